@@ -20,7 +20,6 @@ from hypogoal.experiments.experiment import (
     Paired,
     Seeds,
     agents_of,
-    check_among,
     experiment,
     explained,
 )
@@ -64,8 +63,6 @@ def figure6(
     """For each method and seed its ensemble, options and agents; then the control and the baselines."""
     agents = agents_of(layouts, seeds, paired=paired)
     paper_agents = agents_of(paper_layouts, paper_seeds, paired=paired)
-    for name, values in (("told", told), ("paid", paid)):
-        check_among(values, name, methods, "methods", "ensembles")
     yield Command("data", "collect doorkey")
     for method, seed in product(methods, seeds):
         ensemble, columns = f"ensemble/method-{method}-seed-{seed}", {"method": method, "seed": seed}

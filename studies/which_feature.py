@@ -21,7 +21,7 @@ import numpy as np
 
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import number
-from hypogoal.which_feature.run import Scored
+from hypogoal.which_feature.run import Scored, read_cells
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS
 from hypogoal.which_feature.table import COLUMNS, Line, summary, with_interval
@@ -35,7 +35,6 @@ OF_TWO = OBJECTIVES[:6]
 UNWEIGHTED = ("none", "cnn", "oracle")
 CHOICE_SEEDS, CHOICE_MIX, CHOICE_MIX_OF_TWO = (100,), 0.5, 1.0
 HIGH, LOW = 0.95, 0.6
-SCORES = ("ranking", "balanced_accuracy", "at_best")
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
 TWO = CSV.with_name("which-feature-two.csv")
 SEQUENTIAL = CSV.with_name("which-feature-two-sequential.csv")  # members one after the other
@@ -51,19 +50,6 @@ def gather(target: Path, paths: Iterable[Path]) -> None:
                 lines.setdefault(tuple(row[:5]), row)
     with target.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(lines.values())
-
-
-def read(path: Path) -> list[Scored]:
-    """The cells of a ``results.csv``."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    cells = []
-    for (entry, mix, seed), of in grouped(rows, lambda row: (row["entry"], row["mix"], row["seed"])).items():
-        shape = (-1, len({row["factor"] for row in of}))
-        ranked, at_half, at_best = (np.array([float(row[name]) for row in of]).reshape(shape) for name in SCORES)
-        labels = np.array([int(row["labels"]) for row in of[: shape[1]]])
-        cells.append(Scored(entry, float(mix), int(seed), ranked, at_half, at_best, labels))
-    return cells
 
 
 def chosen(cells: Sequence[Scored], objectives: Sequence[str] = OBJECTIVES, mix: float = CHOICE_MIX) -> dict[str, str]:
@@ -83,7 +69,7 @@ def chosen(cells: Sequence[Scored], objectives: Sequence[str] = OBJECTIVES, mix:
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    cells = read(path)
+    cells = read_cells(path)
     yield from _weights(
         "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose.", cells, chosen(cells)
     )
@@ -98,13 +84,14 @@ def tables(path: Path) -> Iterator[str]:
     yield ""
     yield from table(["", *FACTORS], _by_factor(main))
     if LONG.exists():
-        yield from _board("600 steps", read(LONG))
+        yield from _board("600 steps", read_cells(LONG))
 
 
 def tables_of_two(path: Path) -> Iterator[str]:
     """What the cells of two features say, members trained at once and one after the other."""
     boards = {}
-    for title, cells in (("at once", read(path)), ("one after the other", read(path.with_name(SEQUENTIAL.name)))):
+    for title, source in (("at once", path), ("one after the other", path.with_name(SEQUENTIAL.name))):
+        cells = read_cells(source)
         what = f"{title.capitalize()}: coverage (best) by weight, seed 100 at mix 1; in bold what the rule chose."
         yield from _weights(what, cells, chosen(cells, OF_TWO, CHOICE_MIX_OF_TWO))
         for mix in (0.5, 1.0):
@@ -195,7 +182,7 @@ def main() -> None:
     elif arguments.chosen:
         path = CSV if not arguments.two else SEQUENTIAL if arguments.sequential else TWO
         mix = CHOICE_MIX_OF_TWO if arguments.two else CHOICE_MIX
-        print(",".join([*chosen(read(path), objectives, mix).values(), *UNWEIGHTED]))
+        print(",".join([*chosen(read_cells(path), objectives, mix).values(), *UNWEIGHTED]))
     else:
         print("\n".join(tables_of_two(TWO) if arguments.two else tables(CSV)))
 

@@ -24,7 +24,7 @@ from hypogoal.core.hdf5 import set_attribute, walk
 from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import stage_cell
+from hypogoal.experiments.named import EXPERIMENTS
 from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.records import PLAN, read_plan, write_plan
 from hypogoal.experiments.toml_file import read_toml
@@ -374,8 +374,8 @@ def test_hostile_plans(tmp_path: Path, change: dict[str, Any]) -> None:
     """Spec G2, G4: what a sweep's folder says is to be run is one of our commands, inside it."""
     own = tmp_path / "own.toml"
     own.write_text('format = 1\ncells = [{ name = "data", command = "collect doorkey" }]')
-    write_plan(tmp_path, make_plan(read_toml(own), tmp_path), 1.0)
-    assert read_plan(tmp_path)[0].cells[0].name == "data"
+    write_plan(tmp_path, make_plan(read_toml(own), tmp_path))
+    assert read_plan(tmp_path).cells[0].name == "data"
     plan = json.loads((tmp_path / PLAN).read_text())
     plan["cells"][0] |= change
     (tmp_path / PLAN).write_text(json.dumps(plan))
@@ -399,7 +399,7 @@ def test_a_file_cannot_name_code_to_run(tmp_path: Path, monkeypatch: pytest.Monk
 def test_cells_stay_in_their_run(tmp_path: Path) -> None:
     """Spec G2: a preset's variant that climbs out of --out is refused."""
     with pytest.raises(UserError, match="outside the run"):
-        stage_cell(tmp_path / "a" / ".." / ".." / "x", tmp_path, ("collect",))
+        make_plan(EXPERIMENTS["montezuma-ladders"], tmp_path, ["variants=view=/../../../x"])
 
 
 def test_messages_cannot_drive_a_terminal() -> None:

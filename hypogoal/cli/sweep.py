@@ -94,7 +94,7 @@ def sweep(
 
     out = place_of(out)
     if cell is not None:
-        from hypogoal.experiments.runners.slurm_job import run_job
+        from hypogoal.experiments.runners.slurm import run_job
 
         run_job(out, cell)
         return
@@ -145,11 +145,11 @@ def sweep(
 
 
 def _list(planned: Any) -> None:
-    from hypogoal.experiments.costs import cost_lines, machine_factor
+    from hypogoal.experiments.costs import cost_lines
 
     for cell in planned.cells:
         say(cell.text)
-    for line in cost_lines(planned.cells, planned.workers, machine_factor()):
+    for line in cost_lines(planned.cells, planned.workers):
         say(line, err=True)
 
 

@@ -25,8 +25,6 @@ RATES = {
     "member_step": {"light": 0.15},
     "step": {"planned": 0.3e-3, "light": 0.8e-3, "paper": 65e-3},
     "baseline_step": {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45e-3, "dqn-tuned": 0.57e-3},
-    "evaluated_ensemble": 20,
-    "evaluated_agent": {"light": 4, "planned": 1},
 }
 CONTROLS = {"random": "--set chooser=random", "oracle": "--set termination=oracle"}
 BASELINES = {
@@ -41,7 +39,6 @@ Baselines = Annotated[Names, explained("agents on primitive actions", source="pa
 @experiment(
     "doorkey",
     stages=("collect", "train-ensemble", "train-options", "train-meta", "train-baseline"),
-    short=True,
     rates=RATES,
 )
 def doorkey(
@@ -64,9 +61,8 @@ def doorkey(
     agents = agents_of(layout_seeds, seeds, paired=paired)
     yield Command("data", "collect doorkey")
     for seed in seeds:
-        yield Command(
-            f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}", {"agent": "ensemble", "seed": seed}
-        )
+        columns: dict[str, Value] = {"agent": "ensemble", "seed": seed}
+        yield Command(f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}", columns)
     for layout, seed in agents:
         ensemble, options = f"@ensemble/seed-{seed}", ""
         if pretrain:

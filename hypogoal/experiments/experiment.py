@@ -14,8 +14,7 @@ A command is what one would type, without ``--out``; ``@data`` stands for the ou
 import inspect
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, field, make_dataclass
 from itertools import islice, product
 from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
 
@@ -25,9 +24,10 @@ from hypogoal.core.own_code import UsersCode, load_own
 from hypogoal.experiments.cells import Cost
 
 MAX_CELLS = 20_000
-UNKNOWN = Cost(memory=1e9)  # of a process of a command that is not estimated otherwise
-MEND = "Mend the experiment, see docs/formats.md."
+ONE_PROCESS = Cost(memory=1e9)  # of a command that is not estimated otherwise
+MEND = "Mend the experiment or its settings, see docs/formats.md."
 KINDS = (bool, int, float, str, tuple[int, ...], tuple[float, ...], tuple[str, ...])
+COMMON = ("workers", "evaluate")  # settings of every experiment
 
 Value = str | int | float
 Names: TypeAlias = tuple[str, ...]
@@ -41,7 +41,7 @@ class Command:
     name: str  # its place in the run's folder: ensemble/seed-0
     command: str | Sequence[str]  # as one would type it, or its words
     columns: Mapping[str, Value] = field(default_factory=dict)  # of results.csv: seed, method, ...
-    cost: Cost = UNKNOWN  # where the experiment has no rates
+    cost: Cost = ONE_PROCESS  # where the experiment has no rates
 
     @property
     def words(self) -> list[str]:
@@ -58,23 +58,21 @@ class Experiment:
 
     name: str
     function: Callable[..., Iterable[Any]]  # of the settings, by keyword; yields Command or its fields
-    config_class: type  # the settings of ``hypogoal run``, and how many cells run at once
+    config_class: type  # the settings of ``hypogoal run``: the function's, then those of all experiments
     domain: str | None = None  # whose presets and settings its stages take; None: each command says all itself
     stages: tuple[str, ...] = ()  # whose settings can be changed for all commands
-    short: bool = False  # whether ``hypogoal run`` of a single agent leaves layout and seed out of names
     rates: Mapping[str, Any] = field(default_factory=dict)  # see :class:`hypogoal.experiments.costs.Estimates`
-    is_own: bool = False  # whether the function is a user's
 
     @property
     def settings(self) -> tuple[str, ...]:
         """The names of the function's settings."""
-        return tuple(name for name in inspect.get_annotations(self.config_class) if name not in ("workers", "evaluate"))
+        return tuple(name for name in inspect.get_annotations(self.config_class) if name not in COMMON)
 
     def commands(self, settings: Mapping[str, Any], stage: Callable[[str], Any]) -> Iterator[Command]:
         """What the function yields; ``stage`` gives a stage's settings. What is no command is a ``UserError``."""
-        with UsersCode("the experiment", self.function) if self.is_own else nullcontext():
-            positional = [stage] if _takes_stages(self.function) else []
-            rows = list(islice(self.function(*positional, **settings), MAX_CELLS + 1))
+        takes_stage = "stage" in inspect.signature(self.function).parameters
+        with UsersCode("the experiment", self.function):
+            rows = list(islice(self.function(*[stage][:takes_stage], **settings), MAX_CELLS + 1))
         if len(rows) > MAX_CELLS:
             raise UserError(f"more than {MAX_CELLS} cells", self.name, "Take fewer values.")
         for row in rows:
@@ -97,11 +95,7 @@ Paired = Annotated[bool, explained("each layout with the seed at its place in th
 
 
 def experiment(
-    domain: str,
-    *,
-    stages: Sequence[str],
-    short: bool = False,
-    rates: Mapping[str, Any] | None = None,
+    domain: str, *, stages: Sequence[str], rates: Mapping[str, Any] | None = None
 ) -> Callable[[Callable[..., Iterable[Any]]], Experiment]:
     """Makes a function an experiment on ``domain``; the arguments are those of :class:`Experiment`.
 
@@ -110,8 +104,7 @@ def experiment(
     """
 
     def decorated(function: Callable[..., Iterable[Any]]) -> Experiment:
-        name = function.__name__.replace("_", "-")
-        return Experiment(name, function, _config_of(function, closing=False), domain, (*stages,), short, rates or {})
+        return _experiment_of(function, domain=domain, stages=(*stages,), rates=rates or {})
 
     return decorated
 
@@ -120,13 +113,10 @@ def load_experiment(name: str) -> Experiment:
     """The experiment ``module:function``; the user must have given the name or allowed it, else a ``UserError``."""
     target = load_own(name, "experiment", "hypogoal.experiments", {})
     if isinstance(target, Experiment):
-        return replace(target, is_own=True)
+        return target
     if not inspect.isgeneratorfunction(target):
         raise UserError("the object is not an experiment", name, "Give a generator of (name, command).")
-    if _takes_stages(target):
-        raise UserError("all arguments of an experiment must be keyword-only", name, "Write * before them.")
-    config_class = _config_of(target, closing=True)
-    return Experiment(target.__name__.replace("_", "-"), target, config_class, is_own=True)
+    return _experiment_of(target)
 
 
 def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> list[tuple[int, int]]:
@@ -139,44 +129,30 @@ def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> 
     return list(zip(layouts, seeds, strict=True))
 
 
-def check_among(values: Sequence[Value], name: str, available: Sequence[Value], source: str, noun: str) -> None:
-    """Refuse (``UserError``) values that read what the commands of another setting, ``source``, do not make."""
-    if missing := [value for value in values if value not in available]:
-        raise UserError(f"no {noun} of {','.join(map(str, missing))} to read", name, f"Add it to {source}.")
-
-
-def run_config(
-    fields: Sequence[tuple[str, Any, Any]], *, closing: bool, workers: int = 0, evaluate: bool = True
-) -> type:
-    """The settings of ``hypogoal run``: an experiment's own, then those that all have."""
+def run_config(fields: Sequence[tuple[str, Any, Any]], workers: int = 0, evaluate: bool = True) -> type:
+    """The settings of ``hypogoal run``: an experiment's own, then those of all experiments."""
     common: list[tuple[str, Any, Any]] = [
         ("workers", int, setting(workers, "cells at once; 0 for one per core", low=0, high=1024)),
         ("evaluate", bool, setting(evaluate, "evaluation and report at the end")),
     ]
     namespace = {"__doc__": "Which cells there are."}
-    fields = [*fields, *(common if closing else common[:1])]
-    return make_dataclass("RunConfig", fields, namespace=namespace, frozen=True)
+    return make_dataclass("RunConfig", [*fields, *common], namespace=namespace, frozen=True)
 
 
-def _config_of(function: Callable[..., Iterable[Any]], *, closing: bool) -> type:
-    """The settings that a function's signature describes."""
+def _experiment_of(function: Callable[..., Iterable[Any]], domain: str | None = None, **more: Any) -> Experiment:
+    """A function as an experiment whose settings are those that the function's signature describes."""
     fields = []
     with UsersCode("the experiment", function):
         hints = get_type_hints(function, include_extras=True)
     for name, parameter in inspect.signature(function).parameters.items():
-        if parameter.kind is not parameter.KEYWORD_ONLY:
+        if name == "stage" and domain:
             continue
         kind, metadata = hints.get(name), explained("")
         if get_origin(kind) is Annotated:
             kind, metadata = get_args(kind)
-        if kind not in KINDS or parameter.default is parameter.empty or name in ("workers", "evaluate"):
-            do = "Annotate it with bool, int, float, str or a tuple of one of them, and give it a default."
+        is_setting = parameter.kind is parameter.KEYWORD_ONLY and parameter.default is not parameter.empty
+        if kind not in KINDS or not is_setting or name in COMMON:
+            do = "Make it keyword-only, a bool, int, float, str or a tuple of one of them, with a default."
             raise UserError("this argument of an experiment cannot be a setting", f"{function.__name__}: {name}", do)
-        described = setting(parameter.default, **metadata)
-        fields.append((name, kind, described))
-    return run_config(fields, closing=closing)
-
-
-def _takes_stages(function: Callable[..., Any]) -> bool:
-    kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
-    return inspect.Parameter.POSITIONAL_OR_KEYWORD in kinds
+        fields.append((name, kind, setting(parameter.default, **metadata)))
+    return Experiment(function.__name__.replace("_", "-"), function, run_config(fields), domain, **more)

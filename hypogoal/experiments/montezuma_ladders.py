@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.experiment import Command, Integers, Names, Seeds, check_among, experiment, explained
+from hypogoal.experiments.experiment import Command, Integers, Names, Seeds, experiment, explained
 
 RATES = {
     "heldout": "heldout_per_room",
@@ -17,8 +17,6 @@ RATES = {
     "member_step": {"montezuma": 0.08, "montezuma-crop": 0.01},
     "localiser": 90,
     "step": {"light": 2.5e-3, "paper": 4.0},
-    "evaluated_member": 3,
-    "evaluate_cores": 6,  # ensembles that an evaluation judges at once, at most
 }
 METHODS = {
     "dbat": "--set diversity=dbat",
@@ -51,9 +49,6 @@ def montezuma_ladders(
     oracle: Annotated[bool, explained(ORACLE, source="ours: a control")] = True,
 ) -> Iterator[Command]:
     """The states and ensembles of each N, then the options of each ladder and seed with their oracle."""
-    if ladders:
-        check_among(option_groups, "option_groups", groups, "groups", "ensembles")
-        check_among(option_methods, "option_methods", methods, "methods", "ensembles")
     for count in groups:
         yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}", {"groups": count})
         for method, variant, seed in product(methods, ("", *variants), seeds):

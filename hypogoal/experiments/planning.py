@@ -4,23 +4,22 @@ import contextlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import DOMAIN, parse_assignments, resolve
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name
+from hypogoal.core.files import path_part, plain_name
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import COLUMNS, RESERVED, Cell, Cost, Plan, closing_cells, stage_cell
+from hypogoal.experiments.cells import COLUMNS, RESERVED, UNKNOWN, Cell, Plan, closing_cells
 from hypogoal.experiments.costs import Estimates
 from hypogoal.experiments.experiment import MEND, Command, Experiment
 from hypogoal.settings import CONFIGS, STAGES, TABLES, configuration
 
 FOLDERS = ("evaluation", "report", "logs", "slurm")  # in every run's folder
-READ = re.compile(r"(--[\w-]+=)?@(.+)")
+READ = re.compile(r"--[\w-]+=@.+")
 
 
 def make_plan(
@@ -34,18 +33,17 @@ def make_plan(
 ) -> Plan:
     """The cells of an experiment in the folder ``out``; a ``UserError`` where they cannot be.
 
-    ``assignments`` are ``SETTING=VALUES``, with commas between, in place of its defaults; ``workers=N``,
-    ``evaluate=false``; where it has a domain also ``STAGE.KEY=VALUE``, and ``preset`` and ``device``. ``short``: leave
-    layout and seed out of names if there is a single agent.
+    ``assignments`` are ``SETTING=VALUES``, with commas between, in place of its defaults; where it has a domain also
+    ``STAGE.KEY=VALUE``, and ``preset`` and ``device``. ``short``: leave layout and seed out of names if there is a
+    single agent of an experiment on a domain.
     """
     domain = experiment.domain or DOMAIN
-    by_stage: dict[str, list[str]] = {}
-    if experiment.domain is None:
-        assignments = _check_own(experiment, [*assignments], preset, device)
-    else:
-        assignments, by_stage = _split(experiment, assignments)
+    if experiment.domain is None and (preset or device != "auto"):
+        problem = "an experiment of your own takes no preset and no device"
+        raise UserError(problem, preset or device, "Write --preset and --device into its commands.")
+    of_run, by_stage = _split(experiment, assignments)
     config: Any = resolve(
-        experiment.config_class, stage="run", preset=preset, assignments=assignments, domain=domain, tables=TABLES
+        experiment.config_class, stage="run", preset=preset, assignments=of_run, domain=domain, tables=TABLES
     )
 
     @cache
@@ -56,35 +54,19 @@ def make_plan(
     commands = list(experiment.commands(settings, settings_of))
     if not commands:
         raise UserError("no cells in this experiment", experiment.name, "Give its axes values.")
-    _check_apart(commands, settings)
     _check_free(experiment, commands, by_stage)
     common = {stage: ["--preset", preset] if preset else [] for stage in STAGES}
     for stage in experiment.stages:
         settings_of(stage)  # a mistake in any of them is refused, whether a command uses it or not
         common[stage] += [word for pair in by_stage.get(stage, ()) for word in ("--set", pair)]
         common[stage] += ["--device", device] if device != "auto" and stage in CONFIGS else []
-    planned = _cells(commands, out, common, short=short and experiment.short)
-    closing = Cost()
+    planned, closing = _cells(commands, out, common, short=short and experiment.domain is not None), UNKNOWN
     if experiment.rates:
         estimates = Estimates(experiment.rates, domain)
         planned, closing = estimates.priced(planned), estimates.closing(planned)
-    if getattr(config, "evaluate", True):
+    if config.evaluate:
         planned += closing_cells(out, [cell.out for cell in planned], closing)
     return Plan(experiment.name, planned, config.workers or cores())
-
-
-def _check_own(experiment: Experiment, assignments: list[str], preset: str | None, device: str) -> list[str]:
-    """The assignments of an experiment without a domain; a ``UserError`` where it has not such settings."""
-    for option, value in (("preset", preset or ""), ("device", "" if device == "auto" else device)):
-        if value:
-            do = f"Write --{option} into its commands."
-            raise UserError(f"an experiment of your own takes no {option}", value, do)
-    names = [field.name for field in fields(experiment.config_class)]
-    for key, text in parse_assignments(assignments).items():
-        if key not in names:
-            do = f"It has {', '.join(names)}."
-            raise UserError("no such axis or setting in this experiment", f"{key}={text}", do)
-    return assignments
 
 
 def _split(experiment: Experiment, assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:
@@ -94,13 +76,14 @@ def _split(experiment: Experiment, assignments: Iterable[str]) -> tuple[list[str
     for assignment in assignments:
         (key,) = parse_assignments([assignment])
         stage, dot, rest = key.partition(".")
-        stage = stage.replace("_", "-") if dot else stage
+        stage = stage.replace("_", "-")
         if not dot:
             of_run.append(assignment)
         elif stage in experiment.stages:
             by_stage.setdefault(stage, []).append(f"{rest}={assignment.partition('=')[2]}")
         else:
-            raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(experiment.stages)}.")
+            do = f"It may be one of: {', '.join(experiment.stages) or 'none, its commands say all'}."
+            raise UserError("no such stage in --set", stage, do)
     return of_run, by_stage
 
 
@@ -115,55 +98,49 @@ def _check_free(experiment: Experiment, commands: Sequence[Command], by_stage: M
                 raise UserError("the experiment sets this for each cell", f"{stage}.{key}", do)
 
 
-def _check_apart(commands: Sequence[Command], settings: Mapping[str, Any]) -> None:
-    """Refuse commands of the same name, as two of a seed that is given twice are."""
-    names = [command.name for command in commands]
-    if len({*names}) < len(names):
-        lists = {name: values for name, values in settings.items() if isinstance(values, tuple)}
-        twice = [f"{name}={value}" for name, values in lists.items() for value in values if values.count(value) > 1]
-        where = ", ".join(dict.fromkeys(twice)) or Counter(names).most_common(1)[0][0]
-        raise UserError("two cells would be the same", where, "Give each value once.")
-    flat = Counter([*(name.replace("/", "-") for name in names), "evaluate", "report"])
-    if len(flat) < len(names) + 2:
-        raise UserError("two cells would have the same name", flat.most_common(1)[0][0], MEND)
-
-
 def _cells(commands: Sequence[Command], out: Path, common: Mapping[str, Sequence[str]], *, short: bool) -> list[Cell]:
     """The cell of each command, which reads outputs of those before it."""
     folders = [command.name.partition("/")[0] for command in commands]
     short = short and len({*folders}) == len(folders)
     cells: dict[str, Cell] = {}  # by the names that the commands give
     for command, folder in zip(commands, folders, strict=True):
-        words, where = command.words, f"cell {command.name!r}"
+        place = folder if short else command.name
+        where = f"cell {command.name!r}"
+        words = [part for word in command.words for part in (word.split("=", 1) if READ.fullmatch(word) else [word])]
         if not plain_name(folder) or not re.fullmatch(r"[\w-]+", folder) or folder in FOLDERS:
             raise UserError("cells need a name of their own, of letters, digits, - and _", where, MEND)
+        if not all(map(path_part, place.split("/"))) or not path_part(f"{place.replace('/', '-')}.json"):
+            raise UserError("this would be written outside the run, or the name is too long for a file", where, MEND)
         if not words or words[0] not in STAGES:
             raise UserError("the command must be a stage", where, f"Choose one of {', '.join(STAGES)}.")
-        sources = []
-        for number, word in enumerate(words):
-            if match := READ.fullmatch(word):
-                if match[2] not in cells:
-                    raise UserError(f"{command.name} would read what no cell before it makes", match[2], MEND)
-                sources.append(cells[match[2]])
-                words[number] = f"{match[1] or ''}{sources[-1].out}"
         if any(word.split("=")[0] in RESERVED for word in words):  # even by a setting's value
             raise UserError(f"{', '.join(RESERVED)} are given by the sweep", where, MEND)
+        sources = []
+        for number, word in enumerate(words):
+            if word.startswith("@"):
+                if word[1:] not in cells:
+                    raise UserError(f"{command.name} would read what no cell before it makes", word[1:], MEND)
+                sources.append(cells[word[1:]])
+                words[number] = str(sources[-1].out)
         cost = command.cost._replace(cores=_cores(words, sources))
         # Options of all cells of a stage stand before the cell's own: the last setting of a name counts, so --set
         # cannot turn a method or a control into another.
         words[2:2] = common[words[0]]
-        place = out / ((folder if short else command.name) + (".h5" if words[0] == "collect" else ""))
-        needs = [source.out for source in sources]
-        cells[command.name] = stage_cell(place, out, words, needs, cost, _columns(command))
+        target = out / (place + (".h5" if words[0] == "collect" else ""))
+        arguments, needs = (*words, "--out", str(target)), tuple(source.out for source in sources)
+        cells[command.name] = Cell(place.replace("/", "-"), arguments, target, needs, cost, _axes(command))
+    names = Counter([*(command.name.replace("/", "-") for command in commands), "evaluate", "report"])
+    if len(names) < len(commands) + 2:
+        raise UserError("two cells would be the same", names.most_common(1)[0][0], f"Give each value once. {MEND}")
     return [*cells.values()]
 
 
-def _columns(command: Command) -> Mapping[str, str | int | float]:
+def _axes(command: Command) -> tuple[tuple[str, str | int | float], ...]:
     columns = command.columns
     fits = isinstance(columns, Mapping) and all(isinstance(value, str | int | float) for value in columns.values())
     if not fits or not all(str(name).isidentifier() and name not in ("cell", "stage", *COLUMNS) for name in columns):
         raise UserError("columns must be names with texts or numbers", f"cell {command.name!r}", MEND)
-    return columns
+    return tuple(columns.items())
 
 
 def _cores(words: Sequence[str], sources: Sequence[Cell]) -> int:
@@ -171,10 +148,10 @@ def _cores(words: Sequence[str], sources: Sequence[Cell]) -> int:
     if words[0] != "train-ensemble":
         return 1
     settings = dict(re.findall(r"--set[ =](\w+)=(\S+)", " ".join(words)))
-    domain = next((cell.arguments[1] for cell in sources if cell.stage == "collect"), "")
-    count = len(settings["sub_goals"].split(",")) if "sub_goals" in settings else 1
-    if "sub_goals" not in settings:
+    sub_goals: Sequence[str] = settings["sub_goals"].split(",") if "sub_goals" in settings else ()
+    if not sub_goals:
+        domain = next((cell.arguments[1] for cell in sources if cell.stage == "collect"), "")
         with contextlib.suppress(UserError):  # its cell refuses a domain that may not be loaded
-            count = len(load_domain(domain).sub_goals)
-    limit = settings.get("workers", "")
-    return max(1, min(count, int(limit) if limit.isdigit() and int(limit) else count))
+            sub_goals = load_domain(domain).sub_goals
+    workers = settings.get("workers", "")
+    return max(1, min(len(sub_goals), int(workers) if workers.isdigit() and int(workers) else len(sub_goals)))

@@ -9,21 +9,21 @@ import json
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hypogoal.core.config import parse_assignments, preset_digest
+from hypogoal.core.config import preset_digest
 from hypogoal.core.drafts import PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
 from hypogoal.core.locks import try_lock
 from hypogoal.core.schemas import LARGEST, Schema, is_amount, is_count, is_list, is_table, is_text, is_word, misfit
-from hypogoal.experiments.cells import DERIVED, RESERVED, SHORT, Cell, Cost, Plan, closing_cells, moved
+from hypogoal.experiments.cells import DERIVED, RESERVED, Cell, Cost, Plan, closing_cells, moved
 from hypogoal.settings import STAGES
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1: with forecasts of disk and of the machine's speed, which are ignored
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
 AGAIN = "Start the sweep again."
@@ -72,14 +72,6 @@ def begun(before: Record) -> Record:
     return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
 
 
-def excuse(run: Path, cells: Sequence[Cell]) -> None:
-    """Count failed cells as stopped, so that they are tried again."""
-    for cell in cells:
-        record = read_record(run, cell)
-        if record.code:
-            write_record(run, cell, replace(record, code=None))
-
-
 def open_log(run: Path, cell: Cell) -> BinaryIO:
     """A cell's log to append to, locked: while it or a copy is open, others who start the cell get a ``UserError``."""
     path = log_of(run, cell)
@@ -111,33 +103,29 @@ def is_running(run: Path, cell: Cell) -> bool:
     return not is_free if is_free is not None else record.attempts > 0 and record.code is None
 
 
-def write_plan(run: Path, plan: Plan, factor: float) -> None:
-    """Write the plan into the run's folder; ``factor`` is :func:`hypogoal.experiments.costs.machine_factor`."""
+def write_plan(run: Path, plan: Plan) -> None:
+    """Write the plan into the run's folder."""
     run.mkdir(parents=True, exist_ok=True)
-    rows = [
-        {
-            "name": cell.name,
-            "arguments": list(cell.arguments),
-            "out": str(cell.out),
-            "needs": [str(need) for need in cell.needs],
-            "axes": dict(cell.axes),
-            **cell.cost._asdict(),
-        }
-        for cell in (moved(cell, str(run), RUN) for cell in plan.cells)
-    ]
-    head = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
+    head = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers}
     head |= {"anew": sorted(plan.anew)} if plan.anew else {}
     head |= {"presets": dict(plan.presets)} if plan.presets else {}
-    lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
+    lines = ",\n".join(f"  {json.dumps(_row(cell, run))}" for cell in plan.cells)
     replace_text(run / PLAN, f'{json.dumps(head)[:-1]}, "cells": [\n{lines}\n]}}\n')
+
+
+def _row(cell: Cell, run: Path) -> dict[str, Any]:
+    """What is written of a cell."""
+    cell = moved(cell, str(run), RUN)
+    places = {"out": str(cell.out), "needs": [str(need) for need in cell.needs]}
+    return {"name": cell.name, "arguments": [*cell.arguments], **places, "axes": dict(cell.axes), **cell.cost._asdict()}
 
 
 class LostPlan(UserError):
     """The plan of a sweep exists but cannot be read."""
 
 
-def read_plan(run: Path) -> tuple[Plan, float]:
-    """The plan of a run's folder and its factor, see :func:`write_plan`; a damaged one is ``LostPlan``."""
+def read_plan(run: Path) -> Plan:
+    """The plan of a run's folder; none is a ``UserError``, a damaged one is ``LostPlan``."""
     path = run / PLAN
     if not path.is_file():
         raise UserError("no sweep here", run, "Give the folder of a sweep that was started as --out.")
@@ -148,30 +136,20 @@ def read_plan(run: Path) -> tuple[Plan, float]:
     if isinstance(content, dict) and is_count(content.get("format")) and content["format"] > FORMAT_VERSION:
         raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
     key = misfit(content, PLAN_KEYS, PLAN_MAY)
-    if key is None:
-        faults = ((number, _fault(row)) for number, row in enumerate(content["cells"]))
-        key = next((f"{fault} of cell {number}" for number, fault in faults if fault is not None), None)
     if key is not None:
         raise LostPlan(f"the sweep's plan is damaged ({key or 'no JSON object'})", path, GIVE)
-    anew, cells = frozenset(content.get("anew", ())), [_cell(row, run) for row in content["cells"]]
-    outs: set[Path] = set()
-    for cell in cells:
-        if not outs.issuperset(cell.needs) or cell.out in outs:
+    cells, outs = [], set[Path]()
+    for row in content["cells"]:
+        cost, needs = Cost(*(row[name] for name in Cost._fields)), tuple(map(Path, row["needs"]))
+        cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, cost, tuple(row["axes"].items()))
+        cells.append(moved(cell, RUN, str(run)))
+        if not outs.issuperset(cells[-1].needs) or cells[-1].out in outs:
             raise LostPlan(f"the sweep's plan is damaged (what {cell.name} needs or writes)", path, GIVE)
-        outs.add(cell.out)
-    names = {cell.name for cell in cells}
-    if len(names) < len(cells) or not anew <= names:
+        outs.add(cells[-1].out)
+    if len({cell.name for cell in cells}) < len(cells):
         raise LostPlan("the sweep's plan is damaged (the names of cells)", path, GIVE)
-    plan = Plan(content["experiment"], cells, content["workers"], anew, content.get("presets", {}))
-    return plan, float(content["factor"])
-
-
-def _cell(row: dict[str, Any], run: Path) -> Cell:
-    """A cell in the run's folder, from a row without a :func:`_fault`."""
-    cost = Cost(*(row[name] for name in Cost._fields))
-    needs = tuple(map(Path, row["needs"]))
-    cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, cost, tuple(row["axes"].items()))
-    return moved(cell, RUN, str(run))
+    anew, presets = frozenset(content.get("anew", ())), content.get("presets", {})
+    return Plan(content["experiment"], cells, content["workers"], anew, presets)
 
 
 def _is_place(value: Any) -> bool:
@@ -180,19 +158,16 @@ def _is_place(value: Any) -> bool:
     return len(parts) > 1 and parts[0] == RUN and all(map(path_part, parts))
 
 
-def _fault(row: Any) -> str | None:
-    """Which key of a cell is malformed, or None; its command must be a stage that stays within the run."""
-    key = misfit(row, CELL)
-    if key is not None:
-        return key
+def _is_cell(row: Any) -> bool:
+    """Whether this can be a cell: its command must be a stage that stays within the run."""
+    if misfit(row, CELL) is not None:
+        return False
     words, out = row["arguments"], row["out"]
     if words[:1] and words[0] in DERIVED:  # they read the run
-        closing = closing_cells(Path(RUN), ())
-        return None if (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing] else "arguments"
+        return (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing_cells(Path(RUN), ())]
     reserved = [pair for pair in pairwise([*words, ""]) if pair[0].split("=")[0] in RESERVED]
-    inner = [word for word in words if word.startswith(RUN)]
-    fits = words[:1] and words[0] in STAGES and all(pair == ("--out", out) for pair in reserved)
-    return None if fits and all(map(_is_place, inner)) else "arguments"
+    is_stage = words[:1] and words[0] in STAGES and all(pair == ("--out", out) for pair in reserved)
+    return bool(is_stage) and all(map(_is_place, (word for word in words if word.startswith(RUN))))
 
 
 # What is read of a record and of a plan.
@@ -209,67 +184,45 @@ CELL: Schema = {
     "out": _is_place,
     "needs": is_list(_is_place),
     "axes": is_table(lambda value: is_text(value) or isinstance(value, int | float)),
-    **dict.fromkeys(("seconds", "memory", "disk"), is_amount),
+    "seconds": is_amount,
+    "memory": is_amount,
     "cores": lambda value: is_count(value) and value > 0,
 }
 PLAN_KEYS: Schema = {
     "format": is_count,
     "experiment": is_text,
     "workers": lambda value: is_count(value) and value > 0,
-    "factor": lambda value: is_amount(value) and value > 0,
-    "cells": is_list(lambda row: isinstance(row, dict)),
+    "cells": is_list(_is_cell),
 }
 PLAN_MAY: Schema = {"anew": is_list(is_text), "presets": is_table(is_text)}
 
 
-def made_anew(run: Path, cell: Cell) -> None:
-    """Record that a cell which was to be made again has been."""
-    plan, factor = read_plan(run)
-    write_plan(run, replace(plan, anew=plan.anew - {cell.name}), factor)
-
-
 def check_same(run: Path, cells: Sequence[Cell]) -> None:
     """Refuse (``UserError``) cells that lack any of the folder's plan, or have other commands or presets."""
-    if not (run / PLAN).is_file():
-        return
     do = "Give the settings it was begun with, or choose another --out."
-    plan, digests = read_plan(run)[0], preset_digests(cells)
-    for path, digest in plan.presets.items():
+    before, digests = read_plan(run), preset_digests(cells)
+    for path, digest in before.presets.items():
         if digests.get(path, digest) != digest:
             raise UserError("this preset was changed since the sweep here was begun", path, do)
-    by_place = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
-    for cell in plan.cells:
-        before, after = moved(cell, str(run), RUN), by_place.get(cell.out.relative_to(run))
-        if after is None:
+    by_place = {cell.out: cell for cell in cells}
+    for cell in before.cells:
+        if cell.out not in by_place:
             raise UserError(f"the sweep here has a cell that this one lacks: {cell.name}", run, do)
-        old, new = _meaning(before), _meaning(after)
+        old, new = _meaning(cell), _meaning(by_place[cell.out])
         if old != new:
-            first, second = (next((part for part in a if part not in b), "") for a, b in ((old, new), (new, old)))
+            first, second = (
+                next((part for key, part in a.items() if b.get(key) != part), "") for a, b in ((old, new), (new, old))
+            )
             raise UserError(f"{cell.name} of the sweep here was begun with '{first}', not '{second}'", run, do)
 
 
-def _meaning(cell: Cell) -> list[str]:
-    """A cell's command in parts, in an order that is the same for commands that mean the same.
-
-    The last setting of a name counts, and ``--set`` wins over an option that is short for it.
-    """
-    first, *options = cell.parts
-    short, settings_of_set, rest = [], [], []
-    for group in options:
-        if len(group) == 2 and group[0] in SHORT:
-            short.append(f"{group[0][2:]}={group[1]}")
-        elif len(group) == 2 and group[0] == "--set" and "=" in group[1]:
-            settings_of_set.append(group[1])
-        else:
-            rest.append(group)
-    settings = parse_assignments([*short, *settings_of_set])
-    rest.sort(key=lambda group: group[0])
-    parts = [" ".join(group) for group in (first, *rest)]
-    return [*parts, *(f"{key}={settings[key]}" for key in sorted(settings)), str(cell.out)]
+def _meaning(cell: Cell) -> dict[tuple[str, str], str]:
+    """A cell's command in parts, whose order does not matter; of a setting the last counts."""
+    return {(part[0], part[-1].partition("=")[0]): " ".join(part) for part in cell.parts}
 
 
 def preset_digests(cells: Sequence[Cell]) -> dict[str, str]:
     """The preset files that commands name, each with its digest."""
-    options = (group for cell in cells for group in cell.parts)
-    files = {group[-1] for group in options if group[0] == "--preset" and group[-1].endswith(".toml")}
+    options = (option for cell in cells for option in cell.parts[1:])
+    files = {option[-1] for option in options if option[0] == "--preset" and option[-1].endswith(".toml")}
     return {path: preset_digest(path) for path in sorted(files)}

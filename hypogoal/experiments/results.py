@@ -39,7 +39,7 @@ def write_results(plan: Plan, run: Path) -> Path:
 
 
 def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
-    outs = done_of(plan)
+    outs = done_of(plan, run)
     done = [cell for cell in plan.cells if cell.out in outs]
     evaluated: dict[str, list[Row]] = {}
     for cell in done:

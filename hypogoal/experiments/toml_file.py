@@ -13,16 +13,15 @@ from hypogoal.core.config import MAX_PRESET_BYTES, parse_integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, read_text
 from hypogoal.experiments.cells import COLUMNS, Cost
-from hypogoal.experiments.experiment import UNKNOWN, Command, Experiment, Value, run_config
+from hypogoal.experiments.experiment import COMMON, ONE_PROCESS, Command, Experiment, Value, run_config
 
 FORMAT_VERSION = 1
 NUMBER = (int, float)
 KEYS: Mapping[str, Any] = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
 CELL_KEYS: Mapping[str, Any] = {"name": str, "command": str, "axes": list, "minutes": NUMBER, "memory_gb": NUMBER}
-FORMER = ("domain", "settings", "pairs", "short", "estimate", "for", "first", "if", "out", "columns", "evaluated")
-TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *COLUMNS)  # axes become columns
+TAKEN = ("run", *COMMON, "cell", "stage", "group", *COLUMNS)  # axes become columns
 MOST = 1e7  # minutes, gigabytes
-MEND = "Mend the file, see docs/formats.md."
+MEND = "Mend the file, or write a Python function, see docs/formats.md."
 REFERENCE = re.compile(r"\{([^{}]*)\}")
 
 Point = Mapping[str, Value]
@@ -38,10 +37,16 @@ def read_toml(path: Path) -> Experiment:
     axes = {name: _values(name, values, path) for name, values in table.get("axes", {}).items()}
     rows: dict[str, Mapping[str, Any]] = {}
     for row in table.get("cells", []):
-        _check_row(row, axes, path)
-        if row.get("name", "") in (*rows, *axes):
-            raise UserError("cells need a name of their own", f"cells {row.get('name', '')!r} in {path}", MEND)
-        rows[row.get("name", "")] = row
+        _check_keys(row, CELL_KEYS, path)
+        name, names = row.get("name", ""), row.get("axes", [])
+        where = f"cells {name!r} in {path}"
+        if name in (*rows, *axes):
+            raise UserError("cells need a name of their own", where, MEND)
+        if not all(isinstance(axis, str) and axis in axes for axis in names) or len({*names}) < len(names):
+            raise UserError("cells over an axis that does not exist", where, MEND)
+        if not all(0 <= row.get(key, 0) < MOST for key in ("minutes", "memory_gb")):
+            raise UserError("minutes and memory_gb cannot have these values", where, MEND)
+        rows[name] = row
 
     def commands(**values: tuple[Value, ...]) -> Iterator[Command]:
         for name, chosen in values.items():
@@ -52,30 +57,18 @@ def read_toml(path: Path) -> Experiment:
                 yield _command(row, rows, dict(zip(names, combination, strict=True)))
 
     settings = [(name, _kind(values), setting(values, "")) for name, values in axes.items()]
-    defaults = {key: table[key] for key in ("workers", "evaluate") if key in table}
-    return Experiment(path.stem, commands, run_config(settings, closing=True, **defaults))
+    defaults = {key: table[key] for key in COMMON if key in table}
+    return Experiment(path.stem, commands, run_config(settings, **defaults))
 
 
 def _check_keys(table: Any, kinds: Mapping[str, Any], path: Path) -> None:
     if not isinstance(table, dict):
         raise UserError("cells must be tables", path, MEND)
     for key, value in table.items():
-        if key in FORMER or (kinds is CELL_KEYS and key == "axes" and isinstance(value, dict)):
-            do = "Write it as a Python function and give module:function, see docs/formats.md."
-            raise UserError(f"an experiment in TOML can no longer say {key!r}", path, do)
         if key not in kinds:
-            raise UserError("no such key in an experiment", key, f"{path} may have {', '.join(kinds)}.")
+            raise UserError(f"no such key in an experiment: it may have {', '.join(kinds)}", f"{key} in {path}", MEND)
         if not isinstance(value, kinds[key]) or (isinstance(value, bool) and kinds[key] is not bool):
             raise UserError("wrong kind of value in an experiment", f"{key} in {path}", MEND)
-
-
-def _check_row(row: Any, axes: Mapping[str, Any], path: Path) -> None:
-    _check_keys(row, CELL_KEYS, path)
-    where, names = f"cells {row.get('name', '')!r} in {path}", row.get("axes", [])
-    if not all(isinstance(name, str) and name in axes for name in names) or len({*names}) < len(names):
-        raise UserError("cells over an axis that does not exist", where, MEND)
-    if not all(0 <= row.get(key, 0) < MOST for key in ("minutes", "memory_gb")):
-        raise UserError("minutes and memory_gb cannot have these values", where, MEND)
 
 
 def _values(name: str, values: Any, where: object) -> tuple[Value, ...]:
@@ -108,8 +101,8 @@ def _command(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], poin
         return f"@{_name(rows[key], point)}"
 
     words = Command(row.get("name", ""), row.get("command", "")).words
-    cost = Cost(60.0 * row.get("minutes", 0), 1e9 * row["memory_gb"] if "memory_gb" in row else UNKNOWN.memory)
-    columns = {"group": row.get("name", ""), **point}
+    memory = 1e9 * row["memory_gb"] if "memory_gb" in row else ONE_PROCESS.memory
+    columns, cost = {"group": row.get("name", ""), **point}, Cost(60.0 * row.get("minutes", 0), memory)
     return Command(_name(row, point), [REFERENCE.sub(filled, word) for word in words], columns, cost)
 
 

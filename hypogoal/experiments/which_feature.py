@@ -15,8 +15,6 @@ RATES = {
     "collect": 1,
     "member_step": {"tiles": 0.01},
     "step": {"planned": 0.5e-3},
-    "evaluated_ensemble": 5,
-    "evaluated_agent": 1,
 }
 METHODS = {
     "dbat": "--diversity dbat --members 3",
@@ -27,7 +25,7 @@ METHODS = {
 Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles, rooms and agents of its own")]
 
 
-@experiment("which-feature", stages=("collect", "train-ensemble", "train-meta"), short=True, rates=RATES)
+@experiment("which-feature", stages=("collect", "train-ensemble", "train-meta"), rates=RATES)
 def which_feature(
     *,
     seeds: Rooms = tuple(range(990, 1000)),

@@ -116,7 +116,6 @@ def _unfinished_cells(run: Path) -> list[str]:
     """Of a sweep, the cells that it was to have and has not: failed, or not run yet."""
     if not (run / PLAN).is_file():
         return []
-    planned, _ = read_plan(run)
-    left = [cell.name for cell in planned.cells if cell.stage not in DERIVED and stamp_of(cell) is None]
+    left = [cell.name for cell in read_plan(run).cells if cell.stage not in DERIVED and stamp_of(cell) is None]
     names = ", ".join([*left[:5], *(["..."] if len(left) > 5 else [])])
     return [f"{len(left)} of the sweep's cells are not done: {names}"] if left else []

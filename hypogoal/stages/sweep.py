@@ -5,11 +5,11 @@
 
 import contextlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
@@ -21,18 +21,17 @@ from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments import records
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
-from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
+from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, wall_seconds
 from hypogoal.experiments.experiment import Experiment, load_experiment
 from hypogoal.experiments.named import CELLS, EXPERIMENTS, FIGURES, NAMES
 from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.runners import slurm
 from hypogoal.experiments.runners.local import run_cells
-from hypogoal.experiments.status import done_of, left_of, stamp_of
+from hypogoal.experiments.status import done_of, is_finished, stamp_of
 from hypogoal.experiments.toml_file import read_toml
 from hypogoal.settings import CONFIGS, TABLES
 
 AGAIN = "give the same command again to go on"
-_say = partial(say, err=True)
 
 
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
@@ -94,10 +93,9 @@ def _experiment(name: str) -> Experiment:
 def _has_short_names(out: Path, *, otherwise: bool) -> bool:
     """Whether the cells of the run in this folder have short names; ``otherwise`` if there is none."""
     try:
-        before, _ = records.read_plan(out)
+        return out / "ensemble" in {cell.out for cell in records.read_plan(out).cells}
     except UserError:  # none, or a damaged one: refused when the run is to be continued
         return otherwise
-    return out / "ensemble" in {cell.out for cell in before.cells}
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
@@ -110,13 +108,13 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
 def _is_begun(out: Path, planned: Plan) -> bool:
     """Whether some of these cells are done and others are not: then ``--force --resume`` continues."""
     try:
-        before, _ = records.read_plan(out)
+        before = records.read_plan(out)
         records.check_same(out, planned.cells)
     except records.LostPlan:
         raise
     except UserError:
         return False
-    return len(done_of(replace(planned, anew=before.anew))) < len(planned.cells)
+    return len(done_of(replace(planned, anew=before.anew), out)) < len(planned.cells)
 
 
 def sweep(
@@ -135,10 +133,8 @@ def sweep(
     raises if the answer is no. A user who interrupts the sweep reads ``go_on``. Another process that runs it, another
     sweep's folder, or a cell that failed is a ``UserError``.
     """
-    say = (lambda text: None) if quiet else _say
-    _check_folder(out)
-    with sole_writer(out):
-        planned = _begin(planned, out, force=force, say=say, confirm=confirm)
+    say = _speaker(quiet)
+    with _begun(planned, out, force, say, confirm) as planned:
         try:
             outcome = run_cells(planned, out, say=say)
         except KeyboardInterrupt as error:
@@ -164,102 +160,94 @@ def submit(
     confirm: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Submit unfinished cells to Slurm; arguments and errors as of :func:`sweep`, returns the jobs."""
-    at_once = options.cap or len(planned.cells) or 1  # an upper bound: who else is in the queue is not known
-    planned = replace(planned, workers=at_once)
     slurm.check(out, options)
-    _check_folder(out)
-    with sole_writer(out):
-        planned = _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
-        if planned.anew:
-            problem = f"{len(planned.anew)} cells are still to be made again, as 'run --force' began to"
-            raise UserError(problem, out, records.GIVE)
-        todo = left_of(planned.cells)
+    at_once = options.cap or len(planned.cells)  # an upper bound: who else is in the queue is not known
+    with _begun(replace(planned, workers=at_once), out, False, _speaker(quiet), confirm) as planned:
+        done = done_of(planned, out)
+        todo = [cell for cell in planned.cells if cell.out not in done or not is_finished(cell)]
         return slurm.submit(planned, out, todo, options) if todo else []
 
 
-def _check_folder(out: Path) -> None:
+def _speaker(quiet: bool) -> Callable[[str], None]:
+    return (lambda text: None) if quiet else partial(say, err=True)
+
+
+@contextlib.contextmanager
+def _begun(
+    planned: Plan, out: Path, force: bool, say: Callable[[str], None], confirm: Callable[[str], None] | None
+) -> Iterator[Plan]:
+    """Before the first cell: check the folder, forecast the cost, ask, write the plan; gives the plan as written."""
     if out.exists() and not out.is_dir():
         raise UserError("a run needs a folder, this is a file", out, "Choose another --out.")
     check_parent(out)
+    with sole_writer(out):
+        if alive := slurm.queued(out):
+            raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
+        unplanned, lost = [], ""
+        if force:
+            planned = replace(planned, anew=frozenset(cell.name for cell in planned.cells))
+            todo = planned.cells
+        else:
+            before, lost = _before(planned, out)
+            names = {cell.name for cell in before.cells}
+            unplanned = [cell for cell in planned.cells if cell.name not in names and stamp_of(cell)]
+            planned = replace(planned, anew=before.anew)
+            done = done_of(planned, out)
+            todo = [cell for cell in planned.cells if cell.out not in done]
+        _forecast(planned, todo, say, confirm)
+        (out / records.LOGS).mkdir(parents=True, exist_ok=True)
+        for folder in (out, out / records.LOGS):
+            sweep_up(folder)
+        _check_unplanned([cell for cell in unplanned if cell.stage not in DERIVED], lost, planned, out, say)
+        for cell in todo:  # before the plan is written: from now on a record means an attempt of this start
+            record = records.read_record(out, cell)
+            if force:
+                (out / records.LOGS / f"{cell.name}.json").unlink(missing_ok=True)
+            elif record.code:  # it is tried again
+                records.write_record(out, cell, replace(record, code=None))
+            (out / records.FINISHED).unlink(missing_ok=True)
+        planned = replace(planned, presets=records.preset_digests(planned.cells))
+        records.write_plan(out, planned)
+        yield planned
 
 
-def _begin(
-    planned: Plan, out: Path, *, force: bool, say: Callable[[str], None], confirm: Callable[[str], None] | None
-) -> Plan:
-    """Before the first cell: check the folder, forecast the cost, ask, write the plan; returns the plan as written."""
-    if alive := slurm.queued(out):
-        raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
-    before = _before(planned, out, force=force)
-    planned = replace(planned, anew=before.anew, presets=records.preset_digests(planned.cells))
-    done = done_of(planned)
-    todo = [cell for cell in planned.cells if cell.out not in done]
-    factor = machine_factor() if todo else 1.0
-    _forecast(planned, todo, factor, say, confirm)
-    (out / records.LOGS).mkdir(parents=True, exist_ok=True)
-    for folder in (out, out / records.LOGS):
-        sweep_up(folder)
-    _check_unplanned(before, planned, out, say)
-    if force:
-        for cell in planned.cells:  # before the plan is written: from now on a record means an attempt of this start
-            (out / records.LOGS / f"{cell.name}.json").unlink(missing_ok=True)
-    if todo:
-        records.excuse(out, todo)
-        (out / records.FINISHED).unlink(missing_ok=True)
-    records.write_plan(out, planned, factor)
-    return planned
-
-
-class _Before(NamedTuple):
-    """What a folder has before a sweep begins."""
-
-    anew: frozenset[str]  # names of cells to make again; they stay so however often the sweep is started
-    unplanned: list[Cell]  # complete, but in no plan: older than the sweep, or the plan was lost
-    lost: str  # how the plan was lost; empty if it was not
-
-
-def _before(planned: Plan, out: Path, *, force: bool) -> _Before:
-    """Look at the folder; another sweep's is a ``UserError``."""
-    if force:
-        return _Before(frozenset(cell.name for cell in planned.cells), [], "")
-    complete = [cell for cell in planned.cells if cell.stage not in DERIVED and stamp_of(cell)]
-    if not (out / records.PLAN).is_file():
-        is_gone = (out / records.LOGS).is_dir() and not (out / records.PLAN).exists()
-        return _Before(frozenset(), complete, "the sweep's plan is gone" if is_gone else "")
+def _before(planned: Plan, out: Path) -> tuple[Plan, str]:
+    """The folder's plan, an empty one if there is none, and how it was lost; another sweep's is a ``UserError``."""
+    empty = replace(planned, cells=[])
+    if not (out / records.PLAN).exists():
+        return empty, "the sweep's plan is gone" if (out / records.LOGS).is_dir() else ""
     try:
         records.check_same(out, planned.cells)
-        before, _ = records.read_plan(out)
+        return records.read_plan(out), ""
     except records.LostPlan as error:
-        return _Before(frozenset(), complete, error.what)
-    names = {cell.name for cell in before.cells}
-    return _Before(before.anew, [cell for cell in complete if cell.name not in names], "")
+        return empty, error.what
 
 
 def _forecast(
-    planned: Plan,
-    todo: Sequence[Cell],
-    factor: float,
-    say: Callable[[str], None],
-    confirm: Callable[[str], None] | None,
+    planned: Plan, todo: Sequence[Cell], say: Callable[[str], None], confirm: Callable[[str], None] | None
 ) -> None:
     """Say what the cells left will cost, and ask before a long sweep."""
     if len(todo) < len(planned.cells):
         say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
-    lines = cost_lines(todo, planned.workers, factor) if todo else []
+    lines = cost_lines(todo, planned.workers) if todo else []
     for line in lines:
         say(line)
-    if confirm is not None and wall_seconds(todo, planned.workers, factor) > LONG_SECONDS:
+    if confirm is not None and wall_seconds(todo, planned.workers) > LONG_SECONDS:
         confirm(lines[-1])
 
 
-def _check_unplanned(before: _Before, planned: Plan, out: Path, say: Callable[[str], None]) -> None:
-    """Refuse (``UserError``) complete outputs that, as their stages say, their cells' commands would not make."""
-    if before.lost and before.unplanned:  # said even with --quiet
-        _say(f"{before.lost}, and is written anew: what is complete is kept where its command makes it")
-        if old := [cell.name for cell in before.unplanned if records.read_record(out, cell).code != 0]:
-            _say(f"kept, though 'run --force' may have been about to make them again: {', '.join(old)}")
-    alone = [replace(cell, needs=()) for cell in before.unplanned]
-    outcome = run_cells(replace(planned, cells=alone, anew=frozenset(), workers=cores()), out, say=say, check=True)
-    for name, reason in outcome.failed.items():
+def _check_unplanned(unplanned: list[Cell], lost: str, planned: Plan, out: Path, say: Callable[[str], None]) -> None:
+    """Refuse (``UserError``) complete outputs in no plan that, as their stages say, their commands would not make.
+
+    They are older than the sweep, or the plan was ``lost``.
+    """
+    if lost and unplanned:  # said even with --quiet
+        warn = _speaker(quiet=False)
+        warn(f"{lost}, and is written anew: what is complete is kept where its command makes it")
+        if old := [cell.name for cell in unplanned if records.read_record(out, cell).code != 0]:
+            warn(f"kept, though 'run --force' may have been about to make them again: {', '.join(old)}")
+    alone = replace(planned, cells=[replace(cell, needs=()) for cell in unplanned], workers=cores())
+    for name, reason in run_cells(alone, out, say=say, check=True).failed.items():
         do = "Move it out of the run to have it made, or choose another --out."
         raise UserError(f"what is there is not what the command of {name} makes: {reason}", None, do)
 
@@ -268,10 +256,12 @@ def gather(out: Path) -> Path:
     """Write ``results.csv`` of the cells done and, if all are, ``run.json``; returns the former."""
     from hypogoal.experiments.results import write_results  # loads SciPy, which a plan does without
 
-    planned, _ = records.read_plan(out)
+    planned = records.read_plan(out)
     results = write_results(planned, out)
-    if len(done_of(planned)) == len(planned.cells):
+    if len(done_of(planned, out)) == len(planned.cells):
         seconds = sum(records.read_record(out, cell).seconds for cell in planned.cells)
         summary = {"cells": [cell.text for cell in planned.cells], "seconds": round(seconds, 1)}
         replace_text(out / records.FINISHED, json.dumps(summary, indent=1) + "\n")
+        if planned.anew:  # all are made again
+            records.write_plan(out, replace(planned, anew=frozenset()))
     return results

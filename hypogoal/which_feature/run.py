@@ -1,8 +1,11 @@
 """Spec H1: the benchmark's entries, their training and scores, and the folder of its results."""
 
+import csv
+import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,11 +15,11 @@ from numpy.typing import NDArray
 from hypogoal.core.config import as_dict, from_values, resolve, setting
 from hypogoal.core.drafts import sweep_up
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, replace_text, write_table
+from hypogoal.core.files import read_json, read_text, replace_text, write_table
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.diversity import load_objective
-from hypogoal.evaluation.plots import slug
+from hypogoal.evaluation.numbers import grouped
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
@@ -32,7 +35,9 @@ DEFAULTS: Mapping[str, Any] = {  # where they differ from those of train-ensembl
     "batch_size": 32,
 }
 LABELLED, UNLABELLED = 256, 512  # states
-COLUMNS = ("entry", "mix", "seed", "member", "factor", "ranking", "balanced_accuracy", "at_best", "labels")
+RESULTS = "results.csv"
+SCORES = ("ranking", "balanced_accuracy", "at_best")
+COLUMNS = ("entry", "mix", "seed", "member", "factor", *SCORES, "labels")
 AGAIN = "Remove it and give the same command again, or choose another --out."
 
 
@@ -141,7 +146,7 @@ def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, te
 
 
 def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Scored]:
-    """Score what ``out`` lacks, seed by seed, and write ``results.csv`` of everything in it; returns all scores.
+    """Score what ``results.csv`` in ``out`` lacks, seed by seed, and write it there; returns all scores.
 
     A ``UserError`` if ``out`` is something else or was begun with other settings, or if a file in it is damaged.
     """
@@ -154,62 +159,56 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Scored]:
     if not wanted:
         raise UserError("there is nothing to run", f"seeds {config.seeds}, mixes {config.mix}", "Give one of each.")
     _begin(out, config)
-    paths = [out / "cells" / f"{slug(entry.name)}_{mix}_{seed}.json" for entry, mix, seed in wanted]
+    results = out / RESULTS
+    cells = read_cells(results) if results.exists() else []
+    complete = {(cell.entry, cell.mix, cell.seed) for cell in cells}
     with Progress("which-feature", len(wanted), quiet) as progress:
-        progress.resume(sum(path.exists() for path in paths))
-        for cell, path in zip(wanted, paths, strict=True):
-            if not path.exists():
-                scored = vars(run_cell(*cell, config))
-                replace_text(path, json.dumps(scored, default=lambda array: array.tolist()) + "\n")
+        progress.resume(sum((entry.name, mix, seed) in complete for entry, mix, seed in wanted))
+        for entry, mix, seed in wanted:
+            if (entry.name, mix, seed) not in complete:
+                cells.append(run_cell(entry, mix, seed, config))
+                write_table(results, COLUMNS, rows_of(cells, config.factors))
                 progress.advance()
-    cells = [_read(path, config.factors) for path in sorted((out / "cells").glob("*.json"))]
-    write_table(out / "results.csv", COLUMNS, rows_of(cells, config.factors))
-    return cells
+    return read_cells(results)  # as it is on disk, rounded
 
 
 def rows_of(cells: Iterable[Scored], factors: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     """The lines of ``results.csv``, by entry, mix, seed, member and factor: the values of ``COLUMNS``."""
-    for cell in cells:
+    for cell in sorted(cells, key=lambda cell: (cell.entry, cell.mix, cell.seed)):
         for member, factor in np.ndindex(*cell.ranking.shape):
             scores = (table[member, factor] for table in (cell.ranking, cell.balanced_accuracy, cell.at_best))
             numbers = (*(f"{score:.4f}" for score in scores), int(cell.labels[factor]))
             yield (cell.entry, cell.mix, cell.seed, member, factors[factor], *numbers)
 
 
-def shared(config: WhichFeatureConfig) -> dict[str, Any]:
-    """The settings that all results of a folder share, as JSON."""
-    varied = ("diversity", "mix", "seeds", "high", "low")
-    return {name: value for name, value in as_dict(config).items() if name not in varied}
+def read_cells(path: Path) -> list[Scored]:
+    """The scores in a ``results.csv``, which may come from anyone; a damaged one is a ``UserError``."""
+    lines = csv.DictReader(io.StringIO(read_text(path, "the results are", AGAIN), newline=""))
+    cells = []
+    try:
+        for (entry, mix, seed), rows in grouped(lines, itemgetter("entry", "mix", "seed")).items():
+            shape = (-1, len({row["factor"] for row in rows}))
+            ranked, at_half, at_best = (np.array([float(row[name]) for row in rows]).reshape(shape) for name in SCORES)
+            labels = np.array([int(row["labels"]) for row in rows[: shape[1]]], dtype=np.int64)
+            cells.append(Scored(entry, float(mix), int(seed), ranked, at_half, at_best, labels))
+        for cell in cells:
+            if not all(((table >= 0) & (table <= 1)).all() for table in (getattr(cell, name) for name in SCORES)):
+                raise ValueError("a score out of range")
+    except (TypeError, ValueError, KeyError, OverflowError, csv.Error):
+        raise UserError("the results are damaged", path, AGAIN) from None
+    return cells
 
 
 def _begin(out: Path, config: WhichFeatureConfig) -> None:
-    """Make the folder and write its settings."""
+    """Make the folder and write its settings, those that all of its results share."""
+    varied = ("diversity", "mix", "seeds", "high", "low")
+    shared = {name: value for name, value in as_dict(config).items() if name not in varied}
     path = out / "settings.json"
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise UserError("this is not a folder of the benchmark", out, "Choose another --out.")
         out.mkdir(parents=True, exist_ok=True)
-        replace_text(path, json.dumps(shared(config), indent=1) + "\n")
-    elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):
+        replace_text(path, json.dumps(shared, indent=1) + "\n")
+    elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared:
         raise UserError("this benchmark was begun with other settings", out, "Give those, or choose another --out.")
-    (out / "cells").mkdir(exist_ok=True)
-    for folder in (out, out / "cells"):
-        sweep_up(folder)
-
-
-def _read(path: Path, factors: Sequence[str]) -> Scored:
-    """Scores from their file, which may come from anyone."""
-    data = read_json(path, "the cell is", AGAIN)
-    try:
-        ranked, at_half, at_best = (np.array(data[name], dtype=np.float64) for name in COLUMNS[5:8])
-        labels = np.array(data["labels"], dtype=np.int64)
-        named = str(data["entry"]), float(data["mix"]), int(data["seed"])
-    except (TypeError, ValueError, KeyError, OverflowError):
-        raise UserError("the cell is damaged", path, AGAIN) from None
-    shape = (len(ranked) if ranked.ndim else 0, len(factors))
-    shapes = [array.shape for array in (ranked, at_half, at_best, labels)]
-    fits = shapes == [shape, shape, shape, shape[1:]] and shape[0] > 0
-    within = all(((table >= 0) & (table <= 1)).all() for table in (ranked, at_half, at_best))
-    if not (fits and within):
-        raise UserError("the cell is damaged", path, AGAIN)
-    return Scored(*named, ranked, at_half, at_best, labels)
+    sweep_up(out)

@@ -347,7 +347,7 @@ def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
         own.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
         return tolerated(lambda: make_plan(read_toml(own), run, ["seed=0-2"] if case % 2 else []))
     planned = make_plan(read_toml(own), run)
-    write_plan(run, planned, 1.0)
+    write_plan(run, planned)
     (run / "logs").mkdir(exist_ok=True)
     said = str(rng.choice(box.odd))[:9999]
     (run / "logs" / "data.log").write_text(f"started\n{said}", encoding="utf-8", errors="replace")

@@ -863,7 +863,7 @@ def _sweep(box: Any) -> Path:
     run: Path = box.case / "sweep"
     own = box.case / "own.toml"
     own.write_text(OWN, encoding="utf-8")
-    write_plan(run, make_plan(read_toml(own), run), 1.0)
+    write_plan(run, make_plan(read_toml(own), run))
     (run / "logs").mkdir()
     (run / "logs" / "data.log").write_text("started\n")
     (run / "logs" / "data.json").write_text(

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import pytest
 
 from hypogoal.cli import main
-from hypogoal.experiments import runners
+from hypogoal.experiments.runners import local
 
 
 class Forked:
@@ -86,5 +86,5 @@ def forked() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         own = SimpleNamespace(Popen=Forked, STDOUT=subprocess.STDOUT, DEVNULL=subprocess.DEVNULL)
-        patch.setattr(runners, "subprocess", own)
+        patch.setattr(local, "subprocess", own)
         yield

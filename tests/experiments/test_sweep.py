@@ -18,19 +18,19 @@ from toy import DATA, SMALL, write_toy
 from hypogoal.cli import main
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
+from hypogoal.experiments.cells import Cell
 from hypogoal.experiments.records import (
     GIVE,
     LostPlan,
     Record,
     is_running,
-    made_anew,
     open_log,
     read_plan,
     read_record,
     write_plan,
     write_record,
 )
-from hypogoal.experiments.runners.local import run_cells
+from hypogoal.experiments.runners.local import Running, run_cells
 from hypogoal.experiments.runners.slurm import Options
 from hypogoal.experiments.status import read_status
 from hypogoal.stages.sweep import gather, plan, run, submit
@@ -100,7 +100,7 @@ def extended(swept: Path) -> tuple[list[str], dict[str, int]]:
     with forked():
         for seeds in ("0", "0", "0-1"):
             assert main([*arguments, "--seeds", seeds]) == 0
-    return arguments, {cell.name: read_record(out, cell).attempts for cell in read_plan(out)[0].cells}
+    return arguments, {cell.name: read_record(out, cell).attempts for cell in read_plan(out).cells}
 
 
 def test_finished_cells_are_never_run_again_and_new_ones_are_added(
@@ -117,7 +117,7 @@ def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.Ca
     other = tmp_path / "toy.toml"
     other.write_text((swept / "toy.toml").read_text().replace("steps=6", "steps=7"))
     for arguments, words in (
-        (["sweep", str(other), "--out", out], "ensemble-seed-0 of the sweep here was begun with 'steps=6'"),
+        (["sweep", str(other), "--out", out], "ensemble-seed-0 of the sweep here was begun with '--set steps=6'"),
         (["sweep", str(swept / "toy.toml"), "--out", out, "--seeds", "1-2"], "this one lacks: ensemble-seed-0"),
         (["sweep", "figure6", "--out", out], "data of the sweep here was begun with"),
         (["sweep", "figure7", "--out", out], "unknown experiment"),
@@ -220,7 +220,7 @@ def test_a_cell_is_done_when_its_output_is_there(
     monkeypatch.setenv("LEAVE", "1")
     with pytest.raises(UserError, match="own code has left the process"):
         run(plan(str(toml), out), out, force=True, quiet=True)
-    assert (out / "data.h5").is_file() and read_plan(out)[0].anew == {"data"}
+    assert (out / "data.h5").is_file() and read_plan(out).anew == {"data"}
 
 
 FAILS = f"""
@@ -287,7 +287,7 @@ def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypa
         return [one.state for one in read_status(out).states]
 
     both = plan(toy, out, assignments=["evaluate=true"])
-    write_plan(out, both, 1.0)
+    write_plan(out, both)
     assert states() == ["done", "done", "waiting", "stopped", "stopped"]
     shutil.copytree(swept / "whole" / "ensemble" / "seed-1", out / "ensemble" / "seed-1")
     evaluation = both.cells[-2]
@@ -308,7 +308,7 @@ def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypa
 def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
     """Spec G4: from files alone: who holds the lock on a log runs the cell; when that dies, nobody does."""
     run = swept / "whole"
-    plan, _ = read_plan(run)
+    plan = read_plan(run)
     cell = plan.cells[1]
     assert not is_running(run, cell) and read_status(run).count("done") == 3
     with open_log(run, cell) as log:
@@ -355,13 +355,13 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
     def made() -> tuple[int, int]:
         return data.stat().st_mtime_ns, (ensemble / "manifest.json").stat().st_mtime_ns
 
-    def interrupted(*given: object) -> None:
-        made_anew(*given)  # type: ignore[arg-type]
+    def interrupted(running: Running, code: int) -> str:
+        ended(running, code)
         raise KeyboardInterrupt
 
-    first = made()
+    first, ended = made(), Running.ended
     with monkeypatch.context() as patch:
-        patch.setattr("hypogoal.experiments.runners.local.made_anew", interrupted)
+        patch.setattr(Running, "ended", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(planned, out, force=True, quiet=True)
     second = made()
@@ -377,11 +377,13 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
     told = capsys.readouterr().err
     assert "kept, though 'run --force' may have been about to make them again: ensemble-seed-0\n" in told
     monkeypatch.setattr("hypogoal.experiments.runners.slurm.check", lambda run, options: None)
-    with pytest.raises(UserError, match="still to be made again"):
-        submit(planned, out, Options(), quiet=True)
+    submitted: list[Cell] = []
+    monkeypatch.setattr("hypogoal.experiments.runners.slurm.submit", lambda plan, run, todo, _: submitted.extend(todo))
+    submit(planned, out, Options(), quiet=True)
+    assert [cell.out for cell in submitted] == [ensemble]
     run(planned, out, force=True, resume=True, quiet=True)
     third = made()
-    assert third[0] == second[0] and third[1] > second[1] and not read_plan(out)[0].anew
+    assert third[0] == second[0] and third[1] > second[1] and not read_plan(out).anew
     run(planned, out, resume=True, quiet=True)
     assert made() == third and (out / "run.json").is_file()
 
@@ -407,14 +409,14 @@ def test_a_long_sweep_asks_first_where_somebody_can_answer(tmp_path: Path, monke
 WARNED_AT_ONCE = """
 import os, signal, sys
 from hypogoal.cli import main
-from hypogoal.experiments.runners import slurm_job
+from hypogoal.experiments.runners import slurm
 
-begin = slurm_job.start
+begin = slurm.start
 def warned(*given, **more):
     running = begin(*given, **more)
     os.kill(os.getpid(), signal.SIGUSR2)  # the stage has hardly begun and does not listen yet
     return running
-slurm_job.start = warned
+slurm.start = warned
 sys.exit(main(["sweep", "--out", sys.argv[1], "--cell", "data"]))
 """
 
@@ -427,6 +429,6 @@ def test_a_job_warned_before_its_stage_listens_says_that_nothing_was_saved(swept
     assert done.returncode == 2
     assert "data failed: nothing new could be saved before the time limit" in done.stderr
     assert "queued again" not in done.stderr
-    data = next(cell for cell in read_plan(tmp_path)[0].cells if cell.name == "data")
+    data = next(cell for cell in read_plan(tmp_path).cells if cell.name == "data")
     assert read_record(tmp_path, data).code == 1
     assert not data.out.exists()

@@ -110,7 +110,7 @@ def test_cells_of_a_sweep_that_are_not_done_are_said(run, metrics, tmp_path):
     """Spec A5, G4: a mean over nine of ten seeds says that it is one."""
     shutil.copytree(run / "ensemble", tmp_path / "ensemble")
     cells = [Cell(name, ("train-ensemble", "d"), tmp_path / name) for name in ("ensemble", "other")]
-    write_plan(tmp_path, Plan("own", cells, 1), 1.0)
+    write_plan(tmp_path, Plan("own", cells, 1))
     nothing = {"agents": [], "rooms": [], "selection": [], "distance": {"options": []}}
     assert "1 of the sweep's cells are not done: other" in missing(Work(find(tmp_path), None, None, metrics=nothing))
 

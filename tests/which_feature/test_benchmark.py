@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
+from hypogoal.which_feature import run
 from hypogoal.which_feature.run import parse_entry, resolved, run_cell
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS, KNOWN
@@ -49,22 +49,24 @@ def test_one_member_covers_one_factor_at_most_and_the_same_seed_gives_the_same()
 def test_end_to_end_and_on_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Table and CSV; cells that are there are kept; an objective of one's own is scored like the others."""
+    """Table and CSV; lines that are there are kept; an objective of one's own is scored like the others."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_apart.py").write_text(OWN)
     out = tmp_path / "bench"
     command = [*COMMAND, "--out", str(out), "--seeds", "3"]
     assert main([*command, "--diversity", "dbat:0.1,cnn"]) == 0
-    kept = {path: path.read_bytes() for path in (out / "cells").iterdir()}
-    assert len(kept) == 2
+    kept = rows(out)
+    trained = []
+    run_cell = run.run_cell
+    monkeypatch.setattr(run, "run_cell", lambda *cell: trained.append(cell[:3]) or run_cell(*cell))
     capsys.readouterr()
 
     assert main([*command, "--mix", "0,0.5", "--diversity", "dbat:0.1,mine_apart:apart:0.5,mine_apart:apart"]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[-1] == str(out / "results.csv")
     assert max(map(len, printed[:-1])) <= 80
-    assert all(path.read_bytes() == before for path, before in kept.items())
     found = rows(out)
+    assert len(trained) == 5 and all(row in found for row in kept)
     assert {(row["entry"], row["mix"]) for row in found} == {
         ("cnn", "0.5"),
         *((entry, mix) for entry in ("dbat:0.1", "mine_apart:apart:0.5", "mine_apart:apart") for mix in ("0.0", "0.5")),
@@ -112,7 +114,7 @@ def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str
     assert not out.exists()
 
 
-def test_a_folder_of_other_settings_or_with_a_damaged_cell_is_refused(
+def test_a_folder_of_other_settings_or_with_damaged_results_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Cells that were trained otherwise are not mixed; what a file says is checked."""
@@ -121,14 +123,9 @@ def test_a_folder_of_other_settings_or_with_a_damaged_cell_is_refused(
     assert main(command) == 0
     assert main([*command, "--set", "learning_rate=0.1"]) == 2
     assert "other settings" in capsys.readouterr().err
-    (cell,) = (out / "cells").iterdir()
-    whole = json.loads(cell.read_text())
-    for damage in (
-        {"ranking": [[2, 0, 0, 0]]},
-        {"labels": None},
-        {"mix": "x"},
-    ):
-        cell.write_text(json.dumps({**whole, **damage}))
+    whole = (out / "results.csv").read_text()
+    for before, after in (("cnn,0.5,0,0,colour,", "cnn,0.5,0,0,colour,9"), ("labels", "label"), ("cnn,0.5", "cnn,x")):
+        (out / "results.csv").write_text(whole.replace(before, after, 1))
         assert main(command) == 2
         assert "damaged" in capsys.readouterr().err
 

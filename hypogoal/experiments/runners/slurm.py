@@ -2,35 +2,46 @@
 
 There is an array for the cells of a stage at a depth of the experiment. It begins when the arrays that it reads have
 ended, successfully or not (``afterany``): elements whose inputs are missing end at once, the others run. Slurm's
-accounting is not needed.
+accounting is not needed. A cell in a job saves before its time limit, to be queued again, and when it is cancelled.
 """
 
 import getpass
 import json
+import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
+from hypogoal.core import checkpoints
+from hypogoal.core.drafts import draft_folder
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text
 from hypogoal.core.own_code import TRUST, environment_of_children
 from hypogoal.core.schemas import is_list, is_object, is_text
+from hypogoal.core.terminal import say
 from hypogoal.core.workers import PYTHON
-from hypogoal.experiments.cells import Cell, Plan, depths
+from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.experiments.records import read_plan
+from hypogoal.experiments.runners.local import Running, start
+from hypogoal.experiments.status import is_finished, to_remake
 
 FOLDER, JOBS = "slurm", "jobs.json"
-MOST_ELEMENTS = 1000  # of an array, if Slurm does not say: its default limit is 1001
+MOST_ELEMENTS = 1000  # of an array: Slurm's default limit is 1001
 LEAST_MEMORY = 500e6
 MARGIN, BESIDE = 1.1, 100e6  # factor on estimates, as some clusters kill at the limit; bytes of the job itself
 CANCEL_SECONDS = 120.0
 GATHER = "gather"
+SLOW = "nothing new could be saved before the time limit: give a longer --time, or an earlier --warn"
+STOPPED = (128 + signal.SIGTERM, -signal.SIGTERM)  # exit codes after SIGTERM; the latter: before the stage listened
 
 
 @dataclass(frozen=True)
@@ -58,7 +69,9 @@ class Array:
 
 def arrays(plan: Plan, todo: Sequence[Cell], most: int = MOST_ELEMENTS) -> list[Array]:
     """The arrays of the cells to run, each of at most ``most``, after the arrays that it reads."""
-    depth = depths(plan.cells)
+    depth: dict[Path, int] = {}  # the longest chain of cells before each
+    for cell in plan.cells:
+        depth[cell.out] = 1 + max((depth[need] for need in cell.needs), default=-1)
     groups: dict[tuple[int, str], list[Cell]] = {}
     for cell in todo:
         groups.setdefault((depth[cell.out], cell.stage), []).append(cell)
@@ -79,41 +92,24 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
     """Write a script for each array of ``todo`` into ``run/slurm`` and submit it; a last job gathers the numbers.
 
     Every node must see the run's folder under the same path. Returns the number (``id``), name and cells of each job.
-    No Slurm, a refusal by Slurm, or jobs of this sweep still in its queue are a ``UserError``.
+    No Slurm, or a refusal by Slurm, is a ``UserError``.
     """
-    check(run, options)
-    if alive := queued(run):
-        do = "Look with --status, end them with --cancel."
-        raise UserError(f"this sweep is in Slurm's queue already (job {alive[0]})", run, do)
     folder = run / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     jobs: list[dict[str, Any]] = []
     numbers: dict[str, str] = {}
+    parts = arrays(plan, todo)
     try:
-        for array in arrays(plan, todo, most_elements()):
+        for array in [*parts, Array(GATHER, [], [array.name for array in parts])]:
             script = folder / f"{array.name}.sh"
             replace_text(script, _script(array, run, options))
             numbers[array.name] = _sbatch(script, [numbers[name] for name in array.after])
             jobs.append({"id": numbers[array.name], "name": array.name, "cells": [cell.name for cell in array.cells]})
             replace_text(folder / JOBS, json.dumps(jobs, indent=1) + "\n")
-        script = folder / f"{GATHER}.sh"
-        memory = f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M"
-        replace_text(script, "\n".join([*_head(run, GATHER, options), memory, *_sweep(run, "--gather"), ""]))
-        jobs.append({"id": _sbatch(script, list(numbers.values())), "name": GATHER, "cells": []})
     except UserError:
-        for job in jobs:
-            _command("scancel", job["id"])
+        _command("scancel", *numbers.values())
         raise
-    replace_text(folder / JOBS, json.dumps(jobs, indent=1) + "\n")
     return jobs
-
-
-def most_elements() -> int:
-    """How many cells an array may have, by Slurm's configuration."""
-    if shutil.which("scontrol") is None:
-        return MOST_ELEMENTS
-    match = re.search(r"^MaxArraySize\s*=\s*(\d+)", _command("scontrol", "show", "config").stdout, re.MULTILINE)
-    return max(1, int(match[1]) - 1) if match else MOST_ELEMENTS
 
 
 def check(run: Path, options: Options) -> None:
@@ -128,47 +124,46 @@ def check(run: Path, options: Options) -> None:
         raise UserError("a batch script cannot hold a path with such characters", repr(place), "Choose another --out.")
 
 
-def _head(run: Path, name: str, options: Options) -> list[str]:
-    place = str((run / FOLDER).resolve()).replace("%", "%%")
-    lines = [
-        "#!/bin/sh",
-        f"#SBATCH --job-name={re.sub(r'[^A-Za-z0-9_.-]', '-', run.name)}-{name}",
-        f"#SBATCH --output={shlex.quote(place)}/%x-%A-%a.out",
-        "#SBATCH --open-mode=append",
-    ]
-    lines += [f"#SBATCH --partition={options.partition}"] if options.partition else []
-    return lines + [f"#SBATCH {extra}" for extra in options.extra]
-
-
 def _script(array: Array, run: Path, options: Options) -> str:
-    """A plain batch script: element N runs the Nth cell that it names."""
-    cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
-    estimated = cpus * max(cell.cost.memory for cell in array.cells)
-    requested = MARGIN * max(estimated, LEAST_MEMORY) + BESIDE
-    memory = options.memory or (f"{ceil(requested / 2**20)}M" if estimated else "")
-    lines = _head(run, array.name, options)
-    lines += [
-        f"#SBATCH --array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
-        f"#SBATCH --cpus-per-task={cpus}",
-        "#SBATCH --requeue",
-        f"#SBATCH --signal=B:USR2@{options.warn}",
+    """A plain batch script: element N runs the Nth cell that it names; without cells, it gathers the numbers."""
+    place = str((run / FOLDER).resolve()).replace("%", "%%")
+    settings = [
+        f"--job-name={re.sub(r'[^A-Za-z0-9_.-]', '-', run.name)}-{array.name}",
+        f"--output={shlex.quote(place)}/%x-%A-%a.out",
+        "--open-mode=append",
+        *([f"--partition={options.partition}"] if options.partition else []),
+        *options.extra,
     ]
-    lines += [f"#SBATCH --mem={memory}"] if memory else []
-    lines += [f"#SBATCH --time={options.time}"] if options.time else []
-    lines += [f"#SBATCH --gres=gpu:{options.gpus}"] if options.gpus else []
-    names = " ".join(shlex.quote(cell.name) for cell in array.cells)
-    lines += [
-        "trap '' USR2  # until the program listens: the warning must not end it",
-        f"set -- {names}",
-        'shift "$SLURM_ARRAY_TASK_ID"',
-        f"export {TRUST}={shlex.quote(environment_of_children()[TRUST])}",
-    ]
-    return "\n".join([*lines, *_sweep(run, '--cell "$1"')]) + "\n"
+    out = shlex.quote(str(run))
+    last = f"exec {shlex.join(PYTHON)} -m hypogoal sweep --out {out}"
+    if array.cells:
+        cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
+        memory = max(cell.cost.memory for cell in array.cells)
+        settings += [
+            f"--array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
+            f"--cpus-per-task={cpus}",
+            "--requeue",
+            f"--signal=B:USR2@{options.warn}",
+            *([f"--mem={options.memory or _megabytes(cpus * memory)}"] if options.memory or memory else []),
+            *([f"--time={options.time}"] if options.time else []),
+            *([f"--gres=gpu:{options.gpus}"] if options.gpus else []),
+        ]
+        commands = [
+            "trap '' USR2  # until the program listens: the warning must not end it",
+            f"set -- {shlex.join(cell.name for cell in array.cells)}",
+            'shift "$SLURM_ARRAY_TASK_ID"',
+            f"export {TRUST}={shlex.quote(environment_of_children()[TRUST])}",
+            f'{last} --cell "$1"',
+        ]
+    else:
+        settings.append(f"--mem={_megabytes(0)}")
+        commands = [f"{last} --gather"]
+    head = ["#!/bin/sh", *(f"#SBATCH {setting}" for setting in settings)]
+    return "\n".join([*head, f"cd {shlex.quote(str(Path.cwd()))} || exit 1", *commands, ""])
 
 
-def _sweep(run: Path, option: str) -> list[str]:
-    command = f"{shlex.join(PYTHON)} -m hypogoal sweep --out {shlex.quote(str(run))} {option}"
-    return [f"cd {shlex.quote(str(Path.cwd()))} || exit 1", f"exec {command}"]
+def _megabytes(estimated: float) -> str:
+    return f"{ceil((MARGIN * max(estimated, LEAST_MEMORY) + BESIDE) / 2**20)}M"
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
@@ -222,3 +217,66 @@ def cancel(run: Path) -> int:
             raise UserError("Slurm has not ended all jobs yet", run, "Look with squeue.")
         time.sleep(0.5)
     return len(alive)
+
+
+class _Signals:
+    """Slurm's signals to the job, passed on to the cell as SIGTERM, at which its stage saves."""
+
+    def __init__(self) -> None:
+        self.warned = self.stopped = False
+        self.running: Running | None = None
+        for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._receive)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.warned |= number == signal.SIGUSR2
+        self.stopped |= number != signal.SIGUSR2
+        self.pass_on()
+
+    def pass_on(self) -> None:
+        """Stop the cell if a signal was received."""
+        if self.running is not None and (self.warned or self.stopped):
+            self.running.process.terminate()
+
+
+def run_job(run: Path, name: str) -> None:
+    """Run the cell called ``name`` of the sweep in ``run`` on the job's processors.
+
+    An unknown cell, a missing input or a failure is a ``UserError``.
+    """
+    signals = _Signals()
+    plan = read_plan(run)
+    cell = next((cell for cell in plan.cells if cell.name == name), None)
+    if cell is None:
+        raise UserError("no such cell in this sweep", name, "See sweep.json.")
+    for other in plan.cells:
+        if other.out in cell.needs and (to_remake(plan, run, other) or not is_finished(other)):
+            raise UserError(f"{name} waits for {other.name}, which is not done", run, "Start the sweep again.")
+    if not to_remake(plan, run, cell) and is_finished(cell):
+        return
+    before = _saved(cell)
+    processors = os.environ.get("SLURM_CPUS_PER_TASK", "1")
+    cores = int(processors) if processors.isdigit() else 1
+    signals.running = start(cell, run, cores=cores, force=name in plan.anew)
+    signals.pass_on()  # what came in between
+    code = signals.running.process.wait()
+    again = code in STOPPED and signals.warned and not signals.stopped
+    if again and _saved(cell) in ([], before):  # or it would never end
+        signals.running.log.write(f"hypogoal: {SLOW}\n".encode())
+        again, code = False, 1
+    reason = signals.running.ended(code)
+    if again:
+        # By array and element: the last element's own number is also the array's and would queue all of them again.
+        job = "_".join(os.environ.get(name, "") for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID"))
+        say(f"{name}: saved, queued again (job {job})", err=True)
+        done = _command("scontrol", "requeue", job)
+        if done.returncode:
+            raise UserError(f"Slurm does not queue it again ({done.stderr.strip()})", name, "Start the sweep again.")
+    elif reason:
+        raise UserError(f"{name} failed: {reason}")
+
+
+def _saved(cell: Cell) -> list[tuple[str, int]]:
+    """A cell's checkpoints, and when each was written."""
+    paths = (draft_folder(cell.out) / checkpoints.FOLDER).glob("*.safetensors")
+    return sorted((path.name, path.stat().st_mtime_ns) for path in paths)
