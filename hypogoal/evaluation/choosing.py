@@ -23,14 +23,15 @@ from hypogoal.core.rounding import DIGITS, above, at_least
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name
+from hypogoal.evaluation.curves import LEARNED, NEARLY
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import Metrics, mean_of
 from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.run import takes
 from hypogoal.evaluation.table import Number, Row, Table, by_run, rows_of, select, tabulate
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
-    from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 
 LEAST = 20.0  # expected choices of a member, below which its preference is not told
@@ -141,7 +142,7 @@ def rows(work: Work) -> Iterator[Row]:
         config = artefact.config
         playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
         playable = playable and not config.get("layouts")  # whose states are too many to say what follows in each
-        if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not playable:
+        if not takes(artefact) or artefact.kind != "meta" or config["chooser"] == "random" or not playable:
             continue
         if (played := play_agent(artefact, run.seed)) is None:
             continue

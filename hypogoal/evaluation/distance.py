@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,6 +18,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.own_code import UsersCode, as_number
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import (
     ORACLE,
     Metrics,
@@ -36,7 +37,7 @@ from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
 from hypogoal.evaluation.rooms import VALIDATION, group_name
-from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, thresholds_of, within
+from hypogoal.evaluation.run import read_terminations, takes, thresholds_of, within
 from hypogoal.evaluation.table import (
     BEST,
     VALIDATED,
@@ -51,9 +52,8 @@ from hypogoal.evaluation.table import (
     with_members,
 )
 from hypogoal.hypotheses.scores import most_and_least
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
+from hypogoal.learners.episodes import LAST
+from hypogoal.options.tables import Executions
 
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
@@ -226,7 +226,7 @@ def rows(work: Work) -> Iterator[Row]:
     """Spec F3: every member's option on every ladder: where its executions stopped; overlays go to the arrays."""
     for artefact, (validated, place) in zip(work.contents.ladders, _named(work), strict=True):
         path, config = work.contents.name(artefact), artefact.config
-        executions = read_executions(artefact.path / "executions.csv")
+        executions = Executions.read(artefact.path / "executions.csv")
         if "terminations.h5" in artefact.manifest["files"]:
             for option, states in read_terminations(artefact.path / "terminations.h5").items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
@@ -254,7 +254,7 @@ def view(work: Work) -> dict[str, Any]:
     used = {entry["ladder"] for entry in options}
     starts = [start for start in (domain.starts if domain else ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
-    executions = {path: read_executions(artefact.path / "executions.csv") for path, artefact in artefacts.items()}
+    executions = {path: Executions.read(artefact.path / "executions.csv") for path, artefact in artefacts.items()}
     stops = show_stops(options, ladders, executions, domain, work.arrays)
     return {"distance": {"options": options, "over_ladders": distance_table(work.rows, ladders), "shown": stops}}
 

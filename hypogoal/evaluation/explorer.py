@@ -8,7 +8,7 @@ holds the states as data; ``templates/explorer.js`` shows those that its filters
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,10 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, variants
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.table import Row
 
 MOST_STATES = 300  # over all sub-goals: the page of ten DoorKey agents has 1.2 MB, of the ladders 1.7 MB
 MOST_OF_ONE = 180  # of one sub-goal

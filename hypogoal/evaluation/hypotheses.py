@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import Metrics, grouped
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, drawing
@@ -28,9 +29,6 @@ from hypogoal.evaluation.table import (
     with_members,
 )
 from hypogoal.hypotheses.scores import mean_disagreement, member_scores
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
 
 WHICH = ("best", "mean", "worst")
 STATES = ("unlabelled", "heldout")
@@ -85,6 +83,10 @@ def view(work: Work) -> dict[str, Any]:
     return {"hypotheses": tabulate(of_layouts(work.rows), TABLE), "ensembles": ensembles}
 
 
+CAPTION = (
+    "Balanced accuracy on held-out states of the best, mean and worst member, and the share of states on which two "
+    "members disagree (mean over pairs); mean over ensemble seeds ± standard error."
+)
 ENSEMBLE = page.label("ensemble", "name", once=True)
 SCORES = tuple(page.number(which, which, page.spread, 3) for which in WHICH)
 SEEDS = page.number("seeds", "ensembles")
@@ -128,8 +130,7 @@ def hypotheses_section(material: Material) -> Block:
     whole = page.table(
         HYPOTHESES,
         metrics["hypotheses"],
-        caption="Balanced accuracy on held-out states of the best, mean and worst member, and the share of states "
-        "on which two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
+        caption=CAPTION,
     )
     blocks = [
         *(page.shown(material, figure) for figure in figures(material)),

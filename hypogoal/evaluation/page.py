@@ -13,7 +13,7 @@ from functools import partial
 from hashlib import sha256
 from importlib import resources
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,13 +22,11 @@ from rich.table import Table
 
 from hypogoal.core.files import parse_json
 from hypogoal.core.manifests import AGAIN
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.table import Pairs, Row
+from hypogoal.evaluation.table import Pairs, Row
 
 Block = dict[str, Any]
 Entry = Mapping[str, Any]

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import method_rank
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.table import Number, Row, Table, rows_by_member, rows_of, select, tabulate
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
 
 OF_MEMBERS = ("ranking", "at_best_threshold", "calibration_gap")
 CROSSED = {"ranking": "cross_fitted_ranking", "balanced_accuracy": "cross_fitted_accuracy"}

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +21,7 @@ from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import Metrics, by_method, grouped, methods_lacking
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
@@ -36,9 +37,6 @@ from hypogoal.evaluation.table import (
     tabulate,
 )
 from hypogoal.hypotheses.scores import member_scores, ranking
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
 
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or
 # among the labelled ones.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from hypogoal.core.hdf5 import fixed
 from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
 from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.table import Row
 
 SPREAD = "spread"  # a state as any other
 KINDS = {"true positive": "a true positive", "disagree": "members disagree", "false positive": "a false positive"}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,21 +18,19 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
-from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, THOMPSON, base_name, variants, which
+from hypogoal.evaluation.curves import variants, which
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import Metrics
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
-from hypogoal.evaluation.run import Choices, read_choices, thresholds_of, within
+from hypogoal.evaluation.run import takes, thresholds_of, within
 from hypogoal.evaluation.table import Row, by_fields, by_run, rows_by_member, select
 from hypogoal.hypotheses.scores import member_scores, most_and_least
 from hypogoal.meta.config import layout_seeds
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
+from hypogoal.options.tables import Choices
 
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
-SELECTED = (LEARNED, THOMPSON, RANDOM, PRETRAINING)  # agents whose options are members: to select among
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
 MOST = ("most", "least")  # preferred
 SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth, on a run's layout
@@ -79,11 +77,11 @@ def rows(work: Work) -> Iterator[Row]:
         work.progress.advance()
         artefact = work.artefact(run.path)
         config = artefact.config
-        if base_name(artefact.kind, config) not in SELECTED:
+        if not takes(artefact):
             continue
         layout = run.layout["layout_seed"]
         seeds = layout_seeds(config.get("layouts", ""), layout)[:LOOKED_AT]
-        choices, members = read_choices(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
+        choices, members = Choices.read(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
         for option, (picture, count) in members.sets.items():
             dataset = f"terminations/{run.path}/{option}"
             work.arrays[dataset] = picture

@@ -19,14 +19,14 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.choosing import UNIFORM
-from hypogoal.evaluation.curves import NEAR
+from hypogoal.evaluation.curves import NEAR, scores
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import Metrics, grouped
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.table import Number, Row, Table, rows_of, select, tabulate
 from hypogoal.meta.config import layout_seeds
 
 if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 
 EPISODES = 3  # of an agent on each layout
@@ -58,7 +58,7 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
     """
-    from hypogoal.evaluation.frozen import Always, begin_anew, scores
+    from hypogoal.evaluation.frozen import Always, begin_anew
 
     begin_anew(loop, Always(option))
     engine, steps = loop.engine, np.zeros(loop.engine.count, dtype=np.int64)

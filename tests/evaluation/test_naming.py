@@ -18,8 +18,8 @@ from hypogoal.evaluation.curves import (
     rows_of_run,
 )
 from hypogoal.evaluation.numbers import ensemble_names, name_apart
-from hypogoal.evaluation.run import Choices, Episodes
 from hypogoal.evaluation.selection import rows_of_choices, selection_of
+from hypogoal.options.tables import Choices, Episodes
 
 META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_steps": 200, "option_gamma": 0.95}
 
