@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts, sha256_of
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json
+from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
@@ -166,7 +166,17 @@ def read_numbers(source: Artefact) -> dict[str, Any]:
     if (made_with := metrics.get("format", 1)) != FORMAT:
         difference = f"another version of hypogoal evaluated this (format {made_with}, needed: {FORMAT})"
         raise UserError(difference, path, "Evaluate the run again, with --force.")
+    for name in _sub_goals(metrics):
+        if not plain_name(name):
+            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, AGAIN)
     return metrics
+
+
+def _sub_goals(part: Any) -> Iterator[Any]:
+    if isinstance(part, dict):
+        yield from [part["sub_goal"]] if "sub_goal" in part else []
+    for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
+        yield from _sub_goals(inner)
 
 
 def _since(run: Path, source: Artefact) -> list[str]:
