@@ -265,7 +265,7 @@ def _fault(read: Callable[[], object]) -> Iterator[str]:
 
 
 def _read_table(path: Path) -> None:
-    from hypogoal.evaluation.run import read_table
+    from hypogoal.options.tables import read_table
 
     read_table(path, ("value",) if path.name == NUMBERS_CSV else None)  # its other columns are texts
 

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, find_artefacts
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.choosing import UNIFORM
-from hypogoal.evaluation.curves import WINDOW, Run, read_run, run_numbers
+from hypogoal.evaluation.curves import Run, read_run, run_numbers
 from hypogoal.evaluation.frozen import ENVIRONMENTS, play
+from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
 from studies.cells import interval, table
@@ -116,12 +117,12 @@ def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
 
 
 def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: float | None) -> float:
-    """The lowest share solved of any ``WINDOW`` consecutive episodes that end after step ``since``; NaN if never."""
+    """The lowest share solved of any ``LAST`` consecutive episodes that end after step ``since``; NaN if never."""
     if since is None:
         return math.nan
     sums = np.concatenate([[0], np.cumsum(succeeded.astype(np.int64))])
-    recent = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
-    return float(recent[step[WINDOW - 1 :] >= since].min())
+    recent = (sums[LAST:] - sums[:-LAST]) / LAST
+    return float(recent[step[LAST - 1 :] >= since].min())
 
 
 def tables(path: Path) -> Iterator[str]:

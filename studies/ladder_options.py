@@ -25,9 +25,9 @@ from hypogoal.core.rounding import above
 from hypogoal.core.workers import in_processes
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
 from hypogoal.evaluation.distance import NEAR, option_numbers
-from hypogoal.evaluation.run import read_executions
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig
+from hypogoal.options.tables import Executions
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
@@ -115,7 +115,7 @@ def _learned(
 ) -> list[Row]:
     _, method, seed, ladder, _ = cell
     _train(ensemble, out, seed, {"start": ladder, "steps": STEPS, **METHODS[method][2], **(changes or {})}, options)
-    executions, members = read_executions(out / "executions.csv"), open_artefact(out, "options").config["members"]
+    executions, members = Executions.read(out / "executions.csv"), open_artefact(out, "options").config["members"]
     trained = open_artefact(ensemble, "ensemble").config["steps"]
     rows = []
     for member in range(members):

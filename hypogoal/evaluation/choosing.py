@@ -23,14 +23,15 @@ from hypogoal.core.rounding import DIGITS, above, at_least
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name
+from hypogoal.evaluation.curves import LEARNED, NEARLY
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import Metrics, mean_of
 from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.run import takes
 from hypogoal.evaluation.table import Number, Row, Table, by_run, rows_of, select, tabulate
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
-    from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 
 LEAST = 20.0  # expected choices of a member, below which its preference is not told
@@ -44,10 +45,9 @@ TITLE = "What choosing is worth"
 def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.float64]:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
-    Of an agent whose policies remember nothing, in an engine that knows what follows. ``goals`` (O,) are the columns of
-    the engine's labels that options' true sub-goals are. Executions begin in ``states`` (D,), each as often as it is
-    there: an option's where it is offered, its sub-goal does not hold, and can be had within the timeout; NaN for an
-    option that begins nowhere.
+    Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
+    labels. Executions begin in ``states`` (D,), each as often as it is there: where the option is offered, its
+    sub-goal does not hold, and can be had within the timeout; NaN for an option that begins nowhere.
     """
     from hypogoal.options.planned import distances, places_of
 
@@ -91,13 +91,11 @@ def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) ->
 def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
-    ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known.
-
-    Returns:
-        ``preference`` (G*K,): chosen / expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected;
-        ``within_rho``: Spearman's rho of the two, mean over sub-goals whose members' qualities differ by
-        ``DIFFERENCE``; ``pair``: of two members offered whose qualities differ by that, how often the better of those
-        taken (.5 at random); ``score``: (quality taken - mean quality) / (best - mean), over decisions (0 at random).
+    ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
+    expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected; ``within_rho``: Spearman's rho of
+    the two, mean over sub-goals whose members' qualities differ by ``DIFFERENCE``; ``pair``: of two members offered
+    whose qualities differ by that, how often the better of those taken (.5 at random); ``score``: (quality taken - mean
+    quality) / (best - mean), over decisions (0 at random).
     """
     options = np.arange(len(quality))
     of_goal = choices.offered & (options // members == (choices.options // members)[:, None])
@@ -139,11 +137,10 @@ def rows(work: Work) -> Iterator[Row]:
     for name, run in ((name, run) for name, runs in work.agents.items() for run in runs):
         artefact = work.artefact(run.path)
         config = artefact.config
+        learned = artefact.kind == "meta" and takes(artefact) and config["chooser"] != "random"
         playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
-        playable = playable and not config.get("layouts")  # whose states are too many to say what follows in each
-        if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not playable:
-            continue
-        if (played := play_agent(artefact, run.seed)) is None:
+        # Of many layouts the states are too many to say what follows in each.
+        if not learned or not playable or config.get("layouts") or (played := play_agent(artefact, run.seed)) is None:
             continue
         place = {"scope": FROZEN, "layout": run.layout["layout_seed"], "seed": run.seed, "artefact": run.path}
         for method, numbers in ((name, played), (UNIFORM, played["uniform"])):

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle
 from operator import itemgetter
 from typing import Any
 
@@ -17,12 +18,7 @@ from hypogoal.evaluation.table import Pairs, Row, compared, select
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
 Curves = Mapping[str, Mapping[str, NDArray[Any]]]  # a run's label -> the arrays of its learning curves
-QUANTITIES = {
-    "reward": ("Undiscounted reward", "reward per episode"),
-    "length": ("Episode length", "episode length (steps)"),
-}
-MOST_LINES = len(PALETTE)  # in one figure
-RUN = page.label("run", "run")
+DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
 LADDERS = [rooms.METHOD._replace(once=None), rooms.N]
 
 
@@ -48,65 +44,57 @@ def labels_of(paths: Sequence[str]) -> list[str]:
     return list(paths)
 
 
-def why_not(runs: Mapping[str, Metrics]) -> str | None:
+def why_not(runs: Runs) -> str | None:
     """Why runs cannot be compared, in a few words; None where they can.
 
     They must be of one domain, evaluated with the same settings, and have at least one kind of result in common.
     """
-    domains = {label: domains_of(metrics) for label, metrics in runs.items()}
-    if len({tuple(names) for names in domains.values()}) > 1:
-        return "they are of different domains (" + _told(domains) + ")"
-    common = set.intersection(*(set(metrics["settings"]) for metrics in runs.values()))
-    for key in sorted(common):
-        values = {label: [str(metrics["settings"][key])] for label, metrics in runs.items()}
-        if len({texts[0] for texts in values.values()}) > 1:
-            return f"they were evaluated with different {key} (" + _told(values) + ")"
-    if not shared(runs):
-        has = {label: shared({label: metrics}) for label, metrics in runs.items()}
-        return "they have no kind of result in common (" + _told(has) + ")"
+    settings = [metrics["settings"] for metrics in runs.values()]
+    values = {"they are of different domains": [domains_of(metrics) for metrics in runs.values()]}
+    for key in sorted(set.intersection(*map(set, settings))):
+        values[f"they were evaluated with different {key}"] = [[str(of_run[key])] for of_run in settings]
+    values["they have no kind of result in common"] = [shared({label: runs[label]}) or ["nothing"] for label in runs]
+    for reason, texts in values.items():
+        if any(text != texts[0] for text in texts) and not (reason.startswith("they have") and shared(runs)):
+            return f"{reason} ({'; '.join(map(': '.join, zip(runs, map(', '.join, texts), strict=True)))})"
     return None
 
 
-def _told(values: Mapping[str, Sequence[str]]) -> str:
-    return "; ".join(f"{label}: {', '.join(texts) or 'nothing'}" for label, texts in values.items())
-
-
-def shared(runs: Mapping[str, Metrics]) -> list[str]:
+def shared(runs: Runs) -> list[str]:
     """The kinds of results that every run has."""
     return [name for name, part in PARTS.items() if all(part.entries(metrics) for metrics in runs.values())]
 
 
-def differences(runs: Mapping[str, Metrics]) -> list[dict[str, Any]]:
-    """What was not the same: settings by the kind of artefact, seeds, layouts, data and versions.
+def differences(runs: Runs) -> list[dict[str, Any]]:
+    """What was not the same: settings by the kind of artefact, seeds, data and versions.
 
-    Rows have ``kind`` (an artefact's kind, ``data`` or ``versions``), ``setting`` and ``values``, one text per run.
+    Rows have ``of`` (an artefact's kind, ``data`` or ``versions``), ``setting`` and ``values``, one text per run.
     """
-    settings_of = {label: grouped(_settings(metrics), itemgetter(0)) for label, metrics in runs.items()}
+    texts: dict[tuple[str, str], dict[str, set[str]]] = {}
+    for label, metrics in runs.items():
+        for kind, settings in _settings(metrics):
+            for name, value in settings.items():
+                text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+                texts.setdefault((kind, name), {}).setdefault(label, set()).add(text)
     rows = []
-    for kind, name in sorted({key for settings in settings_of.values() for key in settings}):
-        values = {
-            label: ", ".join(sorted({text for _, text in settings.get((kind, name), [((kind, name), "–")])}))
-            for label, settings in settings_of.items()
-        }
+    for (kind, name), by_run in sorted(texts.items()):
+        values = {label: ", ".join(sorted(by_run.get(label, "–"))) for label in runs}
         if len(set(values.values())) > 1:
             rows.append({"of": kind, "setting": name, "values": values})
     return rows
 
 
-def _settings(metrics: Metrics) -> Iterator[tuple[tuple[str, str], str]]:
-    """((kind, setting), value) for every value that the run's artefacts have."""
-    kinds: list[tuple[str, Mapping[str, Any]]] = []
+def _settings(metrics: Metrics) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """(kind, settings) of the run's artefacts and data; the domain's settings are the data's own."""
     for artefact in metrics["provenance"]["artefacts"]:
-        # the domain's settings are the data's own, told below
         config = {name: value for name, value in artefact["config"].items() if name != "domain_config"}
-        kinds += [(artefact["kind"], {"seed": artefact["seed"]}), (artefact["kind"], config)]
-        kinds.append(("versions", artefact["versions"]))
-        kinds += [("data", {"sha256": entry["sha256"][:10]}) for entry in artefact["inputs"] if entry["kind"] == "data"]
+        yield artefact["kind"], {"seed": artefact["seed"]}
+        yield artefact["kind"], config
+        yield "versions", artefact["versions"]
+        yield from (("data", {"sha256": item["sha256"][:10]}) for item in artefact["inputs"] if item["kind"] == "data")
     for data in metrics["provenance"]["data"]:
-        kinds += [("data", {"seed": data["seed"]}), ("data", data["config"])]
-    for kind, settings in kinds:
-        for name, value in settings.items():
-            yield (kind, name), value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        yield "data", {"seed": data["seed"]}
+        yield "data", data["config"]
 
 
 def compare_runs(rows: Mapping[str, Sequence[Row]]) -> Rows:
@@ -148,21 +136,12 @@ def winners(comparisons: Rows) -> list[str]:
     return lines or ["no pairs: no two runs share a seed of the same agent or method"]
 
 
-def common_names(tables: Sequence[Sequence[Mapping[str, Any]]], key: str = "name") -> list[str]:
-    """The names that every table has, in the first one's order."""
-    first, *others = tables
-    names = dict.fromkeys(row[key] for row in first)
-    return [name for name in names if all(any(row[key] == name for row in table) for table in others)]
-
-
 def compared_sections(runs: Runs, arrays: Curves, comparison: Mapping[str, Any], material: Material) -> list[Block]:
     """The page's sections; of results only those that every run has.
 
     ``comparison`` has ``runs``, ``shared``, ``differences`` and ``comparisons``; figures are added to the material.
     """
-    results = [
-        _result(name, part, runs, arrays, material) for name, part in PARTS.items() if name in comparison["shared"]
-    ]
+    results = [_result(name, PARTS[name], runs, arrays, material) for name in comparison["shared"]]
     return [_runs(comparison), _differences(comparison), *results, _pairs(comparison)]
 
 
@@ -174,7 +153,8 @@ def _result(name: str, part: Part, runs: Runs, arrays: Curves, material: Materia
 
     entries = [{**entry, "run": run} for run, metrics in runs.items() for entry in part.entries(metrics)]
     together = [entry for group in grouped(entries, alike).values() for entry in group]
-    columns = [*(column._replace(once=column.once or alike) for column in part.first), RUN, *part.then]
+    columns = [*(column._replace(once=column.once or alike) for column in part.first), page.label("run", "run")]
+    columns += part.then
     table = page.table(columns, together, tight=name != "agents", caption=part.caption)
     drawn = [page.shown(material, figure) for figure in _curves(runs, arrays)] if name == "agents" else []
     return page.section(name, part.title, [], [table, *drawn])
@@ -213,48 +193,32 @@ def _differences(comparison: Entry) -> Block:
 
 def _curves(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
     """Of each agent that every run has its reward and length, a line per run; of all agents where there is none."""
-    names = common_names([metrics["agents"] for metrics in runs.values()])
-    for index, name in enumerate(names):
-        for quantity in QUANTITIES:
-            yield _curve(runs, arrays, f"{quantity}-{index}", quantity, [(run, name, run) for run in runs], name)
-    if not names:
-        wanted = [(run, agent["name"], f"{run}: {agent['name']}") for run in runs for agent in runs[run]["agents"]]
-        for quantity in QUANTITIES:
-            yield _curve(runs, arrays, quantity, quantity, wanted, "every agent")
-
-
-def _curve(
-    runs: Runs, arrays: Curves, identity: str, quantity: str, wanted: Sequence[tuple[str, str, str]], name: str
-) -> Drawn:
-    """A figure with a line for each (run, agent, what it is called)."""
-    drawn = wanted[:MOST_LINES]
-    lines = []
-    for index, (run, agent, called) in enumerate(drawn):
-        agents = runs[run]["agents"]
-        place = [other["name"] for other in agents].index(agent)
-        values = curves.values_of(agents[place], arrays[run][f"curves/{place}/{quantity}"])
-        look = PALETTE[index], STYLES[index % len(STYLES)]
-        lines.append(curves.Line(called, arrays[run]["curves/grid"], values, *look))
-    heading, axis = QUANTITIES[quantity]
-    bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
-    played = ((run, page.pick(runs[run]["agents"], "name", agent)) for run, agent, _ in drawn)
-    counts = "; ".join(f"{run}, {curves.runs_of(agent)}" for run, agent in played)
-    left = page.listed([called for _, _, called in wanted[MOST_LINES:]])
-    more = f" Not drawn: {left}." if wanted[MOST_LINES:] else ""
-    caption = (
-        f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and seeds; "
-        f"{curves.BANDS} over them ({counts}).{more}"
-    )
-    title = f"{heading}: {name}"
-    return Drawn(identity, title, curves.learning_curves(lines, axis, (), bounds), caption, heading=title)
+    agents = [(run, index, agent) for run in runs for index, agent in enumerate(runs[run]["agents"])]
+    by_name = grouped(agents, lambda item: str(item[2]["name"]))
+    common = {name: alike for name, alike in by_name.items() if len(alike) == len(runs)}
+    for number, (name, shown) in enumerate((common or {"every agent": agents}).items()):
+        for quantity, (heading, axis) in curves.AXES.items():
+            lines = []
+            for (run, index, agent), colour, style in zip(shown, cycle(PALETTE), cycle(STYLES)):
+                values = curves.values_of(agent, arrays[run][f"curves/{index}/{quantity}"])
+                label = run if common else f"{run}: {agent['name']}"
+                lines.append(curves.Line(label, arrays[run]["curves/grid"], values, colour, style))
+            counts = "; ".join(f"{run}, {curves.runs_of(agent)}" for run, _, agent in shown)
+            caption = (
+                f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and "
+                f"seeds; {curves.BANDS} over them ({counts})."
+            )
+            title = f"{heading}: {name}"
+            yield Drawn(f"{quantity}-{number}", title, curves.learning_curves(lines, quantity), caption, heading=title)
 
 
 def _pairs(comparison: Mapping[str, Any]) -> Block:
     first = comparison["runs"][0]["label"]
-    digits = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
-    rows = comparison["comparisons"]
     blocks = page.comparison_tables(
-        rows, "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)", digits
+        comparison["comparisons"],
+        "seed, and layout, sub-goal or ladder",
+        "layouts (or seeds of ensembles or of one layout)",
+        DIGITS,
     )
     text = (
         f"{first} against each other run, over what both have with the same seed."
@@ -270,10 +234,7 @@ PARTS: Mapping[str, Part] = {
         itemgetter("agents"),
         [curves.AGENT],
         curves.HEADLINE,
-        "Over the last 100 training episodes of each run of an agent: mean ± standard error over layouts, or over "
-        f"runs of one layout. Within {curves.NEAR} shortest paths, in short near: the share of episodes that succeeded "
-        "so soon. 95 % at: median number of environment steps at which 95 of the last 100 episodes succeeded, or how "
-        "many runs got there.",
+        f"{curves.HEADLINE_CAPTION}.",
         curves.PAIRS,
     ),
     "hypotheses": Part(
@@ -281,8 +242,7 @@ PARTS: Mapping[str, Part] = {
         itemgetter("hypotheses"),
         [hypotheses.ENSEMBLE, page.label("sub-goal", "sub_goal")],
         [*hypotheses.SCORES, hypotheses.DISAGREE, hypotheses.SEEDS],
-        "Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of held-out states on "
-        "which two members disagree; mean over ensemble seeds ± standard error.",
+        hypotheses.CAPTION,
         hypotheses.PAIRS,
     ),
     "rooms": Part(
@@ -304,9 +264,8 @@ PARTS: Mapping[str, Part] = {
             distance.SHARED[0],
             distance.SEEDS,
         ],
-        "Distance (units of position, lower is better) from where options stop to the nearest true base, mean over the "
-        "ladders named: of the best, the validated, the mean and the worst member; share of the best member's "
-        "executions that got to one. Mean over seeds ± standard deviation. Runs with other ladders are not alike.",
+        "Distance from where options stop to the nearest true base, mean over the ladders named; share of the best "
+        "member's executions that got to one. Mean over seeds ± standard deviation. Only the same ladders compare.",
         distance.PAIRS,
     ),
 }

@@ -7,49 +7,29 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table as Printed
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation import page
-from hypogoal.evaluation.numbers import (
-    BOOTSTRAP_FROM,
-    Metrics,
-    by_layout,
-    ensemble_name,
-    grouped,
-    mean_of,
-    name_apart,
-)
+from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, Metrics, by_layout, ensemble_name, grouped, mean_of, name_apart
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import (
-    BLUE,
-    GREEN,
-    GREY,
-    NARROW,
-    ORANGE,
-    PURPLE,
-    SKY,
-    STYLES,
-    VERMILLION,
-    label_lines,
-    styled,
-)
-from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
+from hypogoal.evaluation.plots import BLUE, GREEN, GREY, NARROW, ORANGE, PURPLE, SKY, STYLES, VERMILLION, drawing
+from hypogoal.evaluation.run import read_layout
 from hypogoal.evaluation.table import Number, Pairs, Row, Table, by_fields, rows_of, select, tabulate, wide
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
+from hypogoal.learners.episodes import LAST
+from hypogoal.options.tables import Episodes
 
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
 SEVERAL = 3  # runs of an agent from which on intervals and pairs say more than the runs
 SOLVED = 0.95  # share of the window's episodes
 NEAR = 1.5  # times the shortest path
+WITHIN = {"near": NEAR, "within_2": 2.0}  # times the shortest path
 LEARNED = "options (learned members)"
 THOMPSON = "Thompson sampling"  # over learned members
 RANDOM = "random choice"
@@ -70,9 +50,11 @@ BANDS = (
     "runs of one of several layouts count once, by their mean. Thin lines: each of fewer than 8; else bands: ± one "
     "standard error"
 )
-HIGHER = {"success": True, "length": False, "near": True}  # compared; the higher is better
-Bounds = tuple[float | None, float | None]
-SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
+AXES = {  # of curves: title, and the y axis's label
+    "reward": ("Undiscounted reward per episode", "reward per episode"),
+    "length": ("Episode length", "episode length (steps)"),
+}
+SHARES = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
 SOLID, DASHED, MIXED, LONG, SHORT = STYLES
 COLOURS = {  # lines differ in how they are drawn, too, for readers who do not see their colours
     LEARNED: (BLUE, SOLID),
@@ -113,12 +95,12 @@ def read_run(artefact: Artefact, path: str) -> Run:
     config = artefact.config
     if artefact.kind != "baseline":
         config["ensemble"] = ensemble_name(open_artefact(artefact.input("ensemble"), "ensemble").config)
-    episodes, layout = read_episodes(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
+    episodes, layout = Episodes.read(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
     return Run(artefact.kind, path, artefact.seed, config, episodes, layout)
 
 
 def trailing_mean(
-    steps: NDArray[np.int64], values: NDArray[np.float64], grid: NDArray[np.int64], window: int = WINDOW, least: int = 1
+    steps: NDArray[np.int64], values: NDArray[np.float64], grid: NDArray[np.int64], window: int = LAST, least: int = 1
 ) -> NDArray[np.float64]:
     """Spec F5: at each point of ``grid`` (G,) the mean of the last ``window`` values known by then, float64 (G,).
 
@@ -132,14 +114,14 @@ def trailing_mean(
     return np.where(counts >= max(1, least), (sums[end] - sums[start]) / np.maximum(counts, 1), np.nan)
 
 
-def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = WINDOW) -> dict[str, NDArray[np.float64]]:
+def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = LAST) -> dict[str, NDArray[np.float64]]:
     """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`."""
     values = {"reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length}
     floats = {name: numbers.astype(np.float64) for name, numbers in values.items()}
     return {name: trailing_mean(episodes.step, numbers, grid, window, FIRST) for name, numbers in floats.items()}
 
 
-def steps_to_solve(episodes: Episodes, window: int = WINDOW) -> int | None:
+def steps_to_solve(episodes: Episodes, window: int = LAST) -> int | None:
     """Spec F5: the first step at which 95 % of the last ``window`` episodes succeeded; None: never, or too few."""
     if len(episodes.step) < window:
         return None
@@ -149,19 +131,26 @@ def steps_to_solve(episodes: Episodes, window: int = WINDOW) -> int | None:
     return int(episodes.step[reached[0] + window - 1]) if len(reached) else None
 
 
-def near_shortest(episodes: Episodes, shortest_path: int | None) -> float:
-    """Share that succeeded within ``NEAR`` times the layout's shortest path (steps); NaN if unknown, or no episodes."""
-    return mean_of(episodes.succeeded & (episodes.length <= NEAR * shortest_path)) if shortest_path else math.nan
+def scores(
+    succeeded: NDArray[np.bool_], steps: NDArray[np.int64], shortest: float | NDArray[np.float64] | None
+) -> dict[str, NDArray[np.float64]]:
+    """``success``, and success within so many times the shortest path, ``WITHIN``: 1 or 0 of each episode (E, ...).
 
-
-def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WINDOW) -> dict[str, float | int | None]:
-    """Spec F5: what is said of one run, from all of its training episodes.
-
-    episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio) and near
-    (see :func:`near_shortest`) over the last episodes, ``window`` of them at most, and steps_to_95; NaN where there is
-    no episode. ``shortest_path`` is primitive steps from the start to the goal at least.
+    ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
     """
-    last = episodes.last(window)
+    path = np.asarray(np.nan if shortest is None else shortest, dtype=np.float64)
+    defined = np.where(np.isnan(path), np.nan, 1.0)
+    within = {name: defined * (succeeded & (steps <= factor * path)) for name, factor in WITHIN.items()}
+    return {"success": succeeded * 1.0, **within}
+
+
+def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = LAST) -> dict[str, float | int | None]:
+    """Spec F5: the numbers of one run, over its last ``window`` training episodes at most; NaN without episodes.
+
+    ``shortest_path``: primitive steps from the start to the goal at least; None or 0 where unknown. ``window`` in the
+    numbers: episodes actually averaged.
+    """
+    last, shortest = episodes.last(window), shortest_path or math.nan
     length = mean_of(last.length)
     return {
         "episodes": len(episodes.step),
@@ -169,31 +158,28 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WIN
         "success": mean_of(last.succeeded),
         "reward": mean_of(last.reward),
         "length": length,
-        "length_over_shortest": length / shortest_path if shortest_path else math.nan,
-        "near": near_shortest(last, shortest_path),
+        "length_over_shortest": length / shortest,
+        "near": mean_of(scores(last.succeeded, last.length, shortest)["near"]),
         "steps_to_95": steps_to_solve(episodes, window),
     }
 
 
 def base_name(kind: str, config: Mapping[str, Any]) -> str:
-    """Spec E6, E7: what an agent is called by how it chooses and what ends its options."""
+    """Spec E6, E7: an agent's name: how it chooses and what ends its options."""
     if kind == "baseline":
         return f"{config['agent'].upper()} {config['setting']}" + (", bonus" if config.get("bonus") else "")
     if kind == "options":
         return PRETRAINING
-    if config["chooser"] == "thompson":
-        return f"{THOMPSON}, {ORACLE}" if config["termination"] == "oracle" else THOMPSON
-    if config["termination"] == "oracle":
-        return ORACLE_RANDOM if config["chooser"] == "random" else ORACLE
-    return RANDOM if config["chooser"] == "random" else LEARNED
+    chooser, oracle = config["chooser"], config["termination"] == "oracle"
+    if chooser == "random":
+        return ORACLE_RANDOM if oracle else RANDOM
+    if chooser == "thompson":
+        return f"{THOMPSON}, {ORACLE}" if oracle else THOMPSON
+    return (ORACLE if oracle else LEARNED) + ("" if chooser == "ppo" else f", chooser={chooser}")
 
 
 def group_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs by the name of their agent, in the order of ``ORDER``.
-
-    Runs of the same name whose settings differ (the layout aside) are different agents: what differs is added to
-    the name, so that nothing is averaged that should not be.
-    """
+    """Runs by the name of their agent, in the order of ``ORDER``; settings that differ, the layout aside, are named."""
     bases = [base_name(run.kind, run.config) for run in runs]
     ranks = [ORDER.index(base) if base in ORDER else len(ORDER) for base in bases]
     names = name_apart(bases, [run.config for run in runs])
@@ -202,7 +188,7 @@ def group_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 OVER_RUNS = Table({"name": "method"}, {name: Number(name, "", unit) for name, unit in UNITS.items()})
-PAIRS = Pairs("agents", {name: Number(name, higher=higher) for name, higher in HIGHER.items()})
+PAIRS = Pairs("agents", {name: Number(name, higher=name != "length") for name in ("success", "length", "near")})
 
 
 def rows_of_run(run: Run, name: str) -> Iterator[Row]:
@@ -217,10 +203,9 @@ def _place(run: Run, name: str) -> dict[str, Any]:
 
 
 def agents_table(rows: Sequence[Row], groups: Mapping[str, Sequence[Run]]) -> list[dict[str, Any]]:
-    """Spec F5: of every agent each run's numbers and, for each number, what is said of it over runs.
+    """Spec F5: of every agent each run's numbers and, for each of ``UNITS``, its statistics over runs.
 
-    name, kind, runs, an entry per key of ``UNITS`` (see ``numbers.over``), and ``steps_to_95``: how many of the runs
-    reached it, and the median over all runs, None where half did not.
+    ``steps_to_95``: how many of the runs reached it, and the median over all runs, None where half did not.
     """
     rows = select(rows, method=tuple(groups), scope="", step="", member="")
     by_agent = by_fields(rows, "method")
@@ -240,10 +225,8 @@ def agents_table(rows: Sequence[Row], groups: Mapping[str, Sequence[Run]]) -> li
 def agent_curves(runs: Sequence[Run], grid: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
     """Figure 6: reward, success and length of every run on the common grid, each (R, G); NaN beyond a run's budget."""
     drawn = [curves(run.episodes, grid) for run in runs]
-    ends = np.array([run.budget for run in runs])[:, None]
-    return {
-        key: np.where(grid <= ends, np.stack([by_quantity[key] for by_quantity in drawn]), np.nan) for key in drawn[0]
-    }
+    beyond = grid > np.array([run.budget for run in runs])[:, None]
+    return {name: np.where(beyond, np.nan, np.stack([of_run[name] for of_run in drawn])) for name in drawn[0]}
 
 
 def common_grid(runs: Sequence[Run], points: int = 151) -> NDArray[np.int64]:
@@ -258,9 +241,8 @@ def rows(work: Work) -> Iterator[Row]:
     float (runs, grid).
     """
     every = [run for runs in work.agents.values() for run in runs]
-    grid = common_grid(every) if every else np.zeros(0, np.int64)
     if every:
-        work.arrays["curves/grid"] = grid
+        work.arrays["curves/grid"] = grid = common_grid(every)
     for index, (name, runs) in enumerate(work.agents.items()):
         drawn = agent_curves(runs, grid)
         for quantity, values in drawn.items():
@@ -285,12 +267,6 @@ def view(work: Work) -> dict[str, Any]:
     """Every agent, and how hard its layouts are."""
     every = [run for runs in work.agents.values() for run in runs]
     return {"agents": agents_table(work.rows, work.agents), "layouts": layouts_of(every)}
-
-
-def layout_of(facts: Entry) -> int | str:
-    """Where a run lives: a layout's seed, or the many that it draws from."""
-    where: int | str = facts.get("layouts") or facts["layout_seed"]
-    return where
 
 
 def missing(work: Work) -> list[str]:
@@ -318,6 +294,12 @@ HEADLINE = (
     page.number("× shortest", "length_over_shortest", page.spread, 2),
     page.number(*NEARLY, page.spread, 2),
     SOLVED_AT,
+)
+HEADLINE_CAPTION = (
+    "Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs of one layout. "
+    "Steps: length of an episode, failures counted at the cap; × shortest: against the layout's shortest path. Within "
+    f"{NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. 95 % at: median number of "
+    "environment steps, in thousands, at which 95 of the last 100 episodes succeeded, or how many runs got there"
 )
 PLAIN = (
     AGENT,
@@ -363,11 +345,7 @@ def summary_section(material: Material) -> Block:
         (AGENT, *HEADLINE),
         metrics["agents"],
         main=lambda agent: bool(agent["name"] == LEARNED),
-        caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
-        "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
-        f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
-        "95 % at: median number of environment steps, in thousands, at which 95 of "
-        "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
+        caption=f"{HEADLINE_CAPTION}; steps of train-options count.",
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
     row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": question}
@@ -427,7 +405,8 @@ def _episodes(agent: Mapping[str, Any]) -> str:
 def runs_of(agent: Entry) -> str:
     """How many runs an agent has, and of which layouts and seeds."""
     runs = agent["runs"]
-    layouts, seeds = sorted({layout_of(run) for run in runs}, key=str), sorted({run["seed"] for run in runs})
+    seeds = sorted({run["seed"] for run in runs})
+    layouts = sorted({run.get("layouts") or run["layout_seed"] for run in runs}, key=str)
     return (
         f"{len(runs)} run{'s' if len(runs) > 1 else ''}: layout seed{'s' if len(layouts) > 1 else ''} "
         f"{page.listed(layouts)}, run seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}"
@@ -451,32 +430,33 @@ def runs_section(material: Material) -> Block:
 
 def figures(material: Material) -> list[Drawn]:
     """Figure 6 and the same of episode length."""
-    return [_curve(material, quantity) for quantity in ("reward", "length")] if material.metrics["agents"] else []
+    return [_curve(material, quantity) for quantity in AXES] if material.metrics["agents"] else []
 
 
 def _curve(material: Material, quantity: str) -> Drawn:
     agents, layouts, arrays = material.metrics["agents"], material.metrics["layouts"], material.arrays
     used = {COLOURS.get(agent["name"]) for agent in agents}
     others = cycle(look for look in OTHERS if look not in used)
-    looks = [COLOURS.get(agent["name"]) or next(others) for agent in agents]
     lines = [
-        Line(agent["name"], arrays["curves/grid"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
-        for index, (agent, look) in enumerate(zip(agents, looks, strict=True))
+        Line(
+            agent["name"],
+            arrays["curves/grid"],
+            values_of(agent, arrays[f"curves/{index}/{quantity}"]),
+            *(COLOURS.get(agent["name"]) or next(others)),
+        )
+        for index, agent in enumerate(agents)
     ]
-    bounds: Bounds
     if quantity == "reward":
-        title, axis, bounds = "Undiscounted reward per episode", "reward per episode", reward_bounds(lines)
         # A share of episodes says nothing on an axis of other rewards.
-        values = [layout["random_success"] for layout in layouts if bounds == SHARES]
+        values = [layout["random_success"] for layout in layouts if limits_of(quantity, lines) == SHARES]
         which_figure, name, dotted = "Figure 6 of the paper", "random play", "uniformly random play"
     else:
-        title, axis, bounds = "Episode length", "episode length (steps)", (0.0, None)
         values = [layout["shortest_path"] or None for layout in layouts]
         which_figure, name, dotted = "Beside Figure 6 of the paper", "shortest path", "the shortest path"
     values = [value for value in values if value is not None]
-    references = [(name, float(np.mean(values)))] if values else []
-    drawn = learning_curves(lines, axis, references, bounds)
-    reference = f" Dotted: mean over layouts of {dotted}." if references else ""
+    title, _ = AXES[quantity]
+    drawn = learning_curves(lines, quantity, {name: float(np.mean(values))} if values else {})
+    reference = f" Dotted: mean over layouts of {dotted}." if values else ""
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
         f"{which_figure}: {title.lower()}, mean of the last 100 at each step.{several} {agents[0]['name']}: "
@@ -496,51 +476,42 @@ class Line:
     style: Any = SOLID
 
 
-def reward_bounds(lines: Sequence[Line]) -> Bounds:
-    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values."""
-    values = np.concatenate([np.zeros(0), *(line.values.ravel() for line in lines)])
+def limits_of(quantity: str, lines: Sequence[Line]) -> tuple[float | None, float | None]:
+    """The y axis: 0 to 1 where rewards are shares of episodes, else what fits them; lengths from 0."""
+    if quantity == "length":
+        return 0.0, None
+    values = np.concatenate([line.values.ravel() for line in lines])
     return (None, None) if ((values < 0) | (values > 1)).any() else SHARES
 
 
-def learning_curves(
-    lines: Sequence[Line], quantity: str, references: Sequence[tuple[str, float]] = (), bounds: Bounds = (0.0, None)
-) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps, a line per agent; the mean, and of few layouts or
-    runs each, of more a band of one standard error.
+def learning_curves(lines: Sequence[Line], quantity: str, references: Mapping[str, float] | None = None) -> Figure:
+    """Figure 6: a quantity of episodes against environment steps, a line per agent, ``references`` dotted across.
 
-    ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
-    of the y axis that is None is what fits the values.
+    The mean, and of few layouts or runs each, of more a band of one standard error.
     """
-    with styled():
-        figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
-        axes = figure.subplots()
+    with drawing(2.9, 2, NARROW, beside=True, handlelength=2.4) as (figure, axes):
         for line in lines:
-            _draw_curve(axes, line)
-        for name, value in references:
+            steps, defined = line.steps / 1000, np.ma.masked_invalid(line.values)
+            mean = defined.mean(0).filled(np.nan)
+            look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
+            axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
+            if len(defined) >= BOOTSTRAP_FROM:
+                error = defined.std(0, ddof=1) / np.sqrt(defined.count(0))
+                axes.fill_between(steps, mean - error, mean + error, color=line.colour, alpha=0.18, linewidth=0)
+            elif len(defined) > 1:
+                axes.plot(steps, line.values.T, linewidth=0.6, alpha=0.5, **look)
+        for name, value in (references or {}).items():
             axes.axhline(value, color=GREY, linewidth=1.2, linestyle=":", label=name)
         axes.set_xlabel("environment steps, in thousands")
-        axes.set_ylabel(quantity)
+        axes.set_ylabel(AXES[quantity][1])
         axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
-        axes.set_ylim(*bounds)
-        label_lines(figure, axes, 2, handlelength=2.4)
+        axes.set_ylim(*limits_of(quantity, lines))
     return figure
 
 
 def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """An agent's curves as they are averaged: of its runs (R, G) each layout's mean where there are several layouts."""
     return by_layout(values, [run["layout_seed"] for run in agent["runs"]])[0]
-
-
-def _draw_curve(axes: Axes, line: Line) -> None:
-    steps, defined = line.steps / 1000, np.ma.masked_invalid(line.values)
-    mean = defined.mean(0).filled(np.nan)
-    look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
-    axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
-    if len(defined) >= BOOTSTRAP_FROM:
-        error = defined.std(0, ddof=1) / np.sqrt(defined.count(0))
-        axes.fill_between(steps, mean - error, mean + error, color=line.colour, alpha=0.18, linewidth=0)
-    elif len(defined) > 1:
-        axes.plot(steps, line.values.T, linewidth=0.6, alpha=0.5, **look)
 
 
 def variants(entries: Iterable[Entry]) -> list[Entry]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,6 +19,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.own_code import UsersCode, as_number
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import (
     ORACLE,
     Metrics,
@@ -36,7 +38,7 @@ from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
 from hypogoal.evaluation.rooms import VALIDATION, group_name
-from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, thresholds_of, within
+from hypogoal.evaluation.run import read_terminations, takes, thresholds_of, within
 from hypogoal.evaluation.table import (
     BEST,
     VALIDATED,
@@ -51,20 +53,17 @@ from hypogoal.evaluation.table import (
     with_members,
 )
 from hypogoal.hypotheses.scores import most_and_least
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
+from hypogoal.learners.episodes import LAST
+from hypogoal.options.tables import Executions
 
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
 SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
 PICKED = {"best": BEST, "validated": VALIDATED, "mean": "mean", "worst": WORST}
-NUMBERS = {
-    **{which: Number("distance", "", "units of position", member) for which, member in PICKED.items()},
-    "executions_deviation": Number("executions_deviation", "", "units of position", BEST),
-    **{share: Number(share, "", "share of executions", BEST) for share in SHARES},
-}
+NUMBERS = {which: Number("distance", "", "units of position", member) for which, member in PICKED.items()}
+NUMBERS["executions_deviation"] = Number("executions_deviation", "", "units of position", BEST)
+NUMBERS |= {share: Number(share, "", "share of executions", BEST) for share in SHARES}
 OF_OPTIONS = ("executions", "distance", "executions_deviation", "duration", *SHARES, "threshold")
 QUANTITIES = (*OF_OPTIONS, BEST, WORST, VALIDATED)
 NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
@@ -95,12 +94,10 @@ def fates(executions: Executions) -> NDArray[np.int64]:
 
 
 def option_numbers(executions: Executions, *, never_offered: bool = False) -> dict[str, float | int]:
-    """Spec F3: what is said of one option's last executions.
+    """Spec F3: the numbers of one option's last executions; NaN without executions, the deviation also of one.
 
-    executions (how many), distance (mean as counted), executions_deviation (of it, n - 1), duration (mean steps), and
-    shares of executions: reached_base, inside_at_start, timed_out (neither its classifier nor a death ended it), died.
-    NaN without executions, the deviation also of one. An option ``never_offered`` has none because it would always have
-    begun inside its own termination set: that counts 300.
+    An option ``never_offered`` has none because it would always have begun inside its own termination set: it counts
+    300. Units: the domain's; duration in steps; shares of executions. Timed out: neither classifier nor death ended it.
     """
     distance, count = counted(executions), len(executions.step)
     shares = {
@@ -128,11 +125,10 @@ def rows_of_ladder(
     thresholds: NDArray[np.float64] | None = None,
     **place: Any,
 ) -> Iterator[Row]:
-    """Spec F3: one options artefact, which was trained from one start (a ladder), on G sub-goals with K members each.
+    """Spec F3: one options artefact, trained from one start (a ladder) on G sub-goals with K members each.
 
-    Per sub-goal each member's numbers, with its threshold (of (G*K,)), and which member is the best (the least mean
-    distance), the worst, and the one that validation rooms pick. ``masked``: options that would begin inside their own
-    termination set were not offered (Spec D6).
+    Per sub-goal each member's numbers, with its threshold (of (G*K,)); the best member (the least mean distance), the
+    worst, and the validated one. ``masked``: options that would begin inside were not offered (Spec D6).
     """
     masked = masked and len(executions.step) > 0
     for index, sub_goal in enumerate(sub_goals):
@@ -171,33 +167,26 @@ def distance_table(rows: Sequence[Row], ladders: Sequence[str]) -> list[dict[str
     """Spec F3, Figure 4: per method and N distances over seeds, each seed's mean over the run's ladders first.
 
     Entries have the distance of the best, validated, mean and worst member and the best member's shares. A seed that
-    lacks one of the ladders is left out, so that nothing is compared over unlike ladders; ``each_seed`` has what the
-    others came to, the best member's. Artefacts alike in all of this count each for itself.
+    lacks a ladder is left out: unlike ladders are not averaged. Artefacts with one seed and ladder all count.
     """
     table = []
     cells = by_fields(_of_options(rows), "method", "N", "sub_goal")
     for key in sorted(cells, key=by_method):
+        by_seed: dict[tuple[int, int], dict[str, list[Row]]] = {}
+        artefacts: Counter[tuple[Any, ...]] = Counter()
+        for (seed, ladder, _), of_artefact in by_fields(cells[key], "seed", "ladder", "artefact").items():
+            by_seed.setdefault((seed, artefacts[seed, ladder]), {})[ladder] = of_artefact
+            artefacts[seed, ladder] += 1
+        seeds = [seed for seed in sorted(by_seed) if by_seed[seed].keys() >= set(ladders)]
+        incomplete = [seed for seed, number in sorted(by_seed) if (seed, number) not in seeds]
         entry: dict[str, Any] = dict(zip(("method", "groups", "sub_goal"), key, strict=True))
-        numbers = {name: _of_ladders(cells[key], number) for name, number in NUMBERS.items()}
-        seeds = sorted({seed for seed, _ in numbers["best"]})
-        whole = [seed for seed in seeds if all((seed, ladder) in numbers["best"] for ladder in ladders)]
-        incomplete = [seed for seed, before in seeds if (seed, before) not in whole]
-        entry |= {"ladders": list(ladders), "seeds": len(whole), "incomplete_seeds": incomplete}
+        entry |= {"ladders": list(ladders), "seeds": len(seeds), "incomplete_seeds": incomplete}
         for name, number in NUMBERS.items():
-            means = [float(np.mean([numbers[name][seed, ladder] for ladder in ladders])) for seed in whole]
+            means = [float(np.mean([per_run(by_seed[seed][on], number)[0][1] for on in ladders])) for seed in seeds]
             entry |= {"each_seed": means} if name == "best" else {}
             entry[name] = over(means, number.unit, "distance", *map(str, key), name, deviation=True)
         table.append(entry)
     return table
-
-
-def _of_ladders(rows: Sequence[Row], number: Number) -> dict[tuple[tuple[int, int], str], float]:
-    """A number by seed and ladder; several artefacts with the same seed and ladder are counted."""
-    values: dict[tuple[tuple[int, int], str], float] = {}
-    for row, value in per_run(rows, number):
-        before = sum((seed, ladder) == (row.seed, row.ladder) for (seed, _), ladder in values)
-        values[(int(row.seed), before), row.ladder] = value
-    return values
 
 
 def ladder_names(
@@ -226,7 +215,7 @@ def rows(work: Work) -> Iterator[Row]:
     """Spec F3: every member's option on every ladder: where its executions stopped; overlays go to the arrays."""
     for artefact, (validated, place) in zip(work.contents.ladders, _named(work), strict=True):
         path, config = work.contents.name(artefact), artefact.config
-        executions = read_executions(artefact.path / "executions.csv")
+        executions = Executions.read(artefact.path / "executions.csv")
         if "terminations.h5" in artefact.manifest["files"]:
             for option, states in read_terminations(artefact.path / "terminations.h5").items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
@@ -237,11 +226,7 @@ def rows(work: Work) -> Iterator[Row]:
 
 
 def view(work: Work) -> dict[str, Any]:
-    """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
-
-    ``options``: an entry per artefact and sub-goal; ``over_ladders``: over seeds; ``shown``: what Figure 5 is drawn of,
-    for each ladder and N the best members of the first seed, whose stops are in the arrays.
-    """
+    """Spec F3, F4: ``options`` of each artefact and sub-goal; ``over_ladders``, over seeds; ``shown`` in Figure 5."""
     contents = work.contents
     artefacts = {contents.name(artefact): artefact for artefact in contents.ladders}
     options = options_of(work.rows)
@@ -254,7 +239,7 @@ def view(work: Work) -> dict[str, Any]:
     used = {entry["ladder"] for entry in options}
     starts = [start for start in (domain.starts if domain else ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
-    executions = {path: read_executions(artefact.path / "executions.csv") for path, artefact in artefacts.items()}
+    executions = {path: Executions.read(artefact.path / "executions.csv") for path, artefact in artefacts.items()}
     stops = show_stops(options, ladders, executions, domain, work.arrays)
     return {"distance": {"options": options, "over_ladders": distance_table(work.rows, ladders), "shown": stops}}
 
@@ -289,9 +274,8 @@ def show_stops(
 ) -> list[dict[str, Any]]:
     """Figure 5's material: for each ladder and N the best members' stops of the first seed, and pictures of the rooms.
 
-    Rows are those of :func:`options_of`; ``executions`` are by their paths.
-    ``stops/<path>/<option>`` and ``pictures/<room>`` are written into ``arrays``. Per figure: ladder, groups, seed,
-    rooms and columns; none where the domain has no pictures.
+    Rows are those of :func:`options_of`, ``executions`` by their paths. ``stops/<path>/<option>/{positions,pixels,
+    fates}`` and ``pictures/<room>`` are written into ``arrays``. None where the domain has no pictures.
     """
     if domain is None or not domain.pictures:
         return []
@@ -307,7 +291,12 @@ def show_stops(
             if row["groups"] == groups or row["method"].startswith(ORACLE):
                 best = row["options"][row["best"]]
                 stops = executions[row["path"]].of(best["option"])
-                _write_stops(arrays, row["path"], best["option"], stops, domain)
+                group = arrays.require_group(f"stops/{row['path']}/{best['option']}")
+                if not len(group):  # the oracle's stand beside every N
+                    group["positions"] = stops.positions()
+                    with UsersCode("the domain's pixel", domain, "pixel"):
+                        group["pixels"] = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
+                    group["fates"] = fates(stops)
                 columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
                 where.append(stops.room)
         if columns:
@@ -333,17 +322,6 @@ def _picture(domain: Domain, room: int) -> NDArray[np.uint8]:
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         code.refuse(f"gave {picture.dtype} {picture.shape}", "Give uint8 (height, width, 3).")
     return picture
-
-
-def _write_stops(arrays: Any, path: str, option: int, executions: Executions, domain: Domain) -> None:
-    """Figure 5: ``stops/<options artefact>/<option>/{positions,pixels,fates}``."""
-    group = arrays.require_group(f"stops/{path}/{option}")
-    if len(group):
-        return  # the oracle's stand beside every N
-    group["positions"] = executions.positions()
-    with UsersCode("the domain's pixel", domain, "pixel"):
-        group["pixels"] = np.asarray(domain.pixel(executions.positions()), np.float64).reshape(-1, 2)
-    group["fates"] = fates(executions)
 
 
 def missing(work: Work) -> list[str]:
@@ -398,14 +376,10 @@ def summary(metrics: Metrics) -> list[Printed]:
 
 def sections(material: Material) -> list[Block]:
     """Figures 4 and 5, of a run with ladders."""
-    options = material.metrics["distance"]["options"]
-    return [distance_section(material), stops_section(material)] if options else []
-
-
-def distance_section(material: Material) -> Block:
-    """Figure 4: how far from a true base options stop."""
     distance = material.metrics["distance"]
-    drawn = page.shown(material, _bars(material))
+    if not distance["options"]:
+        return []
+    bars, *stops = (page.shown(material, figure) for figure in figures(material))
     text = (
         "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
         f"rooms, it stops from the nearest true base of a ladder, over its last {LAST} executions; an execution that "
@@ -413,26 +387,29 @@ def distance_section(material: Material) -> Block:
         "with mean, worst and validated member beside it; then the mean over ladders. Oracle termination ends "
         "options at the true base: what is left to it is how well policies were learned."
     )
-    rows = distance["over_ladders"]
-    short = [f"{entry['method']}, {_group(entry)}" for entry in rows if entry["incomplete_seeds"]]
+    rows = _ordered(distance["over_ladders"])
+    short = [f"{entry['method']}, {_group(entry)}" for entry in distance["over_ladders"] if entry["incomplete_seeds"]]
     left = f" Seeds that lack a ladder are left out: {'; '.join(short)}." if short else ""
-    blocks = [
-        drawn,
-        page.table(
-            OVER_LADDERS,
-            _ordered(rows),
-            tight=True,
-            caption="Distance of the best, the validated, the mean and the worst member, mean over ladders; mean "
-            "over seeds ± standard deviation over seeds. ± exec.: the best member's standard deviation over its last "
-            f"{LAST} executions, mean over ladders and seeds. Shares of the best member's executions: at base, within "
-            f"{NEAR} of a true one and not begun inside; inside, begun in its own termination set; timed out; died. A "
-            f"death or a time-out at a base counts as both.{left}",
-        ),
-        *page.comparison_tables(
-            material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
-        ),
+    caption = (
+        "Distance of the best, the validated, the mean and the worst member, mean over ladders; mean over seeds ± "
+        "standard deviation over seeds. ± exec.: the best member's standard deviation over its last "
+        f"{LAST} executions, mean over ladders and seeds. Shares of the best member's executions: at base, within "
+        f"{NEAR} of a true one and not begun inside; inside, begun in its own termination set; timed out; died. A "
+        f"death or a time-out at a base counts as both.{left}"
+    )
+    pairs = page.comparison_tables(
+        material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
+    )
+    table = page.table(OVER_LADDERS, rows, tight=True, caption=caption)
+    where = (
+        f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "
+        "not drawn none or few did. Circles: at a true base. Crosses: anywhere else, by the member's own verdict, out "
+        "of time, or dead. Squares: executions that began inside the option's own termination set."
+    )
+    return [
+        page.section("distance", "Options on ladders", [text], [bars, table, *pairs]),
+        page.section("stops", "Where options stop on the ladders", [where] if distance["shown"] else [], stops),
     ]
-    return page.section("distance", "Options on ladders", [text], blocks)
 
 
 def _ordered(rows: Sequence[Entry]) -> list[Entry]:
@@ -464,20 +441,6 @@ def _bars(material: Material) -> Drawn:
         "executions instead: in the table."
     )
     return Drawn("figure4", name, drawn, caption, "No seed has executions on all ladders of the run.")
-
-
-def stops_section(material: Material) -> Block:
-    """Figure 5: where on the ladders' rooms the best members' options stopped."""
-    text = (
-        f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "
-        "not drawn none or few did. Circles: at a true base. Crosses: anywhere else, by the member's own verdict, out "
-        "of time, or dead. Squares: executions that began inside the option's own termination set."
-    )
-    drawn = _stops(material)
-    texts = [text] if material.metrics["distance"]["shown"] else []
-    return page.section(
-        "stops", "Where options stop on the ladders", texts, [page.shown(material, figure) for figure in drawn]
-    )
 
 
 def _stops(material: Material) -> list[Drawn]:
@@ -517,11 +480,10 @@ def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
 def distance_bars(
     bars: Sequence[tuple[str, str, float, float, Sequence[float]]], names: Sequence[str], inside: float
 ) -> Figure:
-    """Figure 4: the best member's distance; lower is better.
+    """Figure 4: the best member's distance; lower is better. A line marks ``inside`` if it is near.
 
     A bar is method, group, mean, standard deviation (NaN for one seed) and the seeds' own values; groups stand side by
-    side in the order in which they come. Methods are coloured in the order of ``names``, others grey. A line marks
-    ``inside``, what an execution counts that begins inside its own termination set, if it is near.
+    side. Methods are coloured in the order of ``names``, others grey.
     """
     with drawing(3.1, 2, handlelength=2.6) as (figure, axes):
         groups = grouped(bars, itemgetter(1))

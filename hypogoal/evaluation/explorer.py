@@ -1,14 +1,13 @@
 """Held-out states to browse: what each member says, goes by and leads to (Spec F2, F6, F7).
 
-What members say of most states is right, so a sample as it comes would hardly show an error. Here the kinds of outcome
-take turns, and within each the places that states are from; how often a kind comes up therefore says nothing. The page
-holds the states as data; ``templates/explorer.js`` shows those that its filters let through.
+Most predictions are right, so a random sample would hardly show an error. Here the kinds of outcome take turns, and
+within each the places that states are from. ``templates/explorer.js`` shows those that its filters let through.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,10 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, variants
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.table import Row
 
 MOST_STATES = 300  # over all sub-goals: the page of ten DoorKey agents has 1.2 MB, of the ladders 1.7 MB
 MOST_OF_ONE = 180  # of one sub-goal
@@ -68,10 +65,9 @@ def pick_to_browse(
     most: int,
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Which states are shown, int64 (n,) with n at most ``most``, no state twice.
+    """Which states are shown, int64 (n,) with n at most ``most``, by verdicts (N, K), labels (N,), places (N,) each.
 
-    Of verdicts (N, K), labels (N,) and ``places`` (N,) each; states alike in all of the last are from the same place,
-    and ``rng`` draws among states alike.
+    States alike in all places are from the same one; ``rng`` draws among states alike.
     """
     errors = (verdicts != labels[:, None]).sum(1)
     outcome = np.where(errors == 0, 0, np.where(errors == verdicts.shape[1], 2, 1)) * 2 + labels
@@ -92,9 +88,11 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
     return order[np.argsort(turn, kind="stable")]
 
 
-def explorer_section(material: Material) -> Block:
+def sections(material: Material) -> list[Block]:
     """A browser of held-out states, with filters."""
     explored = material.metrics["explorer"]
+    if not explored:
+        return []
     source = page.pick(material.metrics["ensembles"], "path", explored["ensemble"])
     shown, states = (max(goal[key] for goal in explored["sub_goals"]) for key in ("shown", "states"))
     text = (
@@ -119,7 +117,7 @@ def explorer_section(material: Material) -> Block:
         "kind": _any(sorted(kinds)),
     }
     block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "caption": sample}
-    return page.section("explorer", TITLE, [text], [block])
+    return [page.section("explorer", TITLE, [text], [block])]
 
 
 def _any(values: Sequence[str]) -> list[tuple[str, str]]:
@@ -174,45 +172,33 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
         for run in agent["runs"]:
             goal = next((goal for goal in run["sub_goals"] if goal["sub_goal"] == sub_goal), None)
             if run["ensemble"] == ensemble and goal is not None:
-                options.append(_chosen(material, run, goal, member, agent["name"].removeprefix(LEARNED)))
+                option = goal["members"][member]
+                name = f"layout {run['layout_seed']}, run seed {run['seed']}{agent['name'].removeprefix(LEARNED)}"
+                notes = [f"{word} preferred of its sub-goal" for word in ("most", "least") if goal[word] == member]
+                facts = [
+                    ("chosen", f"{option['chosen']:,} of {option['offered']:,} offers"),
+                    ("preference", f"{page.fixed(option['preference'], 2)} (1: as in uniform-random choice)"),
+                    ("its classifier ended it", f"{option['reached']:,} times"),
+                    ("mean steps", page.fixed(option["duration"], 1)),
+                    ("match on this layout", page.fixed(option["match"], 2)),
+                ]
+                png = _overlay(material, run["path"], option["option"])
+                options.append({"name": name, "note": "".join(notes[:1]), "facts": facts, "png": png})
     for row in material.metrics["distance"]["options"]:
         if row["ensemble"] == ensemble and row["sub_goal"] == sub_goal:
-            options.append(_stopped(material, row, member))
+            option = row["options"][member]
+            picks = " and ".join(word for word in ("best", "validated") if row[word] == member)
+            facts = [
+                ("distance from a true base", page.fixed(option["distance"], 1)),
+                ("stopped at one", page.percent(option["reached_base"])),
+                ("began inside", page.percent(option["inside_at_start"])),
+                ("timed out", page.percent(option["timed_out"])),
+                ("mean steps", page.fixed(option["duration"], 1)),
+            ]
+            name, note = f"ladder {row['ladder']}, seed {row['seed']}", f"{picks} member here" if picks else ""
+            png = _overlay(material, row["path"], option["option"])
+            options.append({"name": name, "note": note, "facts": facts, "png": png})
     return options
-
-
-def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: str) -> dict[str, Any]:
-    option = goal["members"][member]
-    notes = [word for word in ("most", "least") if goal[word] == member]
-    return {
-        "name": f"layout {run['layout_seed']}, run seed {run['seed']}{settings}",
-        "note": f"{notes[0]} preferred of its sub-goal" if notes else "",
-        "facts": [
-            ("chosen", f"{option['chosen']:,} of {option['offered']:,} offers"),
-            ("preference", f"{page.fixed(option['preference'], 2)} (1: as in uniform-random choice)"),
-            ("its classifier ended it", f"{option['reached']:,} times"),
-            ("mean steps", page.fixed(option["duration"], 1)),
-            ("match on this layout", page.fixed(option["match"], 2)),
-        ],
-        "png": _overlay(material, run["path"], option["option"]),
-    }
-
-
-def _stopped(material: Material, row: Entry, member: int) -> dict[str, Any]:
-    option = row["options"][member]
-    notes = [word for word in ("best", "validated") if row[word] == member]
-    return {
-        "name": f"ladder {row['ladder']}, seed {row['seed']}",
-        "note": f"{' and '.join(notes)} member here" if notes else "",
-        "facts": [
-            ("distance from a true base", page.fixed(option["distance"], 1)),
-            ("stopped at one", page.percent(option["reached_base"])),
-            ("began inside", page.percent(option["inside_at_start"])),
-            ("timed out", page.percent(option["timed_out"])),
-            ("mean steps", page.fixed(option["duration"], 1)),
-        ],
-        "png": _overlay(material, row["path"], option["option"]),
-    }
 
 
 def _overlay(material: Material, path: str, option: int) -> str:
@@ -223,5 +209,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     view=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=lambda material: [explorer_section(material)] if material.metrics["explorer"] else [],
+    sections=sections,
 )

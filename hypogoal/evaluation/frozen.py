@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.curves import NEAR
+from hypogoal.evaluation.curves import scores
 from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
 from hypogoal.options.loop import NONE, OptionLoop
 from hypogoal.options.recording import Recorder
 
 ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout: 512 episodes,
 STEPS = 1_000  # or more, where so many steps of an environment hold more of the longest ones
-WITHIN = {"near": NEAR, "within_2": 2.0}  # times the shortest path
 
 
 @dataclass(frozen=True)
@@ -41,19 +40,6 @@ class Play:
     def scores(self, shortest: float | NDArray[np.float64] | None) -> dict[str, NDArray[np.float64]]:
         """See :func:`scores`."""
         return scores(self.succeeded, self.length, shortest)
-
-
-def scores(
-    succeeded: NDArray[np.bool_], steps: NDArray[np.int64], shortest: float | NDArray[np.float64] | None
-) -> dict[str, NDArray[np.float64]]:
-    """``success``, and success within so many times the shortest path, ``WITHIN``: 1 or 0 of each episode (E, ...).
-
-    ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
-    """
-    path = np.asarray(np.nan if shortest is None else shortest, dtype=np.float64)
-    defined = np.where(np.isnan(path), np.nan, 1.0)
-    within = {name: defined * (succeeded & (steps <= factor * path)) for name, factor in WITHIN.items()}
-    return {"success": succeeded * 1.0, **within}
 
 
 class _Listener(Chooser):

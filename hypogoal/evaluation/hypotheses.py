@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import Metrics, grouped
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, drawing
@@ -28,9 +29,6 @@ from hypogoal.evaluation.table import (
     with_members,
 )
 from hypogoal.hypotheses.scores import mean_disagreement, member_scores
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
 
 WHICH = ("best", "mean", "worst")
 STATES = ("unlabelled", "heldout")
@@ -85,18 +83,20 @@ def view(work: Work) -> dict[str, Any]:
     return {"hypotheses": tabulate(of_layouts(work.rows), TABLE), "ensembles": ensembles}
 
 
+CAPTION = (
+    "Balanced accuracy on held-out states of the best, mean and worst member, and the share of states on which two "
+    "members disagree (mean over pairs); mean over ensemble seeds ± standard error."
+)
 ENSEMBLE = page.label("ensemble", "name", once=True)
 SCORES = tuple(page.number(which, which, page.spread, 3) for which in WHICH)
 SEEDS = page.number("seeds", "ensembles")
+DISAGREE = page.number("disagree", "disagreement_heldout", page.spread, 3)
 HYPOTHESES = (
-    ENSEMBLE,
-    page.label("sub-goal", "sub_goal"),
-    *SCORES,
+    *(ENSEMBLE, page.label("sub-goal", "sub_goal"), *SCORES),
     page.number("disagree, unlabelled", "disagreement_unlabelled", page.spread, 3),
-    page.number("disagree, held-out", "disagreement_heldout", page.spread, 3),
+    DISAGREE._replace(title="disagree, held-out"),
     SEEDS,
 )
-DISAGREE = page.number("disagree", "disagreement_heldout", page.spread, 3)
 
 
 def summary(metrics: Metrics) -> list[Printed]:
@@ -107,36 +107,24 @@ def summary(metrics: Metrics) -> list[Printed]:
 
 
 def sections(material: Material) -> list[Block]:
-    """Of ensembles judged by layout."""
-    return [hypotheses_section(material)] if material.metrics["hypotheses"] else []
-
-
-def hypotheses_section(material: Material) -> Block:
     """Figure 3's question on held-out layouts: best, mean and worst member, and how much members disagree."""
     metrics = material.metrics
-    if _has_layouts(metrics):
-        judged = "Members are judged on layouts whose states were in no training set."
-    else:
-        judged = (
-            "Members are judged on the held-out states of the data. Where these are a share of the labelled ones they "
-            "say nothing of other contexts."
-        )
+    if not metrics["hypotheses"]:
+        return []
+    judged = (
+        "Members are judged on layouts whose states were in no training set."
+        if _has_layouts(metrics)
+        else "Members are judged on the held-out states of the data, which say nothing of other contexts where they "
+        "are a share of the labelled ones."
+    )
     text = (
         f"{judged} The best member shows whether a hypothesis that holds there is in the ensemble at all; mean and "
         "worst show what the agent has to choose among. A member that always gives the same answer has 0.5."
     )
-    whole = page.table(
-        HYPOTHESES,
-        metrics["hypotheses"],
-        caption="Balanced accuracy on held-out states of the best, mean and worst member, and the share of states "
-        "on which two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
-    )
-    blocks = [
-        *(page.shown(material, figure) for figure in figures(material)),
-        whole,
-        *page.comparison_tables(material.comparisons("hypotheses"), "ensemble seed and sub-goal"),
-    ]
-    return page.section("hypotheses", "Hypotheses", [text], blocks)
+    blocks = [page.shown(material, figure) for figure in figures(material)]
+    blocks.append(page.table(HYPOTHESES, metrics["hypotheses"], caption=CAPTION))
+    blocks += page.comparison_tables(material.comparisons("hypotheses"), "ensemble seed and sub-goal")
+    return [page.section("hypotheses", "Hypotheses", [text], blocks)]
 
 
 def _has_layouts(metrics: Entry) -> bool:
@@ -160,10 +148,7 @@ def figures(material: Material) -> list[Drawn]:
 
 
 def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
-    """Figure 3's quantity for one labelled layout: balanced accuracy on held-out layouts, by kind of ensemble.
-
-    Entries are those of ``TABLE``; there is no figure where none of their means is defined.
-    """
+    """Balanced accuracy on held-out layouts by kind of ensemble, from entries of ``TABLE``; None if undefined."""
     means = [entry[which]["mean"] for entry in entries for which in WHICH]
     lowest = min((mean for mean in means if mean is not None), default=None)
     if lowest is None:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.compute import prepare
 from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
@@ -23,11 +22,10 @@ from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
 from hypogoal.evaluation.run import Contents
 from hypogoal.evaluation.table import Row
-from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.hypotheses.views import positions_of
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.curves import Run
+    from hypogoal.hypotheses.ensemble import Ensemble
 
 # Bytes of states times members from which on more processes pay for their start (3 s): about 100 s of Montezuma's.
 SPREAD_FROM = 4e9
@@ -53,6 +51,8 @@ class Case(NamedTuple):
 
     def read(self) -> Ensemble:
         """The ensemble."""
+        from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report does not need
+
         return read_ensemble(self.ensemble, self.config, self.sub_goal)
 
 
@@ -84,6 +84,7 @@ class Judgement:
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
         """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
         from hypogoal.hypotheses.deep_lift import mean_state
+        from hypogoal.hypotheses.views import positions_of
 
         ensemble, positions = self.case.read(), positions_of(self.split.origins)
         seen = ensemble.see(self.split.observations[states], None if positions is None else positions[states])
@@ -211,6 +212,9 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
 
 def judge(case: Case) -> Judged:
     """What the members of one case say."""
+    from hypogoal.core.compute import prepare
+    from hypogoal.hypotheses.views import positions_of
+
     prepare()
     split, unlabelled = states_of(case.data, case.sub_goal)
     ensemble = case.read()
@@ -223,5 +227,7 @@ def judge(case: Case) -> Judged:
 @lru_cache(maxsize=1)
 def states_of(data: Path, sub_goal: str) -> tuple[States, Unlabelled]:
     """A sub-goal's held-out states and the unlabelled ones: the largest things here, read once for all ensembles."""
+    from hypogoal.hypotheses.views import positions_of
+
     dataset = open_dataset(data)
     return dataset.heldout(sub_goal), Unlabelled(dataset.unlabelled(), positions_of(dataset.unlabelled_origins()))

@@ -76,16 +76,15 @@ def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> Any:
-    """Spec F5: the mean of the middle half (a quarter of the values, rounded down, is cut off at either end)."""
+    """Spec F5: the mean of the middle half: a quarter of the values, rounded down, is cut off at either end."""
     return trim_mean(values, 0.25, axis=axis)
 
 
 def by_unit(values: ArrayLike, units: Sequence[Hashable]) -> NDArray[np.float64]:
     """The mean of each unit's values, (n, ...) to (U, ...), in the order in which units come; a NaN is left out."""
     numbers, names = np.asarray(values, np.float64), list(dict.fromkeys(units))
-    belongs = np.array([[mark == unit for mark in units] for unit in names], np.float64).reshape(
-        len(names), len(numbers)
-    )
+    belongs = np.zeros((len(names), len(numbers)))
+    belongs[[names.index(unit) for unit in units], range(len(numbers))] = 1
     counts, sums = np.tensordot(belongs, ~np.isnan(numbers), 1), np.tensordot(belongs, np.nan_to_num(numbers), 1)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
@@ -107,11 +106,10 @@ def student_interval(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, str]:
-    """Spec F5: a 95 % interval: below 8 values Student's, of the mean; from 8 on a bootstrap, of the middle half's.
+    """Spec F5: a 95 % interval of (n,) independent values, and its kind; NaN for fewer than two.
 
-    A percentile bootstrap of few values is too narrow: of two it would hold in half of the cases. SciPy's bootstrap
-    gave the same numbers as rliable's, which fails with pandas 3. Returns the bounds for (n,) independent values, NaN
-    for fewer than two, and the interval's kind; ``rng`` draws the resamples.
+    Below 8 values Student's, of the mean: a percentile bootstrap of two would hold in half of the cases. From 8 on a
+    bootstrap of the interquartile mean, whose resamples ``rng`` draws (SciPy's: rliable's fails with pandas 3).
     """
     if len(values) < BOOTSTRAP_FROM:
         return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
@@ -126,14 +124,12 @@ def over(
     """Spec F5: the statistics of a number over runs; runs of one layout count once, by their mean.
 
     Runs with a NaN are left out, and ``n`` shows it. ``cell``, the names that identify the number, seeds the resamples;
-    ``layouts`` as for :func:`by_layout`. Returns mean, standard_error, iqm, interval (95 %, see :func:`interval`),
-    interval_over (its units and kind), n (runs), unit, and with ``deviation`` standard_deviation (n - 1): the bands of
-    Figures 3 and 4.
+    ``layouts`` as for :func:`by_layout`. Returns mean, standard_error, iqm, interval (95 %), interval_over (its units
+    and kind), n (runs), unit, and with ``deviation`` standard_deviation (n - 1).
     """
     defined = [index for index, value in enumerate(values) if not np.isnan(value)]
-    numbers, unit_names = by_layout(
-        [values[index] for index in defined], [layouts[index] for index in defined if layouts]
-    )
+    of_runs = [values[index] for index in defined], [layouts[index] for index in defined if layouts]
+    numbers, unit_names = by_layout(*of_runs)
     mean, error = mean_and_error(numbers)
     low, high, kind = interval(numbers, rng_for(0, "bootstrap", *cell))
     statistics = {
@@ -157,15 +153,12 @@ def pairs(
     *,
     higher: bool = True,
 ) -> Rows:
-    """Spec F5: the first method against each of the others, over what both share, seed by seed.
+    """Spec F5: the first method against each of the others, over what both share, see :func:`compare_pairs`.
 
-    A seed's layout, data and first weights are hard or easy for every method, so pairs that share them tell more than
-    two means. The probability of improvement says how often; a difference of means may come from one run.
+    Pairs that share layout, data and first weights tell more than two means: these may differ by one run.
 
     ``measured`` are (method, key, value). A key is what pairs must share: layout, sub-goal or ladder, and last the
-    seed. Values with the same key, such as options of one seed of several ensembles, are paired in order. Each method
-    after the first that shares a pair with it gets a row, see :func:`compare_pairs`, that names the ``quantity``
-    compared, and ``where``. Keys begin with the layout; where there are several, they are the units, not the seeds.
+    seed; values with the same key are paired in order. Where there are several layouts, they are the units, else seeds.
     """
     values: dict[str, dict[tuple[Hashable, ...], float]] = {}
     for method, key, value in measured:
@@ -192,9 +185,8 @@ def compare_pairs(
     """Spec F5: the first of two methods against the second over n pairs of runs that share layout and seed.
 
     The probability of improvement is the share of pairs in which the first is better, a tie counting half. Pairs of one
-    unit (one seed's ensemble on several ladders, one layout with several seeds) are not independent: everything but
-    the counts is over units, and each unit counts once, by its mean. Where one method wins every pair the interval has
-    no width, so the sign test stands beside it: it stays large with few units. Pairs with a NaN are left out.
+    unit (one ensemble on several ladders, one layout with several seeds) are not independent: everything but the counts
+    is over units, each of which counts once, by its mean. Pairs with a NaN are left out.
 
     Returns:
         n, units (how many), wins, ties, probability and its interval (Student's 95 %, cut at 0 and 1), interval_over,
@@ -222,10 +214,9 @@ def compare_pairs(
 
 
 def name_apart(bases: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A name for each of n things: its base name, and where settings differ within that, those settings.
+    """A name for each of n things: its base name, and the settings by which it differs from most of that base name.
 
-    What more than half of the things of one base name have in common goes unsaid; ``domain_config`` inside the
-    settings is looked into.
+    ``domain_config`` inside the settings is looked into.
     """
     flat = [{**(config.get("domain_config") or {}), **config, "domain_config": None} for config in configs]
     names = []
@@ -261,20 +252,17 @@ def ensemble_name(config: Mapping[str, Any]) -> str:
 def ensemble_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of ensembles; those whose settings differ are kept apart, settings without effect left out."""
     bases = [ensemble_name(config) for config in configs]
-    settings = [
-        {key: value for key, value in config.items() if key not in IDLE.get(base.partition(",")[0], set())}
-        for base, config in zip(bases, configs, strict=True)
-    ]
+    settings = []
+    for base, config in zip(bases, configs, strict=True):
+        idle = IDLE.get(base.partition(",")[0], set())
+        settings.append({key: value for key, value in config.items() if key not in idle})
     return name_apart(bases, settings)
 
 
 def method_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names of ensembles as methods: as ``ensembles.ensemble_names``, with all N under one name."""
-    alike = []
-    for config in configs:
-        inner = {key: value for key, value in (config.get("domain_config") or {}).items() if key != "groups"}
-        alike.append({**config, "domain_config": inner})
-    return ensemble_names(alike)
+    """Names of ensembles as methods: as :func:`ensemble_names`, with all N under one name."""
+    inner = [{**(config.get("domain_config") or {}), "groups": None} for config in configs]
+    return ensemble_names([{**config, "domain_config": domain} for config, domain in zip(configs, inner, strict=True)])
 
 
 def methods_lacking(entries: Iterable[Mapping[str, Any]], artefact: str, figures: str) -> list[str]:

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
 from importlib import resources
-from operator import itemgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,13 +21,11 @@ from rich.table import Table
 
 from hypogoal.core.files import parse_json
 from hypogoal.core.manifests import AGAIN
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.table import Pairs, Row
+from hypogoal.evaluation.table import Pairs, Row
 
 Block = dict[str, Any]
 Entry = Mapping[str, Any]
@@ -40,9 +37,9 @@ POLICY = (
 CAPTION = (
     "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
     "better, a tie counting half, with its 95 % interval (Student's t, cut at 0 and 1); 0.5: neither is. An interval "
-    "without width means that every pair came out alike, not that it is certain: see the sign test (two-sided, ties "
-    "left out). n: how many {units} everything is over, each of which counts once, by its mean: pairs of one are not "
-    "independent. Difference: mean of first − second, with its 95 % interval (Student's t)."
+    "without width means that every pair came out alike, not certainty: see the sign test (two-sided, ties left out). "
+    "n: how many {units} everything is over, each of which counts once, by its mean. Difference: mean of first − "
+    "second, with its 95 % interval (Student's t)."
 )
 INTERVALS = (
     "95 % intervals: of 2 to 7 {units} the mean and Student's t; of more the interquartile mean and a bootstrap (2,000 "
@@ -152,9 +149,9 @@ def table(
     before: list[Any] = [rows] * len(columns)  # which no entry has
     for entry in entries:
         now = [column.once and column.once(entry) for column in columns]
-        new = [column.once is None or mark != old for column, mark, old in zip(columns, now, before, strict=True)]
-        cells = [column.of(entry) if fresh else "" for column, fresh in zip(columns, new, strict=True)]
-        first = any(fresh and column.once for column, fresh in zip(columns, new, strict=True))
+        fresh = [column.once is None or mark != old for column, mark, old in zip(columns, now, before, strict=True)]
+        cells = [column.of(entry) if new else "" for column, new in zip(columns, fresh, strict=True)]
+        first = any(new and column.once for column, new in zip(columns, fresh, strict=True))
         rows.append({"cells": cells, "mark": "main" if main(entry) else "first" if first else ""})
         before = now
     return {
@@ -170,14 +167,13 @@ def table(
 
 def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
     """The same table for a terminal, 79 columns wide; a line between groups of rows."""
-    drawn = table(columns, entries)
     printed = Table(title=title, title_justify="left", width=79)
     for column in columns:
-        if column.number:
-            printed.add_column(column.title, justify="right", no_wrap=True)
-        else:
-            printed.add_column(column.title, ratio=1, overflow="fold")
-    for index, row in enumerate(drawn["rows"]):
+        how: dict[str, Any] = (
+            {"justify": "right", "no_wrap": True} if column.number else {"ratio": 1, "overflow": "fold"}
+        )
+        printed.add_column(column.title, **how)
+    for index, row in enumerate(table(columns, entries)["rows"]):
         if index and row["mark"]:
             printed.add_section()
         printed.add_row(*(str(cell["text"] if isinstance(cell, dict) else cell) for cell in row["cells"]))
@@ -249,7 +245,7 @@ def texts(packed: Any) -> list[str]:
 
 
 def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:
-    """How an entry's method is called: with its sub-goal where the entries are of several."""
+    """An entry's method, with its sub-goal where the entries are of several."""
     several = len({entry["sub_goal"] for entry in entries}) > 1
     return lambda entry: f"{entry['method']} ({entry['sub_goal']})" if several else str(entry["method"])
 
@@ -319,20 +315,19 @@ def comparison_tables(
 ) -> list[Block]:
     """The table of one method against the others, pair by pair, where there are pairs (Spec F5).
 
-    Rows are what ``numbers.pairs`` found. ``shared`` is what pairs share, ``units`` what is independent of each other,
-    ``digits`` the decimals of a quantity's difference, 3 where it is not named.
+    Rows are of ``numbers.pairs``. ``shared``: what pairs share; ``units``: what is independent; ``digits``: decimals of
+    a quantity's difference, by default 3.
     """
     compared = [entry for entry in rows if entry["n"]]
     if not compared:
         return []
     firsts = {entry["first"] for entry in compared}
+    names = ["quantity"]
+    names += ["where"] if any(entry["where"] for entry in compared) else []
+    names += ["first"] if len(firsts) > 1 else []
 
     def quantity(entry: Entry) -> str:
         return str(entry["quantity"]).replace("_", " ") + ("" if entry["higher"] else " (lower is better)")
-
-    names: dict[str, Callable[[Entry], str]] = {"quantity": quantity}
-    names |= {"of": itemgetter("where")} if any(entry["where"] for entry in compared) else {}
-    names |= {"first": itemgetter("first")} if len(firsts) > 1 else {}
 
     def difference(entry: Entry) -> dict[str, str]:
         places = max((digits or {}).get(entry["quantity"], 3), 1)  # may be small where the numbers are not
@@ -340,11 +335,9 @@ def comparison_tables(
         signed = "–" if value is None else f"{round(value, places) + 0.0:+.{places}f}"  # + 0.0: no "-0"
         return cell(signed, _between(entry["difference_interval"], places))
 
+    titles = {"quantity": ("quantity", quantity), "where": ("of", "where"), "first": ("first", "first")}
     columns = [
-        *(
-            label(name, show, once=lambda entry: [named(entry) for named in names.values()])
-            for name, show in names.items()
-        ),
+        *(label(*titles[name], once=lambda entry: [entry[key] for key in names]) for name in names),
         label("second", "second"),
         number("P(first better)", lambda e: cell(fixed(e["probability"], 2), _between(e["interval"], 2)), dict),
         number("won–lost–tied", lambda e: f"{e['wins']}–{e['n'] - e['wins'] - e['ties']}–{e['ties']}"),
@@ -364,8 +357,8 @@ def _between(bounds: Sequence[float | None], digits: int) -> str:
 def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
     """Sections as one HTML file that needs nothing else.
 
-    Every text in it is escaped but our own style and script and what matplotlib drew; should a text of a file ever slip
-    through, the page's policy still lets nothing run and nothing be fetched.
+    Every text is escaped but our own style and script and matplotlib's drawings; the page's policy lets nothing else
+    run or be fetched.
     """
     import jinja2
 
@@ -390,7 +383,7 @@ def packaged(name: str) -> str:
 
 
 def _digest(text: str) -> str:
-    """As a policy names a script or a style that is in the page."""
+    """A script or a style of the page, as a policy names it."""
     return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
 
 

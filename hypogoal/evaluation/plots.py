@@ -69,13 +69,21 @@ def styled(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None
 
 
 @contextmanager
-def drawing(height: float, columns: int, width: float = WIDTH, **more: Any) -> Iterator[tuple[Figure, Axes]]:
-    """One plot, ``height`` inches high; at the end of the ``with`` its :func:`legend_below` of at most ``columns``."""
+def drawing(
+    height: float, columns: int, width: float = WIDTH, *, beside: bool = False, **more: Any
+) -> Iterator[tuple[Figure, Axes]]:
+    """One plot, ``height`` inches high; at the end its :func:`legend_below` of at most ``columns``.
+
+    ``beside``: its :func:`label_lines` in place of that.
+    """
     with styled():
         figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.subplots()
         yield figure, axes
-        legend_below(figure, [axes], columns, **more)
+        if beside:
+            label_lines(figure, axes, columns, **more)
+        else:
+            legend_below(figure, [axes], columns, **more)
 
 
 def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any) -> None:

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import method_rank
-from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.table import Number, Row, Table, rows_by_member, rows_of, select, tabulate
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
 
 OF_MEMBERS = ("ranking", "at_best_threshold", "calibration_gap")
 CROSSED = {"ranking": "cross_fitted_ranking", "balanced_accuracy": "cross_fitted_accuracy"}
 HELDOUT = "heldout"
 TITLE = "Ranking, whatever the threshold"
-
-
 TABLE = Table(
     {"name": "method", "groups": "N", "sub_goal": "sub_goal"},
     {name: Number(name, HELDOUT) for name in (*OF_MEMBERS, *CROSSED.values())},
@@ -38,12 +34,11 @@ def knowledge(
     labels: NDArray[np.bool_],
     contexts: NDArray[np.int64] | None,
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
-    """What K members know of N states, by their probabilities and by their predictions, both (N, K).
+    """What K members know of N states, by their probabilities and predictions (N, K); ``contexts``: layouts or rooms.
 
-    ``contexts`` are the layouts or rooms of states, None where unknown. Returns of each member (K,) ``ranking``,
-    ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that its own threshold loses); and of
-    the best member, picked on half of the contexts and scored on the other, ``cross_fitted_ranking`` and
-    ``cross_fitted_accuracy``, NaN for fewer than two contexts.
+    Returns of each member (K,) ``ranking``, ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much
+    of that its own threshold loses); and of the best member, picked on half of the contexts and scored on the other,
+    ``cross_fitted_ranking`` and ``cross_fitted_accuracy``, NaN for fewer than two contexts.
     """
 
     def scores(inside: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
@@ -81,16 +76,21 @@ def view(work: Work) -> dict[str, Any]:
     return {"ranking": tabulate((row._replace(scope=HELDOUT) for row in judged), TABLE)}
 
 
+def _name(entry: Entry) -> str:
+    return entry["name"] + (f", N={entry['groups']}" if entry["groups"] else "")
+
+
+SCORES = {
+    "ranking: best, cross-fitted": "cross_fitted_ranking",
+    "mean": "ranking",
+    "bal. acc.: best, cross-fitted": "cross_fitted_accuracy",
+    "at best threshold": "at_best_threshold",
+    "lost by the threshold": "calibration_gap",
+}
 COLUMNS = (
-    page.label(
-        "ensemble", lambda entry: entry["name"] + (f", N={entry['groups']}" if entry["groups"] else ""), once=True
-    ),
+    page.label("ensemble", _name, once=True),
     page.label("sub-goal", "sub_goal"),
-    page.number("ranking: best, cross-fitted", "cross_fitted_ranking", page.spread, 3),
-    page.number("mean", "ranking", page.spread, 3),
-    page.number("bal. acc.: best, cross-fitted", "cross_fitted_accuracy", page.spread, 3),
-    page.number("at best threshold", "at_best_threshold", page.spread, 3),
-    page.number("lost by the threshold", "calibration_gap", page.spread, 3),
+    *(page.number(title, score, page.spread, 3) for title, score in SCORES.items()),
     page.number("seeds", "ensembles"),
 )
 
@@ -106,7 +106,7 @@ def sections(material: Material) -> list[Block]:
         "scored on the rest, and the other way round, so that it is not best by luck."
     )
     caption = (
-        "On held-out states of layouts or rooms that no training set holds; mean over ensemble seeds ± standard error."
+        "On held-out states of layouts or rooms without training states; mean over ensemble seeds ± standard error."
     )
     blocks = [page.table(COLUMNS, material.metrics["ranking"], caption=caption)]
     return [page.section("ranking", TITLE, [text], blocks, folded=True)]

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +21,7 @@ from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import Metrics, by_method, grouped, methods_lacking
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
@@ -37,9 +38,6 @@ from hypogoal.evaluation.table import (
 )
 from hypogoal.hypotheses.scores import member_scores, ranking
 
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or
 # among the labelled ones.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
@@ -52,8 +50,8 @@ SHARE = "share of states"
 SPREAD = ("mean", "standard_deviation")  # of the figures
 PAPER = (
     "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
-    "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
-    "positive is not said, so look at the differences between methods and N rather than at the level."
+    "big step at N=2. Its test files include training rooms, as 'all rooms' does; it does not say how many of their "
+    "states are positive, so compare methods and N rather than levels."
 )
 BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 
@@ -67,9 +65,8 @@ def rows_by_room(
 ) -> Iterator[Row]:
     """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
 
-    Their probabilities and predictions are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
-    ``room``. In each scope there are how many states, positives and rooms, and every member's scores; of the labelled
-    rooms, which member they pick, and its balanced accuracy there.
+    Probabilities and predictions are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
+    ``room``. In each scope counts and every member's scores; on labelled rooms, the member that they pick.
     """
     seen = origins["seen"]
     for name, values in SCOPES.items():
@@ -86,10 +83,9 @@ def rows_by_room(
 def choose(
     verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], seen: NDArray[np.int64]
 ) -> dict[str, int | float | None]:
-    """Spec F1: the member with the highest balanced accuracy on held-out states in rooms of labelled groups.
+    """Spec F1: the member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
 
-    Members' order is chance, so of several equally good ones the first is taken. ``validation`` is its balanced
-    accuracy there; there is no such member where those rooms lack a class.
+    The first of equally good ones, since their order is random; None where those rooms lack a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
     scores = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
@@ -123,20 +119,14 @@ PAIRS = Pairs(
 )
 
 
-def of_rooms(rows: Sequence[Row]) -> list[Row]:
-    """The rows of ensembles that are judged room by room."""
-    by_room = {row.artefact for row in rows if row.scope == "unseen"}
-    return [row for row in rows if row.artefact in by_room]
-
-
 def rooms_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
-    Entries have ``scores``: scope -> score -> best, validated, mean, worst (see ``numbers.over``); disagreement on
-    unlabelled and held-out states; and by scope ``positives``, and ``always_no``, the accuracy of negative predictions
-    alone.
+    ``scores``: scope -> score -> best, validated, mean, worst (see ``numbers.over``); by scope ``positives``, and
+    ``always_no``, the accuracy of negative predictions alone.
     """
-    rows = of_rooms(rows)
+    by_room = {row.artefact for row in rows if row.scope == "unseen"}
+    rows = [row for row in rows if row.artefact in by_room]
     counts = {
         (row.method, row.N, row.sub_goal, row.scope, row.quantity): row.value
         for row in reversed(select(rows, quantity=("states", "positives")))  # the first ensemble's
@@ -190,13 +180,9 @@ def summary(metrics: Metrics) -> list[Printed]:
 
 
 def sections(material: Material) -> list[Block]:
-    """What was asked of ladders; Figure 3."""
-    judged = [rooms_section(material)] if material.metrics["rooms"] else []
-    return [ladders_section(material), *judged] if material.of_ladders() else []
-
-
-def ladders_section(material: Material) -> Block:
-    """The question; the answers are in the tables below."""
+    """The question about ladders; Figure 3 and its table: what else is known of members is in ``metrics.json``."""
+    if not material.of_ladders():
+        return []
     metrics = material.metrics
     question = (
         "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
@@ -205,12 +191,7 @@ def ladders_section(material: Material) -> Block:
     )
     alone = not metrics["agents"]
     identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
-    return page.section(identity, title, [question], [], metrics["missing"] if alone else [])
-
-
-def rooms_section(material: Material) -> Block:
-    """Figure 3 and its table; what else is known of members and rooms is in ``metrics.json``."""
-    title = "Hypotheses against labelled ladders"
+    summaries = [page.section(identity, title, [question], [], metrics["missing"] if alone else [])]
     text = (
         "N is the number of ladder groups with labels. Members are judged on held-out states of rooms that no training "
         "state came from (unseen), and of all rooms, training rooms included, as in the paper. The best member is "
@@ -222,7 +203,8 @@ def rooms_section(material: Material) -> Block:
     for figure, rows in zip(figures(material), _by_sub_goal(material), strict=True):
         blocks += [page.shown(material, figure), _table(rows)]
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
-    return page.section("rooms", title, [text], blocks)
+    judged = page.section("rooms", "Hypotheses against labelled ladders", [text], blocks)
+    return [*summaries, judged] if metrics["rooms"] else summaries
 
 
 def _by_sub_goal(material: Material) -> list[list[Entry]]:
@@ -243,44 +225,40 @@ def _table(rows: Sequence[Entry]) -> Block:
         caption="Balanced accuracy on held-out states of unseen rooms of the best, the validated, the mean and the "
         "worst member; accuracy (acc.) of the best one on those of all rooms; the share of states on which two "
         "members' predictions differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
-        f"{_never(rows)}{_why_dashes(rows)}{PAPER}",
+        f"{_never(rows)}{PAPER}",
     )
 
 
-def _never(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What accuracy on all rooms is worth here: that of a member that is never positive, by N."""
+def _never(rows: Sequence[Entry]) -> str:
+    """What accuracy on all rooms is worth here, and where balanced accuracy is not defined."""
     accuracies = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
-    every = sorted(accuracies.items(), key=str)
-    texts = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
-    return f"A member that is never positive has accuracy {page.listed(texts)}. " if texts else ""
-
-
-def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
+    texts = [
+        f"{accuracy:.2f}{'' if groups is None else f' (N={groups})'}"
+        for groups, accuracy in sorted(accuracies.items(), key=str)
+    ]
+    text = f"A member that is never positive has accuracy {page.listed(texts)}. " if texts else ""
     bare = sorted({entry["groups"] for entry in rows if entry["positives"]["unseen"] == 0 and entry["groups"]})
     if not bare:
-        return ""
+        return text
     return (
-        f"At N={page.listed(bare)} no unseen room has a ladder base left, so balanced accuracy on them is not defined "
-        "(–) and accuracy there is the share of negatives called negative. "
+        f"{text}At N={page.listed(bare)} no unseen room has a ladder base left: balanced accuracy on them is not "
+        "defined (–), and accuracy there is the share of negatives called negative. "
     )
 
 
 def figures(material: Material) -> Iterator[Drawn]:
     """Figure 3, and what it leaves out, of each sub-goal."""
     by_sub_goal = _by_sub_goal(material)
+    panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
+    panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
     for rows in by_sub_goal:
         methods = {entry["method"] for entry in rows}
-        seeds = sorted(
-            {ensemble["seed"] for ensemble in material.metrics["ensembles"] if ensemble.get("method") in methods}
-        )
-        panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
-        panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
+        seeds = sorted({entry["seed"] for entry in material.metrics["ensembles"] if entry.get("method") in methods})
         caption = (
             "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
             "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
-            f"mean one; mean over ensemble seeds, {bands(rows)}: ± one standard deviation over seeds, as in the paper. "
-            f"Dotted: never positive. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. "
-            f"{_why_dashes(rows)}{PAPER}"
+            "mean one; mean over ensemble seeds, bands (bars where a method has one N): ± one standard deviation over "
+            f"seeds. Dotted: never positive. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}."
         )
         nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
         title, drawn = "Figure 3: members against labelled ladder groups", scores_over_groups(rows, panels)
@@ -288,23 +266,11 @@ def figures(material: Material) -> Iterator[Drawn]:
         yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
 
 
-def bands(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What a figure of these rows shows spread by: a method with one N has a bar in place of a band."""
-    methods = grouped(rows, itemgetter("method")).values()
-    alone = [len({entry["groups"] for entry in entries} - {None}) == 1 for entries in methods]
-    if all(alone):
-        return "bars (methods side by side, all at the same N)"
-    return "bands, and bars where a method has one N (those methods side by side)" if any(alone) else "bands"
-
-
 def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:
-    """Figure 3: scores against the number of labelled ladder groups; bands of one standard deviation.
-
-    A method with one N has an error bar instead of a band, a little beside the other methods'. Dotted is what it takes
-    no seeing to score.
+    """Figure 3: scores against the number of labelled ladder groups, methods coloured in the order of the rows.
 
     Rows are of :func:`rooms_table`; those without N are left out, and where all are there is no figure. A panel is a
-    title, and of which scope, score and member; two are in a row. Methods are coloured in the order of the rows.
+    title, and of which scope, score and member. Dotted is what it takes no seeing to score.
     """
     names, rows = list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
     if not rows:
@@ -317,9 +283,10 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
         for place, (title, scope, score, which) in zip(axes.flat, panels, strict=False):
             for name, entries in grouped(rows, itemgetter("method")).items():
                 scores = [entry["scores"][scope][score][which] for entry in entries]
-                mean, deviation = (np.array([aggregated[key] for aggregated in scores], float) for key in SPREAD)
-                groups = np.array([entry["groups"] for entry in entries], float)
-                _draw_method(place, name, groups, mean, deviation, names)
+                mean, deviation = (np.array([over[key] for over in scores], float) for key in SPREAD)
+                _draw_method(
+                    place, name, np.array([entry["groups"] for entry in entries], float), mean, deviation, names
+                )
                 lowest = float(np.nanmin([lowest, *(mean - np.nan_to_num(deviation))]))
             blind = {}
             for row in sorted(rows, key=itemgetter("groups")):
@@ -332,9 +299,7 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
                 place.plot(list(blind), list(blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
             place.set_title(title, fontsize=9.5)
         for place in axes.flat:
-            place.set_ylim(max(0.0, lowest - 0.03), 1.03)
-            place.set_xticks(ticks)
-            place.set_xlim(ticks[0] - 0.4, ticks[-1] + 0.4)
+            place.set(ylim=(max(0.0, lowest - 0.03), 1.03), xticks=ticks, xlim=(ticks[0] - 0.4, ticks[-1] + 0.4))
         for place in axes[-1]:
             place.set_xlabel("labelled ladder groups, N")
         for place in axes[:, 0]:

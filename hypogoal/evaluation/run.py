@@ -14,27 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
+from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts, sha256_of
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
-from hypogoal.learners.episodes import LAST as LAST
-from hypogoal.options.tables import AGAIN as AGAIN
-from hypogoal.options.tables import BLANK as BLANK
-from hypogoal.options.tables import MAX_INTEGER
-from hypogoal.options.tables import Choices as Choices
-from hypogoal.options.tables import Episodes as Episodes
-from hypogoal.options.tables import Executions as Executions
-from hypogoal.options.tables import read_table as read_table
+from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
-WINDOW = LAST  # episodes at the end of training by which an agent is judged; executions of an option that count
 FORMAT = 2  # of ``metrics.json``: 1 until 0.15
-PARTS = (  # of ``metrics.json``
-    *("agents", "layouts", "rooms", "distance", "exploits", "hypotheses", "ranking", "explorer", "saliency"),
-    *("selection", "choosing", "ensembles", "settings", "missing", "provenance", "quantities", "comparisons"),
-)
-read_episodes, read_choices, read_executions = Episodes.read, Choices.read, Executions.read
 
 
 @dataclass(frozen=True)
@@ -163,21 +150,33 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     if not evaluations:
         raise UserError("this run was not evaluated", run, advice("First run", "evaluate", run))
     source = next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
-    source.whole()
-    metrics = _metrics(source.path / "metrics.json")
+    metrics = read_numbers(source)
     metrics["missing"] = [*metrics["missing"], *_since(run, source)]
     with open_hdf5(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
         arrays = {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
     return Evaluated(source, metrics, arrays)
 
 
-def read_numbers(source: Artefact) -> Mapping[str, Any]:
-    """``metrics.json`` of an evaluation artefact; a ``UserError`` where it is damaged."""
-    path = source.path / "metrics.json"
-    fault = file_fault(source.path, path.name, source.manifest["files"].get(path.name, ""))
-    if fault:
-        raise UserError(f"the evaluation's file is {fault}", path, AGAIN)
-    return _metrics(path)
+def read_numbers(source: Artefact) -> dict[str, Any]:
+    """``metrics.json`` of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
+    path = source.whole().path / "metrics.json"
+    metrics = read_json(path, "the evaluation is", AGAIN)
+    if not isinstance(metrics, dict) or not isinstance(metrics.get("missing"), list):
+        raise UserError("the evaluation is damaged", path, AGAIN)
+    if (made_with := metrics.get("format", 1)) != FORMAT:
+        difference = f"another version of hypogoal evaluated this (format {made_with}, needed: {FORMAT})"
+        raise UserError(difference, path, "Evaluate the run again, with --force.")
+    for name in _sub_goals(metrics):
+        if not plain_name(name):
+            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, AGAIN)
+    return metrics
+
+
+def _sub_goals(part: Any) -> Iterator[Any]:
+    if isinstance(part, dict):
+        yield from [part["sub_goal"]] if "sub_goal" in part else []
+    for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
+        yield from _sub_goals(inner)
 
 
 def _since(run: Path, source: Artefact) -> list[str]:
@@ -195,26 +194,3 @@ def _since(run: Path, source: Artefact) -> list[str]:
     elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
     do = advice("evaluate it again", "evaluate", run, *elsewhere, "--force") if names else ""
     return [f"{name}: made since this evaluation ({do})" for name in names]
-
-
-def _metrics(path: Path) -> dict[str, Any]:
-    metrics = read_json(path, "the evaluation is", AGAIN)
-    if not isinstance(metrics, dict):
-        raise UserError("the evaluation is damaged", path, AGAIN)
-    if (made_with := metrics.get("format", 1)) != FORMAT:
-        difference = f"another version of hypogoal evaluated this (format {made_with}, needed: {FORMAT})"
-        raise UserError(difference, path, "Evaluate the run again, with --force.")
-    lacking = [part for part in PARTS if part not in metrics]
-    if lacking:
-        raise UserError(f"the evaluation is damaged (no {', '.join(lacking)})", path, AGAIN)
-    for name in _sub_goals(metrics):
-        if not plain_name(name):
-            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, AGAIN)
-    return metrics
-
-
-def _sub_goals(part: Any) -> Iterator[Any]:
-    if isinstance(part, dict):
-        yield from [part["sub_goal"]] if "sub_goal" in part else []
-    for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
-        yield from _sub_goals(inner)

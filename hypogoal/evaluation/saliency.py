@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from hypogoal.core.hdf5 import fixed
 from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.evaluation import page
+from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
 from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.table import Row
 
 SPREAD = "spread"  # a state as any other
 KINDS = {"true positive": "a true positive", "disagree": "members disagree", "false positive": "a false positive"}
 NEEDED = "an ensemble artefact on pictures with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
+COLOURS = "Orange speaks for 'reached', blue against it; each picture has its own scale."
 EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
 AVERAGED = 64  # states over which attributions to features are averaged
 MOST_BARS = 15  # features
@@ -38,8 +37,8 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     """Attributions of the ensemble that is shown; on states of unseen rooms where positives are in them.
 
     ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
-    what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``. Where they are no pictures, of states spread
-    over the held-out ones, each of ``features`` having a name.
+    what members saw, ``seen`` uint8 (n, h, w, C), against ``baseline``. Where they are no pictures, of states spread
+    over the held-out ones, with ``features``' names.
     """
     if judgement.number != work.shown:
         return ()
@@ -74,9 +73,8 @@ def pick_to_explain(
 ) -> list[tuple[int, str]]:
     """Figures 2 and 9: the few of N states, (index, kind), whose attributions are drawn, no state twice.
 
-    ``true positive``: where the most of K members are right and, of those, the surest on average; ``disagree``: where
-    members differ and their probabilities are the furthest apart; ``false positive``: where the most members err, and
-    the surest. Fewer where there are none.
+    ``true positive``: where most of K members are right and surest on average; ``disagree``: where members differ and
+    their probabilities are furthest apart; ``false positive``: where most err, and are surest. Fewer where none are.
     """
     positive, mean = verdicts.sum(1), probabilities.mean(1)
     spread = probabilities.max(1) - probabilities.min(1)
@@ -88,67 +86,62 @@ def pick_to_explain(
     ):
         free = mask.copy()
         free[[index for index, _ in picked]] = False
-        picked += _first(free, order, kind)
+        if free.any():
+            picked.append((int(np.where(free, order, np.inf).argmin()), kind))
     return picked
 
 
-def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], kind: str) -> list[tuple[int, str]]:
-    candidates = np.flatnonzero(mask)
-    return [(int(candidates[order[candidates].argmin()]), kind)] if len(candidates) else []
+def _about(material: Material, states: Sequence[Entry]) -> str:
+    saliency = material.metrics["saliency"]
+    return (
+        f"Attributions by {states[0]['method'] if states else 'DeepLift'} of each member of {saliency['ensemble']} "
+        f"(seed {saliency['seed']}), against {saliency['baseline']}."
+    )
 
 
 def sections(material: Material) -> list[Block]:
-    """What members look at."""
-    return [saliency_section(material)]
-
-
-def _state_card(
-    state: NDArray[np.uint8], sub_goal: str, truth: bool, title: str, lines: list[dict[str, str]]
-) -> dict[str, Any]:
-    alt = f"A held-out state; {sub_goal} is {'reached' if truth else 'not reached'}."
-    return {"png": page.picture(state), "alt": alt, "title": title, "lines": lines}
-
-
-def saliency_section(material: Material) -> Block:
     """Attributions of every member of one ensemble on a few held-out states."""
     saliency = material.metrics["saliency"]
     title = "What members look at"
     if saliency is None:
         lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
-        return page.section("saliency", title, [], [], lacking, folded=True)
+        return [page.section("saliency", title, [], [], lacking, folded=True)]
     states = [state for goal in saliency["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
-    method = states[0].get("method", "DeepLift") if states else "DeepLift"  # evaluations of earlier versions do not say
     text = (
-        f"Attributions by {method} (Figures 2 and 9 of the paper) of each member of {saliency['ensemble']} (seed "
-        f"{saliency['seed']}) on a few held-out states, against {saliency['baseline']}: what a state shares with "
-        "that mean gets no attribution. Orange speaks for 'reached', blue against it, each picture on its own scale; "
-        "the state shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. "
-        "A member that goes by what other contexts lack cannot transfer."
+        f"{_about(material, states)} What a state shares with that mean gets no attribution. {COLOURS} The state shows "
+        "through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member that "
+        "goes by what other contexts lack cannot transfer."
     )
-    if bars := [page.shown(material, drawn) for drawn in feature_figures(material)]:
-        text = (
-            f"Attributions by {method} of each member of {saliency['ensemble']} (seed {saliency['seed']}), against "
-            f"{saliency['baseline']}. A member that goes by what means something else elsewhere cannot transfer."
-        )
+    blocks = [page.shown(material, drawn) for drawn in feature_figures(material)]
+    if blocks:
+        text = f"{_about(material, states)} A member that goes by what means something else elsewhere cannot transfer."
+    else:
+        blocks = [
+            _cards(material, goal["sub_goal"], index, state)
+            for goal in saliency["sub_goals"]
+            for index, state in enumerate(goal["states"])
+        ]
     check = (
-        f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
+        "Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
         f"{max(errors, default=0.0):.0e} (log-odds)."
     )
-    blocks = bars or [
-        _cards(material, goal["sub_goal"], index, state)
-        for goal in saliency["sub_goals"]
-        for index, state in enumerate(goal["states"])
-    ]
     missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
-    return page.section("saliency", title, [text, check if errors else ""], blocks, missing, folded=True)
+    return [page.section("saliency", title, [text, check if errors else ""], blocks, missing, folded=True)]
 
 
 def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block:
     arrays = material.within(f"saliency/{sub_goal}")
     observation, truth = arrays["observations"][index], bool(arrays["labels"][index])
-    place = [{"class": "no", "text": part} for part in (page.texts(arrays["places"])[index],) if part]
-    cards = [_state_card(observation, sub_goal, truth, f"truth: {'yes' if truth else 'no'}", place)]
+    place = page.texts(arrays["places"])[index]
+    cards = [
+        {
+            "png": page.picture(observation),
+            "alt": f"A held-out state; {sub_goal} is {'reached' if truth else 'not reached'}.",
+            "title": f"truth: {'yes' if truth else 'no'}",
+            "lines": [{"class": "no", "text": place}] if place else [],
+        }
+    ]
     for member in state["members"]:
         number = member["member"]
         answer = page.verdict(arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth)
@@ -201,12 +194,9 @@ def figures(material: Material) -> Iterator[Drawn]:
         place = page.texts(arrays["places"])[0]
         error = max(member["completeness_error"] for member in goal["states"][0]["members"])
         description = (
-            f"Attributions by {goal['states'][0].get('method', 'DeepLift')} of each member of {saliency['ensemble']} "
-            f"(seed {saliency['seed']}) on a held-out state of {goal['sub_goal']}{f' ({place})' if place else ''}: "
-            f"{KINDS[goal['states'][0]['kind']]}. Against "
-            f"{saliency['baseline']}. Orange speaks for 'reached', blue against it; each picture has its own "
-            f"scale. "
-            f"They add up to the difference in log-odds within {error:.0e}."
+            f"{_about(material, goal['states'])} A held-out state of {goal['sub_goal']}"
+            f"{f' ({place})' if place else ''}: {KINDS[goal['states'][0]['kind']]}. {COLOURS} They add up to the "
+            f"difference in log-odds within {error:.0e}."
         )
         colours = state["seen"].shape[-1] == 3
         every = "Colour by colour." if colours else "Every frame that members see."
@@ -222,11 +212,7 @@ def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
 
 
 def attributions_of_members(state: Mapping[str, NDArray[Any]]) -> Figure:
-    """Figure 2: what each member goes by in one state; of a stack of frames the last.
-
-    ``state`` is of one state what is in ``EXPLAINED``, as ``arrays.h5`` has it; the first of a row's pictures is the
-    state itself.
-    """
+    """Figure 2: what each member goes by in one state, of which ``state`` holds ``EXPLAINED``; of a stack the last."""
     members = len(state["attributions"])
     columns = min(4, members + 1)
     figure, places = grid_of_pictures(-(-(members + 1) // columns), columns, KEY)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,33 +19,30 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
-from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, THOMPSON, base_name, variants, which
-from hypogoal.evaluation.numbers import Metrics
+from hypogoal.evaluation.curves import variants, which
+from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
-from hypogoal.evaluation.run import Choices, read_choices, thresholds_of, within
+from hypogoal.evaluation.run import takes, thresholds_of, within
 from hypogoal.evaluation.table import Row, by_fields, by_run, rows_by_member, select
 from hypogoal.hypotheses.scores import member_scores, most_and_least
 from hypogoal.meta.config import layout_seeds
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
+from hypogoal.options.tables import Choices
 
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
-SELECTED = (LEARNED, THOMPSON, RANDOM, PRETRAINING)  # agents whose options are members: to select among
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
 MOST = ("most", "least")  # preferred
 SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth, on a run's layout
 
 
 def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Spec F6: chosen / expected under uniform choice among the options offered, float64 (..., O).
+    """Spec F6: chosen / expected under uniform choice among the options offered, float (..., O); NaN if never offered.
 
     A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered
-    always. This ratio is 1 for a chooser that does not care, whatever is offered how often, and NaN where an option was
-    never offered. ``chosen`` are the decisions that chose each option, ``expected`` the sum of 1 / (options offered)
-    over those that offered it.
+    always. This ratio is 1 for a chooser that does not care. ``expected``: the sum of 1 / (options offered) over the
+    decisions that offered it.
     """
     safe = np.where(expected > 0, expected, 1.0)
     return np.where(expected > 0, chosen / safe, np.nan)
@@ -79,11 +77,11 @@ def rows(work: Work) -> Iterator[Row]:
         work.progress.advance()
         artefact = work.artefact(run.path)
         config = artefact.config
-        if base_name(artefact.kind, config) not in SELECTED:
+        if not takes(artefact):
             continue
         layout = run.layout["layout_seed"]
         seeds = layout_seeds(config.get("layouts", ""), layout)[:LOOKED_AT]
-        choices, members = read_choices(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
+        choices, members = Choices.read(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
         for option, (picture, count) in members.sets.items():
             dataset = f"terminations/{run.path}/{option}"
             work.arrays[dataset] = picture
@@ -180,12 +178,10 @@ def missing(work: Work) -> list[str]:
     lines = []
     for name, domain in unknown:
         loaded = load_domain(domain)
-        do = f"add {name} to {loaded.labels_stand_in}"
-        do = "import them under one of these names, if it is one of them" if domain in BUILT_IN else do
-        lines.append(
-            f"no truth of {name} to match members with: {domain} has {page.listed(loaded.sub_goals)}; {do}, then "
-            "evaluate again"
-        )
+        do = "import them under one of these names, if it is one of them"
+        do = do if domain in BUILT_IN else f"add {name} to {loaded.labels_stand_in}"
+        goals = page.listed(loaded.sub_goals)
+        lines.append(f"no truth of {name} to match members with: {domain} has {goals}; {do}, then evaluate again")
     return lines
 
 
@@ -197,14 +193,14 @@ PRACTISED = (
 )
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Entry) -> list[Table]:
     """What options do, for a terminal, where no policy over them tells it."""
-    agents = metrics.get("selection", [])
-    agents = [] if variants(agents) else agents
-    members: dict[str, list[Entry]] = {}
-    for goal in (goal for agent in agents for run in agent["runs"] for goal in run["sub_goals"]):
-        members.setdefault(goal["sub_goal"], []).extend(goal["members"])
-    rows = [practised(name, of_goal) for name, of_goal in members.items()]
+    agents = [] if variants(metrics["selection"]) else metrics["selection"]
+    goals = [goal for agent in agents for run in agent["runs"] for goal in run["sub_goals"]]
+    rows = [
+        practised(name, [member for goal in alike for member in goal["members"]])
+        for name, alike in grouped(goals, itemgetter("sub_goal")).items()
+    ]
     return [page.terminal("What options did while they learned", PRACTISED, rows)] if rows else []
 
 
@@ -212,10 +208,9 @@ def practised(name: str, members: Sequence[Entry]) -> Entry:
     """How often the options of a sub-goal were executed, the share that reached it, and their mean duration."""
     executed = [member for member in members if member["chosen"]]
     count = sum(member["chosen"] for member in executed)
-    reached = sum(member["reached"] for member in executed)
-    steps = sum(member["chosen"] * member["duration"] for member in executed)
-    shares = {"reached": reached / count, "duration": steps / count} if count else {"reached": None, "duration": None}
-    return {"sub_goal": name, "chosen": count, **shares}
+    reached = sum(member["reached"] for member in executed) / count if count else None
+    steps = sum(member["chosen"] * member["duration"] for member in executed) / count if count else None
+    return {"sub_goal": name, "chosen": count, "reached": reached, "duration": steps}
 
 
 MEMBERS = (
@@ -228,12 +223,6 @@ MEMBERS = (
     page.number("steps", "duration", page.fixed, 1),
     page.number("match", "match", page.fixed, 2),
 )
-
-
-def sections(material: Material) -> list[Block]:
-    """Which options are chosen and where they stop, of a run with agents."""
-    agent = _agent(material)
-    return [choices_section(material, agent)] if agent else []
 
 
 def _agent(material: Material) -> Entry | None:
@@ -249,8 +238,11 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
     return f"{word} preferred: member {goal[word]}", note, image
 
 
-def choices_section(material: Material, agent: Entry) -> Block:
+def sections(material: Material) -> list[Block]:
     """Of the first run how often each member was chosen, over what a uniform choice would have; Figures 7 and 8."""
+    agent = _agent(material)
+    if agent is None:
+        return []
     run = agent["runs"][0]
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
@@ -276,7 +268,7 @@ def choices_section(material: Material, agent: Entry) -> Block:
     blocks = [page.table(MEMBERS, lines, caption=caption)]
     blocks += [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
     texts = [text, which(agent, material.metrics["selection"])]
-    return page.section("choices", "Which hypotheses are chosen, and where they stop", texts, blocks, folded=True)
+    return [page.section("choices", "Which hypotheses are chosen, and where they stop", texts, blocks, folded=True)]
 
 
 def figures(material: Material) -> Iterator[Drawn]:

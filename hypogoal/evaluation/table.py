@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_text
+from hypogoal.core.files import FORMULA, read_text
 from hypogoal.evaluation.numbers import by_groups, grouped, method_rank, over, pairs
 
 AGAIN = "Evaluate the run again."
 MAX_BYTES = 2**30  # of numbers.csv
+HARMLESS = re.compile(rf"(^|[,;\"])'(?=\s*[{re.escape(FORMULA)}])")  # what ``write_table`` puts before a formula
 BEST, WORST, VALIDATED = "best_member", "worst_member", "validated_member"  # quantities: which member it is
 MEMBERS: Mapping[str, Callable[[Any], Any]] = {"best": np.max, "mean": np.mean, "worst": np.min}
 Entry = dict[str, Any]
@@ -117,7 +119,7 @@ def _field(name: str, text: str) -> Any:
     if name == "N":
         return int(text) if text else None
     whole = name in ("member", "layout", "seed", "step") and text.lstrip("-").isdecimal()
-    return int(text) if whole else text
+    return int(text) if whole else HARMLESS.sub(r"\1", text)
 
 
 def select(rows: Iterable[Row], **fields: Any) -> list[Row]:

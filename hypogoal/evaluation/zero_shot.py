@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,14 +18,14 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.choosing import UNIFORM
-from hypogoal.evaluation.curves import NEAR
-from hypogoal.evaluation.numbers import Metrics, grouped
+from hypogoal.evaluation.curves import NEAR, scores
+from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.numbers import Metrics
 from hypogoal.evaluation.page import Block, Material, Question
-from hypogoal.evaluation.table import Number, Row, Table, rows_of, select, tabulate
+from hypogoal.evaluation.table import Number, Row, Table, by_fields, rows_of, select, tabulate
 from hypogoal.meta.config import layout_seeds
 
 if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 
 EPISODES = 3  # of an agent on each layout
@@ -58,7 +57,7 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
     """
-    from hypogoal.evaluation.frozen import Always, begin_anew, scores
+    from hypogoal.evaluation.frozen import Always, begin_anew
 
     begin_anew(loop, Always(option))
     engine, steps = loop.engine, np.zeros(loop.engine.count, dtype=np.int64)
@@ -138,28 +137,25 @@ def view(work: Work) -> dict[str, Any]:
         return work.agent_of(row.artefact)
 
     rows = select(work.rows, scope=SCOPE)
-    of_options = [row for row in rows if row.sub_goal]
     by_chooser = Table(
         {"agent": agent, "name": "method"},
         _columns(OF_AGENTS),
         cell=lambda key: (SCOPE, key[0], UNIFORM if key[1] == UNIFORM else "agent"),
     )
-    by_sub_goal = Table(
-        {"agent": agent, "sub_goal": "sub_goal"}, _columns(OF_OPTIONS), cell=lambda key: (SCOPE, *key, MEAN)
-    )
     by_member = Table(
-        {**by_sub_goal.by, "member": "member"}, by_sub_goal.numbers, cell=lambda key: (SCOPE, *map(str, key))
+        {"agent": agent, "sub_goal": "sub_goal", "member": "member"},
+        _columns(OF_OPTIONS),
+        cell=lambda key: (SCOPE, *map(str, key)),
     )
     agents = tabulate((row for row in rows if not row.sub_goal), by_chooser)
     for entry in agents:
         configs = [run.config for run in work.agents[entry["agent"]]]
         trained = [layout_seeds(config.get("layouts", ""), config["layout_seed"]) for config in configs]
         entry["trained_on"] = max(len({*seeds}.intersection(work.layouts)) for seeds in trained)
-    members = grouped(tabulate(of_options, by_member), itemgetter("agent", "sub_goal"))
-    options = []
-    for mean in tabulate(of_options, by_sub_goal):
-        options += [mean | {"member": MEAN}, *members[mean["agent"], mean["sub_goal"]]]
-    return {"zero_shot": {"layouts": list(work.layouts), "agents": agents, "options": options}}
+    of_options: list[Row] = []  # the mean member of each sub-goal, then each member
+    for members in by_fields((row for row in rows if row.sub_goal), agent, "sub_goal").values():
+        of_options += [*(row._replace(member=MEAN) for row in members), *members]
+    return {"zero_shot": {"layouts": list(work.layouts), "agents": agents, "options": tabulate(of_options, by_member)}}
 
 
 SCORES = (

@@ -17,11 +17,12 @@ from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation import curves, distance
 from hypogoal.evaluation.numbers import grouped
-from hypogoal.evaluation.run import read_episodes, read_executions, read_layout
+from hypogoal.evaluation.run import read_layout
 from hypogoal.evaluation.table import Row, defined, read_rows, rows_of, select
 from hypogoal.experiments.cells import COLUMNS, Cell, Plan
 from hypogoal.experiments.records import RESULTS
 from hypogoal.experiments.status import done_of
+from hypogoal.options.tables import Episodes, Executions
 
 SCOPES = ("", "labelled", "unlabelled", "heldout", "unseen", "all")  # of what is listed
 
@@ -69,13 +70,13 @@ def _of_cell(cell: Cell, evaluated: Sequence[Row]) -> Iterator[Row]:
     yield from evaluated
     if "executions.csv" in files:
         if not evaluated:
-            config, executions = artefact.config, read_executions(artefact.path / "executions.csv")
+            config, executions = artefact.config, Executions.read(artefact.path / "executions.csv")
             more = {"masked": config["mask_reached"], "seed": artefact.seed}
             yield from distance.rows_of_ladder(executions, config["sub_goals"], config["members"], {}, **more)
     elif "episodes.csv" in files:
         layout = read_layout(artefact.path / "layout.json")
         if not evaluated:
-            episodes = read_episodes(artefact.path / "episodes.csv")
+            episodes = Episodes.read(artefact.path / "episodes.csv")
             run = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
             yield from curves.rows_of_run(run, "")
         yield from rows_of({"random_success": layout["random_success"]})

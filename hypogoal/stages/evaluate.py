@@ -20,15 +20,16 @@ from hypogoal.evaluation.judging import Case, Work, cases_of, judgements, proces
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.provenance import provenance
 from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings
-from hypogoal.evaluation.run import FORMAT, LAST, WINDOW, find, most_used
+from hypogoal.evaluation.run import FORMAT, find, most_used
 from hypogoal.evaluation.table import Row, compared, defined
 from hypogoal.experiments.cells import DERIVED
 from hypogoal.experiments.records import PLAN, read_plan
 from hypogoal.experiments.status import stamp_of
+from hypogoal.learners.episodes import LAST
 from hypogoal.meta.config import layout_seeds
 from hypogoal.needs import evaluation_needs
 
-SETTINGS = {"window": WINDOW, "solved": SOLVED}
+SETTINGS = {"window": LAST, "solved": SOLVED}
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
 
 

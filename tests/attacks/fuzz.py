@@ -223,11 +223,12 @@ def read_run(case: Path, kind: str, often: bool) -> list[Callable[[], object]]:
 def read_table(path: Path) -> None:
     """A table or file of the artefact ``meta``, as its readers do."""
     from hypogoal.evaluation import run
+    from hypogoal.options.tables import Choices, Episodes, Executions
 
     readers: dict[str, Callable[[Path], Any]] = {
-        "episodes.csv": run.read_episodes,
-        "choices.csv": lambda path: run.read_choices(path).total("chosen", 4),
-        "executions.csv": run.read_executions,
+        "episodes.csv": Episodes.read,
+        "choices.csv": lambda path: Choices.read(path).total("chosen", 4),
+        "executions.csv": Executions.read,
         "layout.json": run.read_layout,
         "terminations.h5": run.read_terminations,
     }

@@ -11,8 +11,8 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.run import read_episodes
 from hypogoal.learners.baselines.settings import BaselineConfig
+from hypogoal.options.tables import Episodes
 from hypogoal.stages.train_baseline import train_baseline
 
 TESTS = Path(__file__).parents[1]
@@ -96,7 +96,7 @@ def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, mon
     monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:SWIFT")
     few = BaselineConfig(steps=2_048, max_episode_steps=20)
     numbers = train_baseline("corridor_env:SWIFT", few, tmp_path / "ppo", quiet=True)
-    episodes = read_episodes(tmp_path / "ppo" / "episodes.csv")
+    episodes = Episodes.read(tmp_path / "ppo" / "episodes.csv")
     succeeded, cut = episodes.succeeded, ~episodes.terminated
     assert (succeeded == (episodes.length <= 5))[~cut].all() and succeeded[cut].any()
     assert (~succeeded & (episodes.reward > 0)).any()

@@ -17,8 +17,8 @@ from hypogoal.evaluation.explorer import _options
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import meanings, paper_figures
-from hypogoal.evaluation.run import Choices, Episodes
 from hypogoal.evaluation.selection import rows_of_choices, sections, selection_of
+from hypogoal.options.tables import Choices, Episodes
 
 SUB_GOALS = ["open-red-door"]
 

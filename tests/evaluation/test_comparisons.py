@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from hypogoal.core.files import write_table
 from hypogoal.evaluation import curves, distance, hypotheses, rooms
 from hypogoal.evaluation.numbers import compare_pairs
 from hypogoal.evaluation.page import comparison_tables
-from hypogoal.evaluation.table import BEST, VALIDATED, Row, compared, rows_of
+from hypogoal.evaluation.table import BEST, VALIDATED, Row, compared, read_rows, rows_of
 
 
 def pairs(first, second, units=None, **more):
@@ -197,3 +198,11 @@ def test_the_table_says_each_method_once():
     (told,) = comparison_tables([*rows, {**rows[0], "first": "b", "where": "N=1"}], "seed", "layouts")
     assert [column["name"] for column in told["columns"]][:4] == ["quantity", "of", "first", "second"]
     assert comparison_tables([], "seed", "layouts") == []
+
+
+def test_names_that_look_like_formulas_are_read_as_they_were(tmp_path):
+    """Spec A5: the apostrophe that keeps a spreadsheet from running them is not part of a name."""
+    rows = [Row("success", 1.0, method="=1+1, steps=-2", seed=-3), Row("success", 0.5, method="it's; @x", layout=7)]
+    write_table(tmp_path / "numbers.csv", Row._fields, rows)
+    assert "'=1+1" in (tmp_path / "numbers.csv").read_text(encoding="utf-8")
+    assert read_rows(tmp_path / "numbers.csv") == rows

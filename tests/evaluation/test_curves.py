@@ -5,7 +5,6 @@ import pytest
 
 from hypogoal.evaluation.curves import (
     curves,
-    near_shortest,
     run_numbers,
     steps_to_solve,
     trailing_mean,
@@ -19,7 +18,7 @@ from hypogoal.evaluation.numbers import (
     mean_and_error,
     over,
 )
-from hypogoal.evaluation.run import Episodes
+from hypogoal.options.tables import Episodes
 
 
 def episodes(terminated, length=10):
@@ -59,10 +58,10 @@ def test_near_counts_successes_within_one_and_a_half_shortest_paths():
     length = np.array([10, 15, 16, 15, 15, 12, 400, 11])
     reward = np.array([1.0, 1, 1, 0, 1, -1, 1, 1])
     run = Episodes(np.cumsum(length), length, reward, np.array([1, 1, 1, 1, 0, 1, 1, 1], dtype=bool))
-    assert near_shortest(run, 10) == 3 / 8
-    assert near_shortest(run, 11) == 4 / 8
+    assert run_numbers(run, 10)["near"] == 3 / 8
+    assert run_numbers(run, 11)["near"] == 4 / 8
     assert run_numbers(run, 10, window=2)["near"] == 1 / 2  # of the last ones
-    for unknown in (near_shortest(run, None), run_numbers(run, None)["near"], near_shortest(episodes([]), 10)):
+    for unknown in (run_numbers(run, None)["near"], run_numbers(episodes([]), 10)["near"]):
         assert np.isnan(unknown)
 
 

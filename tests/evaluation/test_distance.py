@@ -18,7 +18,6 @@ from hypogoal.evaluation.distance import (
     options_of,
     rows_of_ladder,
 )
-from hypogoal.evaluation.run import read_executions
 from hypogoal.evaluation.table import BEST, VALIDATED, WORST, rows_of
 from hypogoal.options.tables import Executions
 
@@ -29,7 +28,7 @@ def read(tmp_path):
 
     def of(rows):
         write_table(tmp_path / "executions.csv", COLUMNS, rows)
-        return read_executions(tmp_path / "executions.csv")
+        return Executions.read(tmp_path / "executions.csv")
 
     return of
 
@@ -152,4 +151,4 @@ def test_a_damaged_table_is_one_line(tmp_path, text):
     path = tmp_path / "executions.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(UserError, match=r"executions\.csv"):
-        read_executions(path)
+        Executions.read(path)

@@ -20,7 +20,7 @@ def curves():
     several[1, 7:] = np.nan
     several[:, 0] = np.nan
     lines = [Line("options", GRID, several, BLUE), Line("PPO", GRID, several[:1], VERMILLION, STYLES[1])]
-    return learning_curves(lines, "reward per episode", [("random play", 0.1)], (0, 1))
+    return learning_curves(lines, "reward", {"random play": 0.1})
 
 
 def of_members(name, sub_goal, best, mean, worst):
@@ -76,7 +76,7 @@ LONG = [
 
 def long_curves():
     values = np.linspace(0, 1, 11)[None]
-    return learning_curves([Line(name, GRID, values, BLUE) for name in LONG], "reward per episode")
+    return learning_curves([Line(name, GRID, values, BLUE) for name in LONG], "reward")
 
 
 def long_members():
@@ -101,7 +101,7 @@ def test_names_beside_lines_do_not_lie_on_each_other():
     lines = [
         Line(name, GRID, np.full((1, 11), end), BLUE) for name, end in (("a", 1.0), ("b", 1.0), ("c", 1.0), ("d", 0.0))
     ]
-    figure = learning_curves(lines, "reward", [("random play", 0.0)], (0, 1))
+    figure = learning_curves(lines, "reward", {"random play": 0.0})
     FigureCanvasAgg(figure).draw()  # lays it out
     assert not figure.legends
     texts = {text.get_text(): text.get_window_extent() for text in figure.axes[0].texts}

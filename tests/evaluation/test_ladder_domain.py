@@ -8,7 +8,7 @@ from ladder_run import COLUMNS
 from hypogoal.core.files import write_table
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.distance import at_base, distance_table, fates, options_of, rows_of_ladder, show_stops
-from hypogoal.evaluation.run import read_executions
+from hypogoal.options.tables import Executions
 
 
 @pytest.mark.atari
@@ -19,7 +19,7 @@ def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
     away = domain.distance(stops)
     rows = [(n, 0, 9, 1, 0, 0, *stop, distance) for n, (stop, distance) in enumerate(zip(stops, away, strict=True))]
     write_table(tmp_path / "executions.csv", COLUMNS, rows)
-    own = read_executions(tmp_path / "executions.csv")
+    own = Executions.read(tmp_path / "executions.csv")
     assert own.distance[1] == 0
     assert own.distance[0] > own.distance[2] > 4
     assert at_base(own).tolist() == [False, True, False, True, False]

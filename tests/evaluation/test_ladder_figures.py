@@ -5,7 +5,7 @@ import pytest
 
 from hypogoal.evaluation.distance import distance_bars, stops_over_rooms
 from hypogoal.evaluation.plots import to_png, to_svg
-from hypogoal.evaluation.rooms import bands, scores_over_groups
+from hypogoal.evaluation.rooms import scores_over_groups
 
 ACCURACY = ("accuracy, all rooms", "all", "accuracy", "best")
 BALANCED = ("balanced, unseen", "unseen", "balanced_accuracy", "best")
@@ -98,14 +98,6 @@ def test_with_one_n_methods_stand_side_by_side_with_error_bars():
     np.testing.assert_allclose([place[0, 0] for place in places], [0.94, 1.0, 1.06])
     marks = [line.get_xdata()[0] for line in axes.get_lines() if line.get_label() in names]
     np.testing.assert_allclose(marks, [0.94, 1.0, 1.06])
-
-
-def test_captions_say_what_shows_the_spread():
-    """Figure 3: bands over several N, bars at one."""
-    one, several = [{"method": "a", "groups": 1}], [{"method": "b", "groups": 1}, {"method": "b", "groups": 2}]
-    assert bands(several) == "bands"
-    assert bands(one) == "bars (methods side by side, all at the same N)"
-    assert bands(one + several) == "bands, and bars where a method has one N (those methods side by side)"
 
 
 def test_a_bar_is_as_high_as_its_mean():

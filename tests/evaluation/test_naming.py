@@ -18,8 +18,8 @@ from hypogoal.evaluation.curves import (
     rows_of_run,
 )
 from hypogoal.evaluation.numbers import ensemble_names, name_apart
-from hypogoal.evaluation.run import Choices, Episodes
 from hypogoal.evaluation.selection import rows_of_choices, selection_of
+from hypogoal.options.tables import Choices, Episodes
 
 META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_steps": 200, "option_gamma": 0.95}
 
@@ -138,3 +138,9 @@ def test_what_most_have_in_common_goes_unsaid() -> None:
     configs: list[dict[str, object]] = [{"a": 1, "b": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 2}, {"a": 1, "b": 1}]
     assert name_apart(["x"] * 4, configs) == ["x", "x, a=2", "x, b=2", "x"]
     assert name_apart(["x"] * 2, configs[:2]) == ["x, a=1", "x, a=2"]
+
+
+def test_a_users_own_chooser_has_its_name():
+    """Spec E6: it is no PPO; the page still shows it as an option agent."""
+    assert base_name("meta", {"termination": "learned", "chooser": "first:First"}) == f"{LEARNED}, chooser=first:First"
+    assert base_name("meta", {"termination": "oracle", "chooser": "first:First"}) == f"{ORACLE}, chooser=first:First"

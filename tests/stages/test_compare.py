@@ -136,7 +136,7 @@ def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
     line = refused(slow, changed("bare", lambda metrics: metrics.update(agents=[])))
     assert "no kind of result in common (slow: agents; bare: nothing)" in line
     old = changed("old", lambda metrics: metrics.pop("distance"))
-    assert "the evaluation is damaged (no distance)" in refused(slow, old)
+    assert "does not fit this hypogoal, or is damaged" in refused(slow, old)
     old = changed("older", lambda metrics: metrics.pop("format"))
     assert "another version of hypogoal evaluated this (format 1, needed: 2)" in refused(slow, old)
     with pytest.raises(UserError, match="would replace an input"):
