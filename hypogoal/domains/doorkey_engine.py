@@ -19,7 +19,6 @@ from minigrid.core.grid import Grid
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import growing
 from hypogoal.domains.base import Engine, Layouts, Plan, Step
 from hypogoal.domains.doorkey_env import (
     DOOR_COLOUR,
@@ -95,7 +94,7 @@ class DoorKeyEngine(Engine):
 
     n_actions = N_ACTIONS
     observation_shape = OBSERVATION_SHAPE
-    restarts = resumes = alike = True
+    restarts = resumes = True
     n_states = 0
 
     def __init__(
@@ -293,13 +292,9 @@ class DoorKeyEngine(Engine):
         return {
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
-            "configurations": growing(self._places[: len(self._rows)].copy()),
-            "sites": growing(self._site[: self.n_states].copy()),
-            **(
-                {"seeds": growing(np.array(self._seeds)), "layouts": self.layouts.snapshot()}
-                if self.layouts.many
-                else {}
-            ),
+            "configurations": self._places[: len(self._rows)].copy(),
+            "sites": self._site[: self.n_states].copy(),
+            **({"seeds": np.array(self._seeds), "layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import ANEW, Unlike, growing
+from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, layers
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
@@ -304,8 +304,6 @@ class GymnasiumEngine(TurnEngine):
     each, see ``GymnasiumDomain``.
     """
 
-    alike = True
-
     def __init__(
         self,
         make: MakeEnv,
@@ -405,9 +403,9 @@ class GymnasiumEngine(TurnEngine):
         return {
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
-            "images": growing(np.stack(self._ring)),
-            "labels": growing(np.frombuffer(self._labels, np.uint8).copy()),
-            "played": [growing(actions, 0) for actions in self._played],
+            "images": np.stack(self._ring),
+            "labels": np.frombuffer(self._labels, np.uint8).copy(),
+            "played": [list(actions) for actions in self._played],
             **({"layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
@@ -420,7 +418,7 @@ class GymnasiumEngine(TurnEngine):
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
         if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, size):
-            raise Unlike("at /loop/engine: its pictures and labels differ in number")
+            raise ValueError("its pictures and labels differ in number")
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
