@@ -222,22 +222,6 @@ def print_next(quiet: bool, *words: object) -> None:
         say(f"next: {typed(*words)}")
 
 
-def command_again(context: typer.Context, **changes: object) -> str:
-    """The current command as one would type it, with some options changed."""
-    from hypogoal.core.commands import command as typed
-
-    words: list[object] = [context.info_name]
-    for option in context.command.params:
-        value = changes.get(str(option.name), context.params.get(str(option.name)))
-        if option.param_type_name == "argument":
-            words.append(value)
-        elif value and value != option.default:
-            switch = option.opts[0]
-            values = value if isinstance(value, list) else [value]
-            words += [switch] if value is True else [word for each in values for word in (switch, each)]
-    return typed(*words)
-
-
 def echo(value: Any, as_json: bool, text: list[str]) -> None:
     if as_json:
         give(json.dumps(value, indent=1))
