@@ -108,7 +108,6 @@ def label(
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
     arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
-    fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps per second; 0: a step for each key.")] = 0,
     resume: Annotated[bool, Option("--resume", help="Continue with an existing folder.")] = False,
     record: Annotated[Path | None, Option(help="Write what you play into this file, for 'collect --play'.")] = None,
 ) -> None:
@@ -122,7 +121,7 @@ def label(
 
     with own_code.given(source):
         counts = stage(
-            source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout, fps=fps,
+            source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout,
             resume=resume, record=record,
         )  # fmt: skip
     say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
