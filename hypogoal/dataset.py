@@ -302,7 +302,7 @@ class Dataset:
     def sample(self, part: str, count: int) -> Observations:
         """About ``count`` states spread over ``unlabelled`` or ``labelled/<sub-goal>``; reads no others."""
         with self._file() as file:
-            length = len(self._observation_data(file, f"{part}/observations"))
+            length = self._count(file, part)
             blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # blocks do not overlap
             starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
             rows = [slice(start, start + min(count, BLOCK)) for start in starts]
@@ -311,12 +311,12 @@ class Dataset:
     def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
         """The unlabelled states' origins, int64 (M,) by name; empty if the file has none."""
         with self._file() as file:
-            return self._origins(file, "unlabelled", len(self._observation_data(file, "unlabelled/observations")))
+            return self._origins(file, "unlabelled", self._count(file, "unlabelled"))
 
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""
         with self._file() as file:
-            rows: dict[str, Any] = {"unlabelled": len(self._observation_data(file, "unlabelled/observations"))}
+            rows: dict[str, Any] = {"unlabelled": self._count(file, "unlabelled")}
             for split in SPLITS:
                 rows[split] = {}
                 for goal in self.sub_goals:
@@ -343,9 +343,8 @@ class Dataset:
         return labels.astype(np.bool_)
 
     def _observations(self, file: Any, base: str, rows: slice | None = None) -> Observations:
-        name = f"{base}/observations"
-        data = self._observation_data(file, name)
-        dtype = self.observation_dtype
+        name, dtype = f"{base}/observations", self.observation_dtype
+        data = hdf5.checked(file, name, "uf")
         if data.shape[1:] != self.observation_shape or data.dtype != dtype:
             raise hdf5.Foreign(f"{name!r} is {data.dtype} {data.shape}, not {dtype} (N, {self.observation_shape})")
         values = hdf5.read_array(file, name, "uf", rows)
@@ -354,12 +353,11 @@ class Dataset:
         return values
 
     @staticmethod
-    def _observation_data(file: Any, name: str) -> Any:
-        hdf5.size_of(file, name, "uf")
-        data = file[name]
-        if not data.shape:
-            raise hdf5.Foreign(f"{name!r} is a single number")
-        return data
+    def _count(file: Any, base: str) -> int:
+        shape = hdf5.checked(file, f"{base}/observations", "uf").shape
+        if not shape:
+            raise hdf5.Foreign(f"{base}/observations is a single number")
+        return int(shape[0])
 
     @staticmethod
     def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:

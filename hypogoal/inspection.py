@@ -13,7 +13,15 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
+from hypogoal.core.artefacts import (
+    MANIFEST,
+    Artefact,
+    check_parent,
+    extra_files,
+    file_faults,
+    find_input,
+    open_artefact,
+)
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
@@ -137,8 +145,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     """Draw a data file's labelled and held-out states, one picture per room and label, to check labels by eye.
 
     The files are ``labelled/room-01-positives.png`` and so on in ``folder``, in a folder per sub-goal if there are
-    several. A path that is no data file, states that are not pictures, and a folder that cannot be written are a
-    ``UserError``.
+    several. A path that is no data file and states that are not pictures are a ``UserError``.
     """
     from PIL import Image
 
@@ -151,6 +158,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
         actual = f"{dataset.observation_dtype} {dataset.observation_shape}"
         do = advice("Read them as arrays", "export", path, "--out", f"{path.stem}.npz")
         raise UserError("the states are not pictures", actual, do)
+    check_parent(folder / "labelled")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []
@@ -158,15 +166,10 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
         for sub_goal in dataset.sub_goals:
             place = folder / split / (sub_goal if len(dataset.sub_goals) > 1 else "")
             for name, sheet in contact_sheets(getattr(dataset, split)(sub_goal), kinds).items():
-                file = place / f"{name}.png"
-                try:
-                    place.mkdir(parents=True, exist_ok=True)
-                    with replacing(file) as fresh:
-                        Image.fromarray(sheet).save(fresh, format="png")
-                except OSError as error:
-                    what = f"the picture cannot be written ({error.strerror or error})"
-                    raise UserError(what, file, "Choose another folder.") from None
-                written.append(file)
+                place.mkdir(parents=True, exist_ok=True)
+                written.append(place / f"{name}.png")
+                with replacing(written[-1]) as fresh:
+                    Image.fromarray(sheet).save(fresh, format="png")
     return written
 
 

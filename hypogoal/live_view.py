@@ -21,6 +21,7 @@ from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError, printable
 from hypogoal.core.files import MOST_INTEGER, inside, json_lines, plain_name, read_end
 from hypogoal.core.manifests import LOG
+from hypogoal.core.progress import duration
 from hypogoal.core.terminal import draw, screen
 
 RATES = ("success", "reached")  # shares of episodes or executions, drawn from 0 to 1
@@ -142,7 +143,7 @@ def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
     for row in shown:
         table.add_row(
             row.title if len(row.title) <= NAME else f"…{row.title[1 - NAME :]}",
-            "done" if row.seconds is None else f"{_ago(row.seconds)} ago",
+            "done" if row.seconds is None else f"{duration(row.seconds)} ago",
             f"{row.step:,}",
             f"{row.watched} {row.series[-1]:.3g}" if row.series else "–",
             curve(row.series, (0.0, 1.0) if row.watched in RATES else None),
@@ -150,13 +151,6 @@ def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
     if len(shown) < len(rows):
         table.caption = f"and {len(rows) - len(shown)} more"
     return table
-
-
-def _ago(seconds: float) -> str:
-    for size, unit in ((3600, "h"), (60, "min")):
-        if seconds >= size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def curve(values: Sequence[float], bounds: tuple[float, float] | None = None, width: int = CURVE) -> str:

@@ -64,19 +64,15 @@ def ensemble_needs(
         parts = [(data, f"labelled/{goals[0]}"), *((path, "unlabelled") for path in unlabelled)]
         cost = step_cost(np.concatenate([open_dataset(path).sample(part, some) for path, part in parts]), config)
 
-    def memory(batch: int, processes: int = workers, area: float = 1.0) -> float:
-        return processes * (BASE + area * (states + cost.memory + batch * cost.memory_each))
-
-    batches = [config.batch_size // 2**halvings for halvings in range(1, config.batch_size.bit_length() - 1)]
-    ways = {"--set workers=1": memory(config.batch_size, 1)} if workers > 1 else {}
-    ways |= next(({f"--set batch_size={batch}": memory(batch)} for batch in batches if memory(batch) < free), {})
-    if dtype == PICTURE and max(shape[:2]) > LARGE:
-        area = (LARGE / max(shape[:2])) ** 2
-        ways[f"pictures of {LARGE} pixels (import them with --resize {LARGE})"] = memory(config.batch_size, area=area)
-    fitting = [way for way, needed in ways.items() if needed < free]
-    smaller = f"It fits with {' or '.join(fitting)}." if fitting else "Give fewer or smaller states."
+    process = BASE + states + cost.memory
+    fitting = int(min((free / workers - process) / max(1.0, cost.memory_each), config.batch_size))
+    ways = [f"--set batch_size={fitting}"] if 2 <= fitting < config.batch_size else []
+    ways += ["--set workers=1"] if workers > 1 else []
+    ways += [f"pictures of {LARGE} pixels (import them with --resize {LARGE})"] if max(shape[:2]) > LARGE else []
+    memory = workers * (process + config.batch_size * cost.memory_each)
     seconds = len(goals) * steps * (cost.seconds + config.batch_size * cost.seconds_each) / workers
-    return Needs(memory(config.batch_size), ensemble_disk(len(goals), cost.weights), seconds, smaller)
+    smaller = f"Try {' or '.join(ways or ['fewer or smaller states'])}."
+    return Needs(memory, ensemble_disk(len(goals), cost.weights), seconds, smaller)
 
 
 def weights_only(weights: float) -> StepCost:

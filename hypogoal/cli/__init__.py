@@ -79,7 +79,8 @@ def main(arguments: list[str] | None = None) -> int:
         message, code = _message(error)
         if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a closed pipe
             raise
-        return _fail(message, code)
+        notes = notes_of(error)
+        return _fail("; ".join([message.rstrip(".") if notes else message, *notes]), code)
 
 
 def _advice(error: Any) -> str:
@@ -95,13 +96,10 @@ def _advice(error: Any) -> str:
 def _message(error: BaseException) -> tuple[str, int]:
     """The message and the exit code."""
     if isinstance(error, UserError):
-        return with_notes(str(error), error), 2
+        return str(error), 2
     if isinstance(error, NumericalError):
-        return "; ".join([f"training stopped: {error}", *notes_of(error)]), 1
-    if isinstance(error, OSError):
-        message, code = _refused(error)
-        return with_notes(message, error), code
-    return _internal(error)
+        return f"training stopped: {error}", 1
+    return _refused(error) if isinstance(error, OSError) else _internal(error)
 
 
 def _internal(error: BaseException) -> tuple[str, int]:
@@ -111,9 +109,9 @@ def _internal(error: BaseException) -> tuple[str, int]:
     if os.strerror(errno.EMFILE) in str(error):  # torch's is not an OSError
         return _refused(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
     if isinstance(error, MemoryError) or any(text in str(error) for text in MEMORY_TEXTS):
-        return with_notes(f"there is not enough memory. Nothing was half-written. {NO_MEMORY}", error), 2
+        return f"there is not enough memory. Nothing was half-written. {NO_MEMORY}", 2
     if (user_error := users_own(error)) is not None:
-        return with_notes(str(user_error), error), 2
+        return str(user_error), 2
     first = next(iter(str(error).splitlines()), "")  # a printed tensor may follow
     return f"internal error: {type(error).__name__}: {first}. Run again with --debug for the traceback.", 1
 
@@ -172,11 +170,6 @@ def _homed() -> bool:
 def _may_read(name: str | bytes) -> bool:
     """Whether the file can be read or does not exist, so that the system refused something else."""
     return os.access(name, os.R_OK) or not os.path.lexists(name)
-
-
-def with_notes(message: str, error: BaseException) -> str:
-    """A message with the notes that were added to its error."""
-    return "; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message
 
 
 def notes_of(error: BaseException) -> list[str]:

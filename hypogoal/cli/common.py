@@ -82,25 +82,23 @@ def command(panel: str, example: str, name: str | None = None, parent: typer.Typ
 
 
 def offer(kind: str) -> Any:
-    """For shell completion: domains, presets, experiments or settings that begin with the typed text."""
+    """For shell completion: all domains, presets, experiments, stages or settings."""
 
-    def offered(ctx: typer.Context, incomplete: str) -> list[str]:
-        presets, stage = Path(__file__).parents[1] / "presets", ctx.info_name or ""
-        named = {path.stem for path in presets.glob("*/*.toml")}
+    def offered(ctx: typer.Context) -> list[str]:
         if kind == "experiment":
             from hypogoal.experiments.named import NAMES
 
-            named = {*NAMES}
-        elif kind == "setting":
-            prefixed = {"": CONFIGS[stage]} if stage in CONFIGS else {f"{name}.": CONFIGS[name] for name in CONFIGS}
-            named = {f"{prefix}{field.name}=" for prefix, config in prefixed.items() for field in fields(config)}
-        elif kind == "stage":
-            named = {*TABLES}
-        elif kind == "domain":
+            return sorted(NAMES)
+        if kind == "domain":
             from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS
 
-            named = {*BUILT_IN, *(entry.name for entry in entry_points(group=ENTRY_POINTS))}
-        return sorted(name for name in named if name.startswith(incomplete))
+            return sorted({*BUILT_IN, *(entry.name for entry in entry_points(group=ENTRY_POINTS))})
+        if kind == "setting":
+            stage = ctx.info_name or ""
+            prefixed = {"": CONFIGS[stage]} if stage in CONFIGS else {f"{name}.": CONFIGS[name] for name in CONFIGS}
+            return [f"{prefix}{field.name}=" for prefix, config in prefixed.items() for field in fields(config)]
+        presets = (Path(__file__).parents[1] / "presets").glob("*/*.toml")
+        return [*TABLES] if kind == "stage" else sorted({path.stem for path in presets})
 
     return offered
 
@@ -220,22 +218,6 @@ def print_next(quiet: bool, *words: object) -> None:
         from hypogoal.core.commands import command as typed
 
         say(f"next: {typed(*words)}")
-
-
-def command_again(context: typer.Context, **changes: object) -> str:
-    """The current command as one would type it, with some options changed."""
-    from hypogoal.core.commands import command as typed
-
-    words: list[object] = [context.info_name]
-    for option in context.command.params:
-        value = changes.get(str(option.name), context.params.get(str(option.name)))
-        if option.param_type_name == "argument":
-            words.append(value)
-        elif value and value != option.default:
-            switch = option.opts[0]
-            values = value if isinstance(value, list) else [value]
-            words += [switch] if value is True else [word for each in values for word in (switch, each)]
-    return typed(*words)
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:

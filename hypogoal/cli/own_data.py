@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 @cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
-    context: typer.Context,
     source: Annotated[Path, Argument(help="A .npz file, or a folder of .npy files, of images or of a Minari dataset.")],
     out: cli.Out,
     sub_goal: Annotated[
@@ -56,13 +55,13 @@ def import_(
             source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, resize=resize, stack=stack,
             domain=domain, seed=seed, force=force,
         )  # fmt: skip
-    _print_observations(context, out, resize, quiet)
+    _print_observations(out, resize, quiet)
     cli.print_counts(counts, quiet)
     cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
     give(out)
 
 
-def _print_observations(context: typer.Context, data: Path, resize: int, quiet: bool) -> None:
+def _print_observations(data: Path, resize: int, quiet: bool) -> None:
     """Say how states were read, as pictures or numbers; of large pictures, how to import them smaller."""
     from hypogoal.dataset import PICTURE, open_dataset
     from hypogoal.needs import LARGE
@@ -73,8 +72,7 @@ def _print_observations(context: typer.Context, data: Path, resize: int, quiet: 
     if not quiet:
         say(f"taken for {'pictures' if pictures else 'numbers'}, {sizes} {dataset.observation_dtype}")
     if pictures and max(dataset.observation_shape[:2]) > LARGE and not resize:
-        smaller = cli.command_again(context, resize=LARGE, force=True)
-        say(f"hypogoal: pictures of {sizes} need much memory and time; for smaller ones: {smaller}", err=True)
+        say(f"hypogoal: pictures of {sizes} need much memory and time; add --resize {LARGE} --force", err=True)
 
 
 @cli.command(cli.OWN, "export data/doorkey.h5 --out states.npz")
@@ -110,7 +108,6 @@ def label(
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
     arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
-    fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps per second; 0: a step for each key.")] = 0,
     resume: Annotated[bool, Option("--resume", help="Continue with an existing folder.")] = False,
     record: Annotated[Path | None, Option(help="Write what you play into this file, for 'collect --play'.")] = None,
 ) -> None:
@@ -124,7 +121,7 @@ def label(
 
     with own_code.given(source):
         counts = stage(
-            source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout, fps=fps,
+            source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout,
             resume=resume, record=record,
         )  # fmt: skip
     say(", ".join(f"{count} {kind}" for kind, count in counts.items()))

@@ -153,8 +153,8 @@ def report(
     if figures is None:
         try:
             give(drawn(run, videos=videos, force=force, resume=resume))
-        except Complete as complete:
-            raise Complete(run / "report" / "index.html", complete.note) from None
+        except Complete:
+            raise Complete(run / "report" / "index.html") from None
         return
     written, missing = draw_figures(run, figures, format_ or "svg", force=force)
     for line in missing:

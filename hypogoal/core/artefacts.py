@@ -8,7 +8,6 @@ import contextlib
 import hashlib
 import os
 import platform
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -19,7 +18,6 @@ from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MAX_NAME_BYTES, inside, is_hole, open_file, read_json, visible
-from hypogoal.core.hdf5 import Busy, open_hdf5
 from hypogoal.core.manifests import (
     AGAIN,
     FORMAT_VERSION,
@@ -31,11 +29,12 @@ from hypogoal.core.manifests import (
 )
 
 DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
-HDF5 = b"\x89HDF\r\n\x1a\n"
+# How a file of a kind begins, and what is in its first bytes, even if the rest is cut off.
+SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations.npy")}
 DEPTH = 3  # levels of folders below a run that are searched for artefacts
 THE_FILE = "the file is"
 PIECE = 1 << 20  # bytes hashed at once
-FRONT = 1 << 16  # the attributes of our HDF5 files begin within so many bytes
+FRONT = 1 << 16  # bytes of a file that are looked at for its kind
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
     "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
@@ -154,7 +153,11 @@ def check_kind(out: Path, kind: str) -> None:
         if existing != kind:
             what = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
             raise UserError(f"the existing output is not of kind {kind!r}: {what}", out, AWAY)
-    elif not (out.is_file() and {DATA: _is_data, ARRAYS: _is_arrays}.get(kind, lambda path: False)(out)):
+        return
+    with open_file(out, "the existing output is", AWAY) as file:
+        begin = file.read(FRONT)
+    signature, content = SIGNATURES.get(kind, (b"", b""))
+    if not signature or not begin.startswith(signature) or content not in begin:
         raise UserError(f"the existing output is not of kind {kind!r}: another file", out, AWAY)
 
 
@@ -165,29 +168,6 @@ def _manifest_kind(folder: Path) -> str:
         if isinstance(manifest, dict) and "format" in manifest and isinstance(manifest.get("kind"), str):
             return str(manifest["kind"])
     return ""
-
-
-def _is_data(path: Path) -> bool:
-    """Whether a file holds collected states: HDF5 with sub-goals' names, which come first in a truncated file."""
-    with open_file(path, "the existing output is", AWAY) as raw:
-        begin = raw.read(FRONT)
-    if not begin.startswith(HDF5):
-        return False
-    try:
-        with open_hdf5(path, "the file", AWAY) as file:
-            return "sub_goals" in file.attrs
-    except Busy:
-        raise
-    except UserError:
-        return b"sub_goals" in begin
-
-
-def _is_arrays(path: Path) -> bool:
-    try:
-        with open_file(path, "the existing output is", AWAY) as raw, zipfile.ZipFile(raw) as file:
-            return "observations.npy" in file.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
 
 
 def check_parent(out: Path) -> None:

@@ -2,7 +2,7 @@
 
 A state is nested dicts and lists of arrays, tensors and plain JSON values; objects give it as ``snapshot()`` and take
 it back with ``restore(snapshot)``. One state is one safetensors file with its JSON part as bytes; no pickle. It is
-private to its stage and version: a loaded state must have the structure of a fresh one (:func:`require_alike`).
+private to its stage and version; a state that does not fit raises an error where it is restored.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, replace_file
+from hypogoal.core.files import replace_file
 from hypogoal.core.stopping import SIGNALS, stop
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least 30 times as long as saving took: at most 3 % of a run
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART, SUM_PART = "json-5", "crc32"  # raise the number when the contents of states change
+JSON_PART, SUM_PART = "json-6", "crc32"  # raise the number when the contents of states change
 ARRAY, TENSOR = "$array", "$tensor"
 ANEW = "Give --force and no --resume to begin anew."
 
@@ -162,7 +162,7 @@ class Checkpoints:
         except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
             if users_own(error) is not None:
                 raise
-            fault = str(error).partition("\n")[0] if isinstance(error, Unlike) else "at its values"
+            fault = f"{type(error).__name__}: {error}".partition("\n")[0]
             raise UserError(f"the checkpoint does not fit this stage ({fault})", self.path, ANEW) from error
 
 
@@ -206,98 +206,14 @@ def _put_together(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     return {key: _put_together(item, arrays) for key, item in value.items()}
 
 
-class Unlike(ValueError):
-    """A saved state does not have the structure of a fresh one."""
-
-
-class _Rows(np.ndarray[Any, Any]):
-    """An array whose number of rows may change between snapshots."""
-
-
-class _List(list[Any]):
-    """A list whose length may change between snapshots; each item is like ``item``."""
-
-    item: Any
-
-
-class _Dict(dict[str, Any]):
-    """A dict whose keys may change between snapshots; each value is like ``item``."""
-
-    item: Any
-
-
-class Unknown(dict[str, Any]):
-    """A part of a state whose structure only its owner knows, such as that of a user's engine."""
-
-
-def growing(values: Any, item: Any = None) -> Any:
-    """The same array (n, ...), list or dict, marked for :func:`require_alike`: only its length may change.
-
-    ``item`` is an example item of a list or dict, which may be empty.
-    """
-    if isinstance(values, np.ndarray):
-        return values.view(_Rows)
-    marked = _Dict(values) if isinstance(values, dict) else _List(values)
-    marked.item = item
-    return marked
-
-
-def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
-    """Refuse (``Unlike``) a saved state whose keys, types, dtypes or shapes differ from those of a ``fresh`` one.
-
-    Only parts marked as :func:`growing` may differ in length; a number may replace None. Texts, such as the kind of a
-    generator, never change.
-    """
-    fresh = fresh.item() if isinstance(fresh, np.generic) else fresh
-    where = place or "/"
-    if isinstance(fresh, Unknown):
-        return
-    if isinstance(fresh, dict):
-        if not isinstance(saved, dict):
-            raise Unlike(f"no dict at {where}")
-        if isinstance(fresh, _Dict):
-            fresh = dict.fromkeys(saved, fresh.item)
-        if differ := sorted(fresh.keys() ^ saved.keys()):
-            raise Unlike(f"{'unknown' if differ[0] in saved else 'missing'}: {place}/{differ[0]}")
-        for key, value in saved.items():
-            require_alike(value, fresh[key], f"{place}/{key}")
-    elif isinstance(fresh, list | tuple):
-        if isinstance(fresh, _List) and isinstance(saved, list):
-            fresh = [fresh.item] * len(saved)
-        if not isinstance(saved, list) or len(saved) != len(fresh):
-            raise Unlike(f"no list of {len(fresh)} at {where}")
-        for number, (value, like) in enumerate(zip(saved, fresh, strict=True)):
-            require_alike(value, like, f"{place}/{number}")
-    elif hasattr(fresh, "dtype"):
-        kind, shape = str(fresh.dtype), tuple(fresh.shape)
-        saved_shape = tuple(getattr(saved, "shape", ()))
-        grows = isinstance(fresh, _Rows) and len(saved_shape) == len(shape)
-        if str(getattr(saved, "dtype", "")) != kind or saved_shape[grows:] != shape[grows:]:
-            raise Unlike(f"not {kind} {shape} at {where}")
-    elif not (
-        (saved == fresh if isinstance(fresh, str) else type(saved) is type(fresh))
-        or (type(saved) is int and isinstance(fresh, float))
-        or (type(saved) in (int, float) and fresh is None)
-    ):
-        raise Unlike(f"not {type(fresh).__name__} at {where}")
-    elif type(saved) is int and abs(saved) > MOST_INTEGER >= abs(fresh or 0):  # a generator's state is as large
-        raise Unlike(f"no such count at {where}")
-
-
 def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:
     """Adam's moments and step counts of each parameter that was updated; its settings come from the configuration."""
-    import torch
-
-    state = optimiser.state
-    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    items = [{"step": torch.zeros(()), "exp_avg": each, "exp_avg_sq": each} for each in parameters]
-    pairs = enumerate(zip(parameters, items, strict=True))
-    return {str(number): growing([state[each]] if each in state else [], item) for number, (each, item) in pairs}
+    return {str(number): moments for number, moments in optimiser.state_dict()["state"].items()}
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None:
     """Continue from an ``optimiser_snapshot`` of an optimiser of the same parameters."""
-    state = {int(number): moments[0] for number, moments in snapshot.items() if moments}
+    state = {int(number): moments for number, moments in snapshot.items()}
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
@@ -311,17 +227,9 @@ class Resumable:
 
     CHANGING: ClassVar[tuple[str, ...]] = ()
 
-    def items(self) -> Mapping[str, Any]:
-        """An example item of each attribute in ``CHANGING`` whose length changes: a deque, a list, an array's rows.
-
-        For a list of lists or deques, one per option or environment, an item of the inner ones.
-        """
-        return {}
-
     def snapshot(self) -> State:
         """All that a resumed run needs to continue exactly; valid until the next step."""
-        items = self.items()
-        return {name: _taken(getattr(self, name), items.get(name)) for name in self.CHANGING}
+        return {name: _taken(getattr(self, name)) for name in self.CHANGING}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an object made with the same arguments."""
@@ -329,16 +237,13 @@ class Resumable:
             setattr(self, name, _restored(getattr(self, name), snapshot[name]))
 
 
-def _taken(value: Any, item: Any = None) -> Any:
+def _taken(value: Any) -> Any:
     import torch
 
     if isinstance(value, Resumable):
         return value.snapshot()
     if isinstance(value, list | deque):
-        fixed = bool(value) and isinstance(value[0], Resumable | list | deque | np.random.Generator)
-        return [_taken(each, item) for each in value] if fixed else growing(list(map(_taken, value)), item)
-    if isinstance(value, np.ndarray) and item is not None:
-        return growing(value)
+        return list(map(_taken, value))
     if isinstance(value, torch.nn.Module):
         return value.state_dict()
     if isinstance(value, torch.optim.Optimizer):

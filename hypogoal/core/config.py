@@ -18,6 +18,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
 from hypogoal.core.own_code import OF_FILE
@@ -154,8 +155,6 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
         if key in constant and value == constant[key]:
             continue
         if key not in fields:
-            from hypogoal.core.commands import advice  # loads more than this module may
-
             do = advice("All of them", "config", stage, *([] if domain == DOMAIN else ["--domain", domain]))
             raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}{do}")
         checked[key] = _checked(fields[key], kinds[key], value, stage)

@@ -136,31 +136,14 @@ def _settle(out: Path) -> None:
 
 
 def sweep_up(folder: Path) -> None:
-    """Remove what killed processes left in a folder: temporary files, and drafts without a checkpoint, whose old
-    outputs come back. Every writer calls this first.
+    """Remove the temporary files that killed processes left in a folder. Every writer calls this first.
 
     Files of living processes are locked and stay; on systems without locks all files stay.
     """
     with contextlib.suppress(OSError):  # missing or unreadable
-        for name in filter(lambda name: name.startswith("."), os.listdir(folder)):
+        for name in filter(FRESH.fullmatch, os.listdir(folder)):
             with contextlib.suppress(OSError):  # another process removes it, or only another user may
-                if FRESH.fullmatch(name):
-                    remove_left_over(folder / name)
-                elif name.endswith(PARTIAL) and not (out := folder / name[1 : -len(PARTIAL)]).is_symlink():
-                    _sweep_draft(folder / name, out)
-
-
-def _sweep_draft(folder: Path, out: Path) -> None:
-    expected = {FILES, FOLDER, BEGUN, LOCK}
-    lock = folder / LOCK
-    if any(path.is_symlink() for path in (folder, lock)) or not lock.is_file():
-        return
-    if not all(name in expected or FRESH.fullmatch(name) for name in os.listdir(folder)):
-        return  # not a draft
-    with lock.open("r+b") as file:
-        if try_lock(file) and is_there(file, lock) and not unfinished(out):
-            _settle(out)
-            _clear(folder)
+                remove_left_over(folder / name)
 
 
 def _clear(folder: Path) -> None:
@@ -224,24 +207,23 @@ def _that_matters(identity: dict[str, Any]) -> dict[str, Any]:
 def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
     """What to raise if ``--resume`` finds ``out`` complete; a ``UserError`` if its identity is another.
 
-    ``before`` and ``now`` have ``config``, ``versions`` and the rest of an identity. Settings that only one of them has
-    are from another version of hypogoal and are ignored. Other versions are only mentioned, since nothing is resumed.
+    ``before`` and ``now`` have ``config`` and the rest of an identity. Settings that only one of them has are from
+    another version of hypogoal and are ignored, as are other package versions, since nothing is resumed.
     """
     now = json.loads(json.dumps(now))
-    keys = [key for key in now if key not in ("config", "versions")]
     settings = sorted(before["config"].keys() & now["config"].keys())
     old, new = (
-        {"config": {key: identity["config"][key] for key in settings}, **{key: identity[key] for key in keys}}
+        {
+            **{key: identity[key] for key in now if key != "versions"},
+            "config": {key: identity["config"][key] for key in settings},
+        }
         for identity in (before, now)
     )
     do = "Give --force and no --resume, or write elsewhere."
     check_same(old, new, out, "the complete output was made", do)
     if now["config"] and not settings:
         raise UserError("the complete output was made with other settings", out, do)
-    versions = before.get("versions")
-    recorded = versions.items() if isinstance(versions, dict) else ()
-    others = [f"{name} {version}" for name, version in recorded if now["versions"].get(name) != version]
-    return Complete(out, f"made with {', '.join(others)}" if others else "")
+    return Complete(out)
 
 
 def _short(value: Any) -> str:

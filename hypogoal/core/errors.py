@@ -30,12 +30,12 @@ class Killed(UserError):
 class Complete(UserError):
     """The output to resume is complete and as requested: the command line says so and exits with code 0.
 
-    ``path`` is the output, ``note`` a remark on it.
+    ``path`` is the output.
     """
 
-    def __init__(self, path: object, note: str = ""):
-        super().__init__(f"{path} is complete already" + (f" ({note})" if note else ""))
-        self.path, self.note = path, note
+    def __init__(self, path: object):
+        super().__init__(f"{path} is complete already")
+        self.path = path
 
 
 class NumericalError(Exception):

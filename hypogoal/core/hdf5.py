@@ -26,16 +26,12 @@ MAX_CHUNKS = 100_000  # per dataset: each takes about 4 kB of memory, stored or 
 MAX_ENTRIES = 100_000  # per group
 
 
-class Busy(UserError):
-    """A file that may be whole but cannot be read now."""
-
-
 @contextlib.contextmanager
 def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
     """An HDF5 file opened for reading, locked if the file system can.
 
-    A file that is missing, truncated, not HDF5, or in which something is ``Foreign`` is a ``UserError``; one that is
-    open for writing elsewhere or may not be read is ``Busy``.
+    A file that is missing, truncated, not HDF5, open for writing elsewhere, or in which something is ``Foreign`` is a
+    ``UserError``.
     """
     import h5py
 
@@ -44,9 +40,9 @@ def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
         opened = h5py.File(path, "r", locking="best-effort")
     except (OSError, ValueError, RuntimeError, KeyError) as error:
         if "unable to lock" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
-            raise Busy(f"{what} is open in another program", path, "Close it there first.") from None
+            raise UserError(f"{what} is open in another program", path, "Close it there first.") from None
         if isinstance(error, PermissionError):
-            raise Busy(f"{what} may not be read (permission denied)", path, "Ask for permission.") from None
+            raise UserError(f"{what} may not be read (permission denied)", path, "Ask for permission.") from None
         raise UserError(f"{what} is truncated or not HDF5", path, do) from None
     with opened as file:
         try:
@@ -75,6 +71,15 @@ class Foreign(Exception):
     """Refused contents of an HDF5 file; the caller adds where and what to do."""
 
 
+@contextlib.contextmanager
+def _readable(what: str) -> Iterator[None]:
+    """Whatever the HDF5 library raises in the block, if ``what`` is damaged, is ``Foreign``."""
+    try:
+        yield
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, MemoryError):
+        raise Foreign(f"{what} is not readable") from None
+
+
 def fixed(text: str) -> NDArray[np.bytes_]:
     """A text as a fixed-length UTF-8 string, stored in place; variable-length ones lie in HDF5's global heap."""
     import h5py
@@ -94,7 +99,7 @@ def attribute(file: Any, name: str) -> Any:
 
     Anything else is ``Foreign``; reading a variable-length text from a damaged heap may never end (HDF5 2.0).
     """
-    try:
+    with _readable(f"the attribute {name!r}"):
         if name not in file.attrs:
             return None
         stored = file.attrs.get_id(name)
@@ -102,11 +107,8 @@ def attribute(file: Any, name: str) -> Any:
             raise Foreign(f"the attribute {name!r} is neither a text of fixed length nor a number")
         if stored.get_storage_size() > MAX_ATTRIBUTE_BYTES:
             raise Foreign(f"the attribute {name!r} is too large")
-        value = file.attrs[name]
-        value = value.item() if isinstance(value, (np.generic, np.ndarray)) else value
+        value = np.asarray(file.attrs[name]).item()
         return value.decode() if isinstance(value, bytes) else value
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError):  # UnicodeDecodeError is a ValueError
-        raise Foreign(f"the attribute {name!r} is not readable") from None
 
 
 def members(group: Any) -> list[str]:
@@ -115,11 +117,9 @@ def members(group: Any) -> list[str]:
 
     if not isinstance(group, h5py.Group):  # iterating over a dataset would yield its values, perhaps 2^62
         raise Foreign("a dataset is where a group should be")
-    try:
+    with _readable("a group"):
         count = len(group)
         names = sorted(group) if count <= MAX_ENTRIES else []
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError):
-        raise Foreign("a group is not readable") from None
     if count > MAX_ENTRIES or not all(map(path_part, names)):
         raise Foreign("a group has names that cannot be right")
     return names
@@ -131,72 +131,61 @@ def find(file: Any, name: str) -> Any:
 
     place = file
     for part in name.split("/"):
-        try:
+        with _readable(repr(name)):
             # Not `part in place` and not `place.get`: these follow links, into other files too.
             if not isinstance(place, h5py.Group) or not place.id.links.exists(part.encode()):
                 return None
             if place.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
                 raise Foreign(f"{name!r} is a link, which may lead anywhere")
             place = place[part]
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError):
-            raise Foreign(f"{name!r} is not readable") from None
     return place
 
 
-def check_dataset(dataset: Any, kinds: str) -> int:
-    """The size in bytes of a dataset's values, checked against what the file can hold.
+def checked(file: Any, name: str, kinds: str) -> Any:
+    """The dataset called ``name``, unread; the size that it declares is one that the file can hold.
 
-    ``kinds`` are letters of NumPy's ``dtype.kind``; ``S`` for fixed-length texts. Other types (such as references and
-    variable-length texts), data outside the file, plugin filters, and more declared bytes than the stored ones can
-    stand for are ``Foreign``.
+    ``kinds`` are letters of NumPy's ``dtype.kind``; ``S`` for fixed-length texts. A missing one, other types (such as
+    references and variable-length texts), data outside the file, plugin filters, and more declared bytes than the
+    stored ones can stand for are ``Foreign``.
     """
     import h5py
 
+    dataset = find(file, name)
     if not isinstance(dataset, h5py.Dataset):
-        raise Foreign("a dataset is missing")
-    try:
-        dtype, shape, name = dataset.dtype, dataset.shape, dataset.name
-        settings = dataset.id.get_create_plist()
+        raise Foreign(f"no readable {name!r}")
+    with _readable(repr(name)):
+        dtype, shape, settings = dataset.dtype, dataset.shape, dataset.id.get_create_plist()
         if dtype.kind not in kinds or shape is None:
             raise Foreign(f"{name!r} has values of an unexpected type ({dtype}, shape {shape})")
         if dataset.is_virtual or settings.get_external_count():
             raise Foreign(f"the data of {name!r} lie in another file")
-        for index in range(settings.get_nfilters()):
-            if settings.get_filter(index)[0] not in FILTERS:
-                raise Foreign(f"{name!r} needs a filter that is not one of {', '.join(FILTERS.values())}")
-        size, stored = prod(map(int, shape)) * dtype.itemsize, int(dataset.id.get_storage_size())
+        filters = [settings.get_filter(index)[0] for index in range(settings.get_nfilters())]
+        if not FILTERS.keys() >= {*filters}:
+            raise Foreign(f"{name!r} needs a filter that is not one of {', '.join(FILTERS.values())}")
+        stored, whole = int(dataset.id.get_storage_size()), int(file.id.get_filesize())
         sides = dataset.chunks or shape
         chunk = prod(map(int, sides)) * dtype.itemsize if dataset.chunks else 0
         chunks = prod(-(-side // width) for side, width in zip(shape, sides, strict=True) if width)
-        whole = int(dataset.file.id.get_filesize())
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
-        raise Foreign("a dataset is not readable") from None
-    ratio = MOST_RATIO if settings.get_nfilters() else 1
-    if stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES:
+    size = size_of(dataset)
+    if stored > whole or size > (MOST_RATIO if filters else 1) * stored or chunk > MAX_CHUNK_BYTES:
         raise Foreign(f"{name!r} declares {human(size)} but stores {human(stored)} in a file of {human(whole)}")
     if chunks > min(MAX_CHUNKS, max(stored, 1)):  # ``stored`` may be a lie
         raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks but stores {human(stored)}")
-    return size
+    return dataset
 
 
-def size_of(file: Any, name: str, kinds: str) -> int:
-    """The size of the dataset called ``name``, see :func:`check_dataset`; ``Foreign`` if there is none."""
-    dataset = find(file, name)
-    if dataset is None:
-        raise Foreign(f"no readable {name!r}")
-    return check_dataset(dataset, kinds)
+def size_of(dataset: Any) -> int:
+    """The bytes of a dataset's values; its own ``nbytes`` may overflow."""
+    return prod(map(int, dataset.shape)) * int(dataset.dtype.itemsize)
 
 
 def read_array(file: Any, name: str, kinds: str, rows: slice | None = None) -> NDArray[Any]:
     """A dataset's values, or ``rows`` of them; ``Foreign`` if damaged, or read whole and larger than free memory."""
-    size = size_of(file, name, kinds)
-    free = free_memory()
-    if rows is None and free is not None and size > free:
-        raise Foreign(f"{name!r} needs {human(size)} of memory, {human(free)} are free")
-    try:
-        return np.asarray(file[name][() if rows is None else rows])
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError):
-        raise Foreign(f"{name!r} is damaged") from None
+    dataset, free = checked(file, name, kinds), free_memory()
+    if rows is None and free is not None and size_of(dataset) > free:
+        raise Foreign(f"{name!r} needs {human(size_of(dataset))} of memory, {human(free)} are free")
+    with _readable(repr(name)):
+        return np.asarray(dataset[() if rows is None else rows])
 
 
 def walk(group: Any, prefix: str = "", depth: int = 8, seen: set[int] | None = None) -> Iterator[str]:

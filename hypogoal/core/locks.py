@@ -13,7 +13,6 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-LOCKED_BYTE = 1 << 30
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that cannot lock
 
 
@@ -23,7 +22,7 @@ def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
     Returns whether it was free; None if the system cannot lock, so that nobody is kept out.
     """
     if fcntl is None:
-        return None if shared else _try_lock_byte(file)
+        return None
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -32,20 +31,6 @@ def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
         if error.errno not in NO_LOCKS:
             raise
         return None
-    return True
-
-
-def _try_lock_byte(file: IO[Any]) -> bool | None:
-    """On Windows: lock a byte far behind the text, so that others can read who has the lock."""
-    try:
-        import msvcrt
-    except ImportError:
-        return None
-    os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
-    try:
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-    except OSError:
-        return False
     return True
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from hypogoal.core.files import MOST_INTEGER
 
 LARGEST = 1e18  # of bytes or seconds: a million terabytes, the age of the universe; sums of them stay finite
-MOST_TEXT, MOST_WORD = 1 << 12, 1 << 16  # characters
+MOST_TEXT = 1 << 16  # characters; settings in commands may be long lists
 Test = Callable[[Any], bool]
 Schema = Mapping[str, Test]
 
@@ -22,13 +22,8 @@ def misfit(value: Any, needed: Schema, optional: Schema | None = None) -> str | 
 
 
 def is_text(value: Any) -> bool:
-    """Whether a value is a text that can be a path."""
+    """Whether a value is a text that can be a path or a word of a command."""
     return isinstance(value, str) and "\0" not in value and len(value) < MOST_TEXT
-
-
-def is_word(value: Any) -> bool:
-    """Whether a value is a text that can be a word of a command; settings may be long lists."""
-    return isinstance(value, str) and "\0" not in value and len(value) < MOST_WORD
 
 
 def is_count(value: Any) -> bool:

@@ -8,7 +8,6 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
@@ -19,20 +18,15 @@ Context = Callable[[ModuleType], contextlib.AbstractContextManager[object]]
 class Around:
     """A finder for ``sys.meta_path``: a module is loaded within a context, whoever imports it first."""
 
-    asking = False  # whether the other finders are being asked
-
     def __init__(self, name: str, context: Context):
         self.name, self.context = name, context
 
-    def find_spec(self, name: str, *_: object) -> Any:
+    def find_spec(self, name: str, *place: Any) -> Any:
         """The module's spec; None for any other module."""
-        if name != self.name or self.asking:
+        if name != self.name:
             return None
-        self.asking = True
-        try:
-            spec: Any = find_spec(name)
-        finally:
-            self.asking = False
+        specs = (finder.find_spec(name, *place) for finder in sys.meta_path if finder is not self)
+        spec: Any = next(filter(None, specs), None)
         if loader := getattr(spec, "loader", None):
             load = loader.exec_module
 
@@ -49,7 +43,8 @@ def shield() -> None:
 
     Not for hypogoal as a library: there matplotlib is also the user's, with the user's settings.
     """
-    _drop_current_folder()
+    # An empty part means the current folder; OpenCV would add the variable, or an empty part in its place, to its own.
+    os.environ[LIBRARIES] = ":".join(filter(None, os.environ.get(LIBRARIES, "").split(":"))) or os.devnull
     if not any(isinstance(finder, Around) and finder.name == "matplotlib" for finder in sys.meta_path):
         sys.meta_path.insert(0, Around("matplotlib", _plain_matplotlib))
 
@@ -74,16 +69,3 @@ def _plain_matplotlib(module: ModuleType) -> Iterator[None]:
     with contextlib.chdir(folder), environment(MATPLOTLIBRC=os.devnull, MPLBACKEND="agg"):
         yield
     module.get_configdir = lambda: folder  # type: ignore[attr-defined]
-
-
-@contextlib.contextmanager
-def plain_opencv(_module: ModuleType) -> Iterator[None]:
-    """Undo the empty part that OpenCV adds to the path of libraries."""
-    yield
-    _drop_current_folder()
-
-
-def _drop_current_folder() -> None:
-    """Remove empty parts of the path of libraries: they mean the current folder."""
-    if parts := [part for part in os.environ.pop(LIBRARIES, "").split(":") if part]:
-        os.environ[LIBRARIES] = ":".join(parts)

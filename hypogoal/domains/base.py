@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core import own_code
-from hypogoal.core.checkpoints import ANEW, Resumable, Unknown, Unlike
+from hypogoal.core.checkpoints import ANEW, Resumable
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
@@ -77,9 +77,6 @@ class Layouts(Resumable):
         self.seeds, self.rng, self.many = tuple(seeds), rng, len(seeds) > 1
         self.now: list[int] = []
 
-    def items(self) -> dict[str, Any]:
-        return {"now": 0}
-
     def begin(self, number: int) -> int:
         """The layout seed of a new episode in environment ``number``."""
         place = number if self.rng is None else int(self.rng.integers(len(self.seeds)))
@@ -107,7 +104,6 @@ class Engine(ABC):
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
         restarts: whether it has :meth:`restart`; resumes: whether it has :meth:`snapshot` and :meth:`restore`.
-        alike: whether all its snapshots have the same structure, except for the parts marked as ``growing``.
     """
 
     n_actions: int
@@ -123,7 +119,7 @@ class Engine(ABC):
     action_sets: Mapping[str, tuple[int, ...]] = MappingProxyType({})
     position_names: tuple[str, ...] = ()
     layouts: Layouts | None = None
-    restarts = resumes = alike = False
+    restarts = resumes = False
 
     @property
     @abstractmethod
@@ -172,10 +168,6 @@ class Engine(ABC):
         layouts = {"layouts": self.layouts.snapshot()} if self.layouts and self.layouts.many else {}
         return {"ids": self.ids.copy(), "elapsed": self.elapsed.copy(), **layouts}
 
-    def kept(self) -> dict[str, Any]:
-        """Its snapshot for a checkpoint; on loading, ``alike`` ones are compared with a fresh snapshot."""
-        return self.snapshot() if self.alike else Unknown(self.snapshot())
-
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an engine made with the same arguments, to be extended; needs ``resumes``."""
         if not self.resumes:
@@ -183,12 +175,6 @@ class Engine(ABC):
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
         if self.layouts and self.layouts.many:
             self.layouts.restore(snapshot["layouts"])
-
-    def take_back(self, kept: Mapping[str, Any]) -> None:
-        """Continue from what :meth:`kept` returned; ``Unlike`` if an environment is in an unknown state."""
-        self.restore(kept)
-        if self.ids.shape != (self.count,) or not ((self.ids >= 0) & (self.ids < self.n_states)).all():
-            raise Unlike("at the engine's ids")
 
     @property
     def oldest(self) -> int:

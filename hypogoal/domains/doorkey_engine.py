@@ -19,7 +19,6 @@ from minigrid.core.grid import Grid
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import growing
 from hypogoal.domains.base import Engine, Layouts, Plan, Step
 from hypogoal.domains.doorkey_env import (
     DOOR_COLOUR,
@@ -292,9 +291,9 @@ class DoorKeyEngine(Engine):
         """All that a resumed run needs: each environment's state, and the ids assigned so far."""
         return {
             **super().snapshot(),
-            "configurations": growing(self._places[: len(self._rows)].copy()),
-            "sites": growing(self._site[: self.n_states].copy()),
-            **({"seeds": growing(np.array(self._seeds))} if self.layouts.many else {}),
+            "configurations": self._places[: len(self._rows)].copy(),
+            "sites": self._site[: self.n_states].copy(),
+            **({"seeds": np.array(self._seeds)} if self.layouts.many else {}),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:

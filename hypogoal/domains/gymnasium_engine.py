@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import ANEW, Unlike, growing
+from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
@@ -344,9 +344,9 @@ class GymnasiumEngine(TurnEngine):
         """All that a resumed run needs: the states, and the actions played since each episode began."""
         return {
             **super().snapshot(),
-            "images": growing(np.stack(self._ring)),
-            "labels": growing(np.frombuffer(self._labels, np.uint8).copy()),
-            "played": [growing(actions, 0) for actions in self._played],
+            "images": np.stack(self._ring),
+            "labels": np.frombuffer(self._labels, np.uint8).copy(),
+            "played": [list(actions) for actions in self._played],
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -359,7 +359,7 @@ class GymnasiumEngine(TurnEngine):
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
         if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, self.room):
-            raise Unlike("at /loop/engine: its pictures and labels differ in number")
+            raise ValueError("its pictures and labels differ in number")
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]

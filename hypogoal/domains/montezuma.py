@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Checkpoints, require_alike
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
@@ -107,18 +107,8 @@ class _Task(NamedTuple):
     def load(self) -> RoomStates | None:
         """The states gathered before, if any."""
         saved = self.kept.load()
-        if saved is None:
-            return None
         with self.kept.restoring():
-            require_alike(
-                saved,
-                {
-                    "observations": np.empty((self.wanted, *OBSERVATION_SHAPE), np.uint8),
-                    "ram": np.empty((self.wanted, 128), np.uint8),
-                    "actions": np.empty((self.wanted, 2), np.int64),
-                },
-            )
-        return RoomStates(**saved)
+            return RoomStates(**saved) if saved else None
 
 
 def labelled_rooms(groups: int) -> tuple[int, ...]:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Unlike, growing
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
@@ -116,12 +115,12 @@ class MontezumaEngine(TurnEngine):
         row = {address: number for number, address in enumerate(frames)}
         return {
             **super().snapshot(),
-            "rng": growing(np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8)),
-            "positions": growing(np.frombuffer(self._positions, np.uint8).copy()),
-            "alive": growing(np.frombuffer(self._alive, np.uint8).copy()),
-            "frames": growing(np.stack(list(frames.values()))),
-            "stacks": growing(np.array([[row[id(frame)] for frame in seen] for seen in stacks], np.int32)),
-            "states": growing(np.concatenate(states)),
+            "rng": np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8),
+            "positions": np.frombuffer(self._positions, np.uint8).copy(),
+            "alive": np.frombuffer(self._alive, np.uint8).copy(),
+            "frames": np.stack(list(frames.values())),
+            "stacks": np.array([[row[id(frame)] for frame in seen] for seen in stacks], np.int32),
+            "states": np.concatenate(states),
             "state_sizes": np.array([len(state) for state in states]),
             "screens": np.stack([each.screen for each in saved]),
         }
@@ -139,7 +138,7 @@ class MontezumaEngine(TurnEngine):
             len(self._positions) != 3 * len(self._alive)
             or len(snapshot["stacks"]) != min(played, self.memory) + self.count
         ):
-            raise Unlike("at /loop/engine: its states, positions and stacks differ in number")
+            raise ValueError("its states, positions and stacks differ in number")
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
         stacks = [tuple(frames[row] for row in rows) for rows in snapshot["stacks"].tolist()]
         self._ring = stacks[: -self.count]

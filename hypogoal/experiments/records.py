@@ -19,7 +19,7 @@ from hypogoal.core.drafts import PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
 from hypogoal.core.locks import try_lock
-from hypogoal.core.schemas import LARGEST, Schema, is_amount, is_count, is_list, is_table, is_text, is_word, misfit
+from hypogoal.core.schemas import LARGEST, Schema, is_amount, is_count, is_list, is_table, is_text, misfit
 from hypogoal.experiments.cells import DERIVED, RESERVED, Cell, Cost, Plan, closing_cells, moved
 from hypogoal.settings import STAGES
 
@@ -180,7 +180,7 @@ RECORD: Schema = {
 }
 CELL: Schema = {
     "name": path_part,
-    "arguments": is_list(is_word),
+    "arguments": is_list(is_text),
     "out": _is_place,
     "needs": is_list(_is_place),
     "axes": is_table(lambda value: is_text(value) or isinstance(value, int | float)),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.checkpoints import Checkpoints, Resumable, State, Unknown, Unlike, require_alike
+from hypogoal.core.checkpoints import Checkpoints, Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.dataset import Observations
@@ -109,9 +109,8 @@ def fit(
 
     if saved is not None:
         with checkpoints.restoring():
-            require_alike(saved, {**state(0, None), "part": Unknown()})
             if not 0 <= saved["round"] <= len(rounds) or (saved["round"] == len(rounds) and saved["part"]):
-                raise Unlike("at /round")
+                raise ValueError("no such round")
             ensemble.load_state_dict(saved["ensemble"])
             watcher.restore(saved["watcher"])
     trunk, networks = ensemble.parts
@@ -137,7 +136,6 @@ def fit(
             part = Round(networks, members, states, config, seed_for(seed, "batches", number), number * config.steps)
             if saved and number == first:
                 with checkpoints.restoring():
-                    require_alike(saved["part"], part.snapshot(), "/part")
                     part.restore(saved["part"])
             for step in part.steps(watcher.report):
                 watcher.look(step, ensemble)
@@ -190,10 +188,6 @@ class Round(Resumable):
         torch.manual_seed(seed_for(seed, "layers"))
         self.done = 0
         self.losses: list[Tensor] = []  # of the steps since the last check: each member's, then those of diversity
-
-    def items(self) -> dict[str, Any]:
-        terms = self.objective.terms(self.members, self.members[0]) if self.objective else []
-        return {"losses": torch.zeros(len(self.members) + len(terms))}
 
     def snapshot(self) -> State:
         """All that the next steps depend on."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hypogoal.core.checkpoints import Resumable, State, growing
+from hypogoal.core.checkpoints import Resumable, State
 
 if TYPE_CHECKING:
     from hypogoal.domains.base import Step
@@ -57,7 +57,7 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
         return sum(row[1] for row in last) / len(last) if last else float("nan")
 
     def snapshot(self) -> State:
-        return {**super().snapshot(), "rows": growing(np.array(self, np.float64).reshape(-1, 5))}
+        return {**super().snapshot(), "rows": np.array(self, np.float64).reshape(-1, 5)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable, growing
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.columns import Columns
 
 FAN = 64  # children of a node: 1e5 leaves are three levels, and NumPy's cost is by the call
@@ -116,8 +116,8 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
 
     def snapshot(self) -> dict[str, Any]:
         return {
-            "data": {name: growing(values[: self.size].copy()) for name, values in vars(self.data).items()},
-            "priorities": growing(self.tree.get(np.arange(self.size))),
+            "data": {name: values[: self.size].copy() for name, values in vars(self.data).items()},
+            "priorities": self.tree.get(np.arange(self.size)),
             "largest": self._largest,
             "next": self._next,
         }
@@ -143,9 +143,6 @@ class StepsAhead(Resumable):
     def __init__(self, sequences: int, n: int):
         self.n = n
         self._open: list[list[tuple[int, int]]] = [[] for _ in range(sequences)]
-
-    def items(self) -> dict[str, Any]:
-        return {"_open": (0, 0)}
 
     def add(self, rows: Joined, ended: NDArray[np.bool_]) -> Joined:
         """One step of every sequence, and which sequences end with it, bool (E,); returns the transitions now complete.

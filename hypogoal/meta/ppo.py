@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.checkpoints import State, growing
+from hypogoal.core.checkpoints import State
 from hypogoal.core.columns import Columns
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
@@ -190,8 +190,7 @@ class MetaPolicy(Chooser):
         draws = vars(self._open.at(slice(0)))
         outcomes = {name: np.zeros(0, kind) for name, kind in Decisions.types().items() if name not in draws}
         self._finished = [Decisions.joined([Decisions(**draws, **outcomes), *self._finished])]
-        finished = {name: growing(values) for name, values in vars(self._finished[0]).items()}
-        return {**super().snapshot(), "finished": finished}
+        return {**super().snapshot(), "finished": dict(vars(self._finished[0]))}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, sha256_of
-from hypogoal.core.checkpoints import Checkpoints, growing, require_alike
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
@@ -209,12 +209,10 @@ def train(
         checkpoints = Checkpoints(None)
 
     def state() -> dict[str, Any]:
-        return {"loop": loop.snapshot(), "log": log.snapshot(), "logged": logged, "numbers": growing(numbers, 0.0)}
+        return {"loop": loop.snapshot(), "log": log.snapshot(), "logged": logged, "numbers": numbers}
 
     saved = checkpoints.load()
     with checkpoints.restoring():
-        if saved is not None:
-            require_alike(saved, state())
         log.restore(saved["log"] if saved else 0)
         if saved:
             loop.restore(saved["loop"])

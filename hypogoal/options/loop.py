@@ -160,8 +160,8 @@ class OptionLoop(Resumable):
         self.option[done] = NONE
 
     def snapshot(self) -> State:
-        return {"engine": self.engine.kept(), **super().snapshot()}
+        return {"engine": self.engine.snapshot(), **super().snapshot()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        self.engine.take_back(snapshot["engine"])
+        self.engine.restore(snapshot["engine"])
         super().restore(snapshot)

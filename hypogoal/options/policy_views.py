@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +66,6 @@ class AgentCrop(PolicyView):
                 what, "policy_view=agent-crop", "Train the ensemble with view=agent-crop, localiser=learned."
             )
         return cls(shape, source.view.localiser)
-
-    def items(self) -> dict[str, Any]:
-        return {"_centres": self._centres[:1]}
 
     def see(self, pictures: Pictures, ids: NDArray[np.int64] | None = None) -> Pictures:
         centres = self.localiser.locate(pictures) if ids is None else self._centres_of(pictures, ids)

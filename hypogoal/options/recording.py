@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable, growing
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine, Step
@@ -51,12 +51,6 @@ class Recorder(Resumable):
         self._states: list[list[int]] = [[] for _ in range(engine.count)]  # that running executions came to
         self._window_start = 0
         self._window = np.zeros((options, 5))  # offered, chosen, expected, reached, duration
-
-    def items(self) -> dict[str, Any]:
-        execution = Execution(0, 0, 0, False, False, False, growing([], 0), 0)
-        pictures = np.zeros(self.engine.observation_shape, self.engine.observation_dtype)
-        choice = (0, 0, 0, 0, 0.0, 0, 0)
-        return {"choices": choice, "stops": 0, "executions": execution, "_pictures": pictures, "_states": 0}
 
     @property
     def steps(self) -> int:

@@ -85,9 +85,6 @@ class RecurrentLearner(Learner):
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
         self.running: list[list[tuple[int, int, int, bool, bool, bool]]] = [[] for _ in range(self.engine.count)]
 
-    def items(self) -> dict[str, Any]:
-        return {"running": (0, 0, 0, False, False, False)}
-
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
         """How many states back the replays hold when each has had as many steps as another.

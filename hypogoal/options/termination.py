@@ -84,9 +84,6 @@ class Terminations(Part):
         self.environments, self.length = environments, length
         self._log_odds = np.full((1024, options), np.nan, dtype=np.float32)  # NaN: not classified yet
 
-    def items(self) -> dict[str, Any]:
-        return {"_log_odds": self._log_odds[:1]}
-
     def of(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether each option's sub-goal holds: bool (n, O) for states (n,)."""
         self._grow(ids)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable, growing
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected, Observations, States, write_dataset
 from hypogoal.domains.base import Domain, Engine
@@ -94,13 +94,11 @@ class Visited(Resumable):
     def snapshot(self) -> dict[str, Any]:
         digests = sorted(self._kept)
         return {
-            "known": growing(self._known.copy()),
+            "known": self._known.copy(),
             "before": self._before.copy(),
-            "digests": growing(np.array(digests, np.int64)),
-            "pictures": growing(self.states().observations),
-            "origins": growing(
-                np.array([self._kept[digest][1] for digest in digests], np.int64).reshape(-1, len(self.origins))
-            ),
+            "digests": np.array(digests, np.int64),
+            "pictures": self.states().observations,
+            "origins": np.array([self._kept[digest][1] for digest in digests], np.int64).reshape(-1, len(self.origins)),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:

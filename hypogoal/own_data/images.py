@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import warnings
 from collections.abc import Sequence
@@ -25,7 +26,6 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP")  # whatever a file's name: for PostScript, PIL would run a program
 MOST_PIXELS = 4096 * 4096  # of a state; a kilobyte can declare a thousand times as many
 ARRAY = ".npy"  # a state that no image format holds, such as a stack of four frames
-ORIENTATION = 0x0112  # the tag in EXIF
 DO = "Remove it, or write it again."
 GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", "PA", "RGBA")  # 8 bits per channel
 
@@ -83,6 +83,7 @@ def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
     An image too large, of over 8 bits a channel, animated, partly transparent or unreadable is a ``UserError``.
     """
     import PIL.Image
+    import PIL.ImageOps
 
     require_file(file, "the image is", DO)
     try:
@@ -103,31 +104,13 @@ def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
             if getattr(image, "is_animated", False):
                 raise UserError("one file holds several pictures", file, "Write each as a file of its own.")
             image.load()  # in a PNG the orientation may follow the pixels
-            opaque = _opaque(image, file).convert("L" if image.mode in GREY else "RGB")
-            values = np.asarray(_upright(opaque, image), dtype=np.uint8)
+            upright: Image = image
+            with contextlib.suppress(*DAMAGED, LookupError, AttributeError, struct.error):  # viewers ignore bad EXIF
+                upright = PIL.ImageOps.exif_transpose(image)
+            values = np.asarray(_opaque(upright, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
     except (*DAMAGED, LookupError, struct.error, PIL.Image.DecompressionBombError):
         raise UserError("this is not an image, or it is damaged", file, DO) from None
     return values.reshape(*values.shape[:2], -1)
-
-
-def _upright(image: Image, source: Image) -> Image:
-    """The image as viewers show it, turned or mirrored by the EXIF orientation of its ``source``."""
-    from PIL.Image import Transpose
-
-    turns = {
-        2: Transpose.FLIP_LEFT_RIGHT,
-        3: Transpose.ROTATE_180,
-        4: Transpose.FLIP_TOP_BOTTOM,
-        5: Transpose.TRANSPOSE,
-        6: Transpose.ROTATE_270,
-        7: Transpose.TRANSVERSE,
-        8: Transpose.ROTATE_90,
-    }
-    try:
-        turn = turns.get(source.getexif().get(ORIENTATION, 1))
-    except (*DAMAGED, LookupError, AttributeError, struct.error):  # damaged metadata, which viewers ignore
-        turn = None
-    return image if turn is None else image.transpose(turn)
 
 
 def _opaque(image: Image, file: Path) -> Image:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import io
 import os
-import time
 from collections.abc import Callable, Sequence, Set
 from hashlib import blake2b
 from pathlib import Path
@@ -117,11 +116,10 @@ def _encoded(state: NDArray[np.uint8]) -> tuple[str, bytes]:
     return ".npy", file.getvalue()
 
 
-def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) -> None:
+def mark_states(source: Source, marks: Marks, sub_goal: str) -> None:
     """Show the states of ``source`` and mark them by keyboard until the window is closed.
 
-    ``fps``: steps per second, played whether or not a key is held; 0: one step for each key. A missing screen or pygame
-    is a ``UserError``.
+    A missing screen or pygame is a ``UserError``.
     """
     keys = {kind[0]: kind for kind in marks.kinds}  # p, n, u
     modes: list[str | None] = [None, *(kind for kind in ("negative", "unlabelled", "positive") if kind in marks.kinds)]
@@ -131,10 +129,9 @@ def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) ->
             current = marks.of(source.state)
             lines = _lines(source, marks, sub_goal, mode, keys, current)
             window.draw(as_rgb(source.state), lines)
-            key, held = window.next_key(fps)
+            key, held = window.next_key()
             if key == "escape":
                 return
-            moved = False
             if key in keys:
                 marks.mark(source.state, keys[key])
                 source.marked()
@@ -142,11 +139,7 @@ def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) ->
                 marks.undo()
             elif key == "m":
                 mode = modes[(modes.index(mode) + 1) % len(modes)]
-            elif key:
-                moved = source.press(key, held)
-            elif fps:
-                moved = source.idle()
-            if moved and mode is not None and marks.of(source.state) is None:
+            elif source.press(key, held) and mode is not None and marks.of(source.state) is None:
                 marks.mark(source.state, mode)
 
 
@@ -190,7 +183,6 @@ class _Window:
             raise UserError("the window needs pygame", None, "pip install pygame-ce") from None
         self._pygame, self._title = pygame, title
         self._surface: Any = None
-        self._tick = 0.0  # time of the last tick, in real time
 
     def __enter__(self) -> _Window:
         pygame = self._pygame
@@ -230,32 +222,17 @@ class _Window:
             self._surface.blit(drawn, (10, height * factor + LINE // 2 + number * LINE))
         pygame.display.flip()
 
-    def next_key(self, fps: int) -> tuple[str, frozenset[str]]:
-        """The next key pressed, and the keys held; closing the window is ``escape``.
-
-        In real time a key that plays counts once per tick, however long it is held; a tick without one is an empty key.
-        """
+    def next_key(self) -> tuple[str, frozenset[str]]:
+        """The next key pressed, and the keys held; closing the window is ``escape``."""
         pygame: Any = self._pygame
-        tapped: set[str] = set()
         while True:
-            left = max(0.0, self._tick + 1 / fps - time.monotonic()) if fps else WAIT_MS / 1000
-            event = pygame.event.wait(max(1, round(1000 * left)))
+            event = pygame.event.wait(WAIT_MS)
             if event.type == pygame.QUIT:
                 return "escape", frozenset()
             if event.type == pygame.KEYDOWN:
-                key = pygame.key.name(event.key)
-                if not fps or key not in HELD:
-                    return key, self._held()
-                tapped.add(key)
-            if fps and time.monotonic() >= self._tick + 1 / fps:
-                self._tick = time.monotonic()
-                held = self._held() | tapped
-                return next(iter(sorted(held)), ""), frozenset(held)
-
-    def _held(self) -> frozenset[str]:
-        pygame: Any = self._pygame
-        pressed = pygame.key.get_pressed()
-        return frozenset(name for name in HELD if pressed[pygame.key.key_code(name)])
+                pressed = pygame.key.get_pressed()
+                held = frozenset(name for name in HELD if pressed[pygame.key.key_code(name)])
+                return pygame.key.name(event.key), held
 
 
 GRID_KEYS = {
@@ -272,6 +249,7 @@ GRID_KEYS = {
 DIRECTIONS = {
     "UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s"), "FIRE": ("space",)
 }  # fmt: skip
+WAITS = "return"  # the key of NOOP
 FALLBACK = tuple("0123456789bcfghijkotvxyz")
 """Keys of other actions: their number, from 10 on a letter that is not used otherwise."""
 
@@ -286,10 +264,6 @@ class Source:
     def press(self, key: str, held: Set[str]) -> bool:
         """React to a key while others are ``held``; returns whether the state changed."""
         raise NotImplementedError
-
-    def idle(self) -> bool:
-        """React to a tick without a key, in real time; returns whether the state changed."""
-        return False
 
     def marked(self) -> None:
         """React to a mark; by default nothing happens."""
@@ -355,13 +329,8 @@ class Played(Source):
             self._begin()
             return True
         action = action_of(self._names, key, held)
-        return action is not None and self._play(action)
-
-    def idle(self) -> bool:
-        """Play NOOP, if there is one."""
-        return not self._over and "NOOP" in self._names and self._play(self._names.index("NOOP"))
-
-    def _play(self, action: int) -> bool:
+        if action is None:
+            return False
         if self._over:
             self._begin()
             return True
@@ -386,6 +355,8 @@ def action_names(env: gymnasium.Env) -> tuple[str, ...]:
 def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
     """The action of a key: by name for MiniGrid, by the keys held together for Atari, else by number."""
     if "NOOP" in names:
+        if key == WAITS:
+            return names.index("NOOP")
         down = {key, *held}
         axes = (("UP", "DOWN"), ("RIGHT", "LEFT"), ("FIRE",))  # the first one held of each
         name = "".join(next((part for part in axis if down & set(DIRECTIONS[part])), "") for axis in axes)
@@ -401,7 +372,7 @@ def keys_of(names: Sequence[str]) -> list[tuple[str, ...]]:
 def action_help(names: Sequence[str]) -> tuple[str, ...]:
     """Lines that list the keys of the actions."""
     if "NOOP" in names:
-        return ("arrows or w a s d, space: move, fire; together, too",)
+        return (f"arrows or w a s d, space: move, fire; together, too; {WAITS}: wait",)
     texts = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
     return tuple(", ".join(texts[first : first + 3]) for first in range(0, len(texts), 3))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array, size_of
+from hypogoal.core.hdf5 import checked, create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE, write_observations
@@ -71,7 +71,7 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list
             what = "its images are stored as JPEG, not as they were seen"
             raise UserError(what, path, "Make it with jpeg_encoding=False.")
         places = [f"{name}/{place}" for name in names]
-        require_memory(sum(size_of(file, name, "uif") for name in places), path)
+        require_memory(sum(size_of(checked(file, name, "uif")) for name in places), path)
         episodes = [read_array(file, name, "uif") for name in places]
     if len({episode.shape[1:] for episode in episodes}) > 1 or not all(episode.ndim for episode in episodes):
         raise UserError("its episodes have observations of different shapes", path, "Give those of one shape.")

@@ -26,7 +26,6 @@ def label(
     layout_seed: int = 0,
     arguments: Mapping[str, Any] | None = None,
     heldout: bool = False,
-    fps: int = 0,
     resume: bool = False,
     record: Path | None = None,
 ) -> dict[str, int]:
@@ -35,9 +34,8 @@ def label(
     ``source`` is a data file, a ``.npz`` file or a folder of images, whose states are shown in turn; or an environment
     to play: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
     environment from ``arguments``. ``out`` is the folder, named after the sub-goal; ``heldout``: the marks are for
-    evaluation, in ``out/heldout``. ``fps``: steps per second in real time; 0: a step for each key. ``record``: a file
-    for the episodes played, for ``collect --play``. A missing source, an existing ``out`` without ``resume``, an
-    existing ``record``, and a missing screen are a ``UserError``.
+    evaluation, in ``out/heldout``. ``record``: a file for the episodes played, for ``collect --play``. A missing
+    source, an existing ``out`` without ``resume``, an existing ``record``, and a missing screen are a ``UserError``.
     """
     require_names([out.resolve().name])
     if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
@@ -53,7 +51,7 @@ def label(
     with sole_writer(out):
         marks = Marks(out / HELD_OUT, KINDS[:2]) if heldout else Marks(out)
         try:
-            mark_states(states, marks, out.resolve().name, fps=fps)
+            mark_states(states, marks, out.resolve().name)
         finally:
             if record and isinstance(states, Played):
                 played = [{"layout_seed": seed, "actions": actions} for seed, actions in states.recorded if actions]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
-from hypogoal.core.checkpoints import FOLDER, checkpoints_of, growing
+from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
@@ -174,7 +174,7 @@ class _Report(Watcher):
         self.log.write(sub_goal=self.sub_goal, step=step, **losses)
 
     def snapshot(self) -> dict[str, Any]:
-        return {"log": self.log.snapshot(), "scores": self.scores.snapshot(), "numbers": growing(self.numbers, 0.0)}
+        return {"log": self.log.snapshot(), "scores": self.scores.snapshot(), "numbers": self.numbers}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         self.log.restore(snapshot["log"])

@@ -57,7 +57,7 @@ class RoomsEngine(Engine):
     one step, so it is never truncated.
     """
 
-    resumes = alike = True
+    resumes = True
     n_states = 0
 
     def __init__(self, layout_seed: int, count: int, max_steps: int, factors: tuple[str, ...], truth: str, rooms: int):

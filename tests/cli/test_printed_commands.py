@@ -135,17 +135,16 @@ def test_what_an_error_says_to_do(shell: Shell) -> None:
     """Each is typed as it stands, with code of one's own that this process was not told of."""
     shell("hypogoal collect tiny:DOMAIN --out 'a run/data.h5' -q")
     shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble 'a run/data.h5' --out 'a run/ensemble' -q")
-    lead = "First run, if you trust tiny:DOMAIN: "
-    shell(printed(shell("hypogoal report 'a run'", 2), lead))
+    trust = "HYPOGOAL_TRUST=tiny:DOMAIN "
+    shell(trust + printed(shell("hypogoal report 'a run'", 2), "First run: "))
     shell("hypogoal report 'a run'")
     shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-options 'a run/ensemble' --out 'a run/options' -q")
     since = read_evaluation(Path("a run")).metrics["missing"]
-    line = printed(since[-1], "options: made since this evaluation (evaluate it again, if you trust tiny:DOMAIN: ")
-    shell(line)
+    shell(trust + printed(since[-1], "options: made since this evaluation (evaluate it again: "))
     assert read_evaluation(Path("a run")).metrics["missing"] == []
     shell("hypogoal collect tiny:NUMBERS --out 'num  bers.h5' -q")
     text = shell("hypogoal show 'num  bers.h5' --pictures sheets", 2)
-    assert "num  bers.npz" in shell(printed(text, "Read them as arrays, if you trust tiny:NUMBERS: "))
+    assert "num  bers.npz" in shell(printed(text, "Read them as arrays: "))
     for given in ("collect tiny:DOMAIN", "collect doorkey", "collect montezuma", "train-baseline doorkey"):
         text = shell(f"hypogoal {given} --out x --set bogus=1", 2)
         assert " = " in shell(printed(text, "All of them: "))
@@ -169,15 +168,12 @@ def test_permissions_asked_for_add_up(shell: Shell) -> None:
 
 
 def test_a_strangers_code_is_never_allowed_in_passing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of what this process was not told to load a command says nothing, and advice asks."""
+    """A command allows only what this process was told to load."""
     shell("hypogoal collect tiny:DOMAIN --out theirs.h5 -q")
     monkeypatch.setattr(own_code, "_before", set())
     monkeypatch.delenv(TRUST, raising=False)
     assert command("train-ensemble", "theirs.h5") == "hypogoal train-ensemble theirs.h5"
-    asked = "Do, if you trust tiny:DOMAIN: HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble theirs.h5"
-    assert advice("Do", "train-ensemble", "theirs.h5") == asked
-    monkeypatch.setenv(TRUST, "others:DOMAIN")
-    assert advice("Do", "train-ensemble", "theirs.h5") == asked
+    assert advice("Do", "train-ensemble", "theirs.h5") == "Do: hypogoal train-ensemble theirs.h5"
     with own_code.given("tiny:DOMAIN"):
         assert command("show", "theirs.h5") == "HYPOGOAL_TRUST=tiny:DOMAIN hypogoal show theirs.h5"
 

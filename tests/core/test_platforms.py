@@ -8,12 +8,9 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from hypogoal.core import drafts, locks
-from hypogoal.core.errors import UserError
 from hypogoal.core.workers import in_processes
 
 ROOT = Path(__file__).parents[2]
@@ -103,24 +100,3 @@ def test_a_system_without_posix_modules_collects(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["data.h5"]
-
-
-def test_locks_without_flock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G1: where there is no flock a byte far behind the text is locked, and a second writer is refused."""
-    held: list[int] = []
-
-    def locking(descriptor: int, mode: int, count: int) -> None:
-        assert (os.lseek(descriptor, 0, os.SEEK_CUR), mode, count) == (locks.LOCKED_BYTE, 2, 1)
-        if held:
-            raise OSError(36, "Resource deadlock avoided")
-        held.append(descriptor)
-
-    monkeypatch.setattr(locks, "fcntl", None)
-    monkeypatch.setattr(drafts, "PATIENCE_SECONDS", 0.1)
-    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
-    with (
-        drafts.sole_writer(tmp_path / "run"),
-        pytest.raises(UserError, match=f"process {os.getpid()} on .* is writing this"),
-        drafts.sole_writer(tmp_path / "run"),
-    ):
-        pass

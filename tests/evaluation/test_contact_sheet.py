@@ -95,5 +95,5 @@ def test_what_has_no_sheets(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="contact sheets need a data file"):
         write_contact_sheets(tmp_path, tmp_path / "sheets")
     path = written(tmp_path / "data.h5", ("one",))
-    with pytest.raises(UserError, match="the picture cannot be written"):
+    with pytest.raises(UserError, match="a file is in the way"):
         write_contact_sheets(path, path)

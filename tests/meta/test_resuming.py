@@ -5,14 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from corridor import Corridor
 from loops import CASES, loop_of
-from misfits import misfits
 
-from hypogoal.core.checkpoints import Checkpoints, State, Unlike, require_alike
+from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.learners import episodes
@@ -78,22 +76,6 @@ def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.Mo
     fresh = loop_of(case).learner.state()  # type: ignore[attr-defined]
     assert any(not torch.equal(value, fresh[name]) for name, value in weights.items()), "nothing was learned"
 
-    saved, like = Checkpoints(path).load() or {}, loop_of(case).snapshot()
-    require_alike(saved, like)
-    if not loop.engine.alike:  # an own domain's, of which only it knows what belongs there
-        del saved["engine"], like["engine"]
-    accepted = [what for what in misfits(saved) if fits(saved, like)]
-    assert accepted == []
-
-
-def fits(saved: State, like: State) -> bool:
-    """Whether a state could be that of what is to go on."""
-    try:
-        require_alike(saved, like)
-    except Unlike:
-        return False
-    return True
-
 
 @pytest.mark.parametrize(("until", "reached"), [(0.9, True), (1.0, False)])
 def test_training_that_succeeds_ends_whatever_breaks_it(
@@ -153,11 +135,10 @@ def test_a_checkpoint_of_something_else_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(Broken):
         run(case, tmp_path, Breaking(path, 23))
     saved = Checkpoints(path).load() or {}
-    saved["loop"]["engine"]["sites"] = saved["loop"]["engine"]["sites"][:-1]
-    for name, fault in (("logged", "missing: /logged"), ("log", "missing: /log"), ("loop", "missing: /loop"), ("", "")):
+    for name in ("logged", "log", "loop"):
         odd = {key: value for key, value in saved.items() if key != name}
         Checkpoints(path).save(odd)
-        with pytest.raises(UserError, match=f"the checkpoint does not fit .*{fault}.*Give --force and no --resume"):
+        with pytest.raises(UserError, match=f"the checkpoint does not fit .*{name}.*Give --force and no --resume"):
             run(case, tmp_path, Checkpoints(path))
         assert path.exists()
 
@@ -177,13 +158,3 @@ def test_an_engine_without_snapshots_begins_anew(tmp_path: Path, monkeypatch: py
     checkpoints = Breaking(tmp_path / "checkpoint.safetensors", 1)
     assert run("plain", tmp_path, checkpoints).recorder.steps == STEPS
     assert not checkpoints.saved and checkpoints.steps == 0
-
-
-def test_counts_that_no_training_reaches_are_refused() -> None:
-    """Spec G2: 10 ** 30 updates that are due would never end; a generator's own state is as large and stays."""
-    generator = np.random.default_rng(0).bit_generator.state
-    fresh = {"due": 3, "rng": generator}
-    require_alike({"due": 2**53 - 1, "rng": np.random.default_rng(1).bit_generator.state}, fresh)
-    for count in (2**62, -(10**30)):
-        with pytest.raises(Unlike, match="no such count at /due"):
-            require_alike({"due": count, "rng": generator}, fresh)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shlex
 import struct
 import zlib
 from pathlib import Path
@@ -175,13 +174,12 @@ def test_large_pictures_are_proposed_to_be_made_smaller(
     [line] = [line for line in said.err.splitlines() if "--resize" in line]
     shape = (240, 240, 3) if kind == "minari" else (240, 192, 3)
     sizes = " x ".join(map(str, shape))
-    assert f"pictures of {sizes} need much memory and time; for smaller ones: hypogoal import " in line
+    assert f"pictures of {sizes} need much memory and time; add --resize 160 --force" in line
     assert said.out.startswith(f"taken for pictures, {sizes} uint8\n")
     before = open_dataset(out)
     labels = before.labelled(name).labels
     assert before.observation_shape == shape
-    words = shlex.split(line.partition("smaller ones: ")[2])
-    assert words[0] == "hypogoal" and main(words[1:]) == 0
+    assert main(["import", str(source), "--out", str(out), *given, *line.partition("add ")[2].split()]) == 0
     assert "--resize" not in capsys.readouterr().err
     after = open_dataset(out)
     assert after.observation_shape == (160, 160 if kind == "minari" else 128, 3)

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from hypogoal.core.checkpoints import Checkpoints, growing, optimiser_snapshot, require_alike, restore_optimiser
+from hypogoal.core.checkpoints import Checkpoints, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for
@@ -181,7 +181,6 @@ def train(
         saved = checkpoints.load()
         with checkpoints.restoring():
             if saved is not None:
-                require_alike(saved, watch.snapshot(agent))
                 watch.restore(agent, saved)
             if log:
                 log.restore(saved["log"] if saved else 0)
@@ -210,7 +209,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
         dqn = {
             "pos": buffer.pos,
             "full": buffer.full,
-            "columns": {name: growing(getattr(buffer, name)[:kept].copy()) for name in REPLAY_COLUMNS},
+            "columns": {name: getattr(buffer, name)[:kept].copy() for name in REPLAY_COLUMNS},
             "explore": agent.explore_rng.bit_generator.state,
             "counts": [agent._n_calls, agent.exploration_rate],
         }
@@ -220,7 +219,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
         "policy": agent.policy.state_dict(),
         "optimiser": optimiser_snapshot(agent.policy.optimizer),
         "counts": {name: getattr(agent, name) for name in COUNTS},
-        "logged": growing(_logged(agent, prefix="train/"), 0.0),
+        "logged": _logged(agent, prefix="train/"),
         "last_observations": fresh[0] if agent._last_obs is None else agent._last_obs,
         "last_starts": fresh[1] if agent._last_episode_starts is None else agent._last_episode_starts,
         "dqn": dqn,

@@ -105,12 +105,12 @@ class EngineEnv(VecEnv):
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
-        state = {"engine": self.engine.kept(), "episodes": self.episodes.snapshot()}
+        state = {"engine": self.engine.snapshot(), "episodes": self.episodes.snapshot()}
         return {**state, "bonus": self.bonus.snapshot()} if self.bonus else state
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of environments made with the same arguments."""
-        self.engine.take_back(snapshot["engine"])
+        self.engine.restore(snapshot["engine"])
         self.episodes.restore(snapshot["episodes"])
         if self.bonus:
             self.bonus.restore(snapshot["bonus"])
