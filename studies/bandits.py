@@ -59,8 +59,8 @@ def tables(path: Path) -> Iterator[str]:
                 if of:
                     shares = {end: np.array([float(r["success"]) for r in of if int(r["step"]) == end]) for end in ENDS}
                     good = f"{(shares[200] >= 0.9).sum()} of {len(shares[200])}"
-                    lines.append([truth, title, name, *(interval(values, 2) for values in shares.values()), good])
-    yield from table(["rewarded", "members", "chooser", *map(str, ENDS), "90 % at 200 on"], lines)
+                    lines.append([truth, title, name, *(interval(shares[end], 2) for end in ENDS[1:]), good])
+    yield from table(["rewarded", "members", "chooser", *map(str, ENDS[1:]), "90 % at 200 on"], lines)
 
 
 def main() -> None:

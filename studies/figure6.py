@@ -153,13 +153,12 @@ def tables(path: Path) -> Iterator[str]:
             f"{soon:,.0f}" if np.isfinite(soon) else "never",
             interval(known(of(method, "success")), 2),
             interval(known(of(method, "length_over_shortest")), 2),
-            interval(known(of(method, "near")), 2),
             f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
         ]
 
     yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts, Student's 95 % interval."
     yield ""
-    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest", "within 1.5 shortest paths"]
+    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest"]
     yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
     frozen = [method for method in methods if len(known(of(method, "success", "frozen")))]
     yield "Without further training: the agent / uniform-random choice among its own options."

@@ -1,7 +1,8 @@
 """Published tables are drawn from the committed cells (Spec F5)."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -46,16 +47,22 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_tables_are_those_of_the_cells(name: str) -> None:
-    """Every line of every table stands on the page, and the page has no other."""
-    cells = RESULTS / f"{name}.csv"
-    drawn = [line for line in PAGES[name](cells) if line.startswith("|")] if cells.exists() else []
-    page = (RESULTS / f"{name}.md").read_text(encoding="utf-8")
-    assert drawn == [line for line in page.splitlines() if line.startswith("|")]
+def test_the_table_of_a_page_is_drawn_from_its_cells(name: str) -> None:
+    """A page shows one whole table that its study prints (Figure 3 one for each N); the study's others may be absent."""
+    printed = tables_in(PAGES[name](RESULTS / f"{name}.csv"))
+    shown = tables_in((RESULTS / f"{name}.md").read_text(encoding="utf-8").splitlines())
+    assert len(shown) == 1 or name == "figure3-ladders"
+    assert all(table in printed for table in shown)
+
+
+def tables_in(lines: Iterable[str]) -> list[list[str]]:
+    """The tables among lines of Markdown, each as its lines."""
+    blocks = groupby(lines, key=lambda line: line.startswith("|"))
+    return [list(block) for is_table, block in blocks if is_table]
 
 
 def test_no_page_has_a_table_without_cells() -> None:
-    """What nothing redraws is told in sentences; the first page's tables are taken from the others."""
+    """Numbers that no study can redraw stand in sentences; the first page's tables are taken from the others."""
     with_tables = {page.stem for page in RESULTS.glob("*.md") if "\n|" in page.read_text(encoding="utf-8")}
     assert with_tables == {"index", *PAGES}
 
