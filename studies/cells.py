@@ -81,6 +81,7 @@ def interval(values: NDArray[np.float64], digits: int = 3) -> str:
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Lines of Markdown, and an empty one."""
-    for cells in (titles, ["---"] * len(titles), *rows):
-        yield f"| {' | '.join(cells)} |"
+    yield f"| {' | '.join(titles)} |"
+    yield f"|{'---|' * len(titles)}"
+    yield from (f"| {' | '.join(cells)} |" for cells in rows)
     yield ""
