@@ -73,14 +73,14 @@ WHERE = ("trained", "new")
 
 def new_layouts() -> list[int]:
     """The first seeds from ``FIRST`` on whose grids nothing was learned on, and which differ from each other."""
-    known = {layout_of(seed).grid for seed in (*LEARNT, *layout_seeds(TRAINED))}
-    found: list[int] = []
+    grids = {layout_of(seed).grid for seed in (*LEARNT, *layout_seeds(TRAINED))}
+    new: list[int] = []
     for seed in itertools.count(FIRST):
-        if (grid := layout_of(seed).grid) not in known:
-            known.add(grid)
-            found.append(seed)
-        if len(found) == TRIED:
-            return found
+        if (grid := layout_of(seed).grid) not in grids:
+            grids.add(grid)
+            new.append(seed)
+        if len(new) == TRIED:
+            return new
     raise AssertionError("there is always another seed")
 
 
@@ -100,8 +100,8 @@ def run_cell(work: Path, method: str, seed: int, looks: tuple[int, ...]) -> list
     source = open_artefact(ensemble_of(work, method, seed), "ensemble")
     config = TrainOptionsConfig(**{"layouts": TRAINED, **METHODS[method][2]})
     loop = assemble(DOMAIN, source.path, source.config, config, seed)
-    there = layout_seeds(config.layouts)
-    tried = {"trained": there[:: max(1, len(there) // TRIED)][:TRIED], "new": new_layouts()}
+    trained = layout_seeds(config.layouts)
+    tried = {"trained": trained[:: max(1, len(trained) // TRIED)][:TRIED], "new": new_layouts()}
     tests: dict[str, OptionLoop] = {}
     rows: list[Row] = []
     spent = 0.0
@@ -127,8 +127,10 @@ def tried_out(loop: OptionLoop, sub_goals: list[str]) -> Iterator[Row]:
     ways, members = shortest_ways(loop.engine), loop.terminations.options // len(sub_goals)
     for option in range(loop.terminations.options):
         sub_goal, goal = sub_goals[option // members], DOMAIN.sub_goals.index(sub_goals[option // members])
-        told = alone(loop, option, goal, ways[:, goal])
-        yield {"sub_goal": sub_goal, "member": option % members} | {name: float(told[name].mean()) for name in told}
+        numbers = alone(loop, option, goal, ways[:, goal])
+        yield {"sub_goal": sub_goal, "member": option % members} | {
+            name: float(numbers[name].mean()) for name in numbers
+        }
 
 
 # By method, step and layouts; then by seed and sub-goal: the members' numbers (K,).
@@ -137,23 +139,23 @@ Found = dict[tuple[str, int, str], dict[int, dict[str, NDArray[np.float64]]]]
 
 def read(path: Path, name: str) -> Found:
     """A number of all cells."""
-    found: Found = defaultdict(lambda: defaultdict(dict))
+    numbers: Found = defaultdict(lambda: defaultdict(dict))
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            of_seed = found[row["method"], int(row["step"]), row["layouts"]][int(row["seed"])]
+            of_seed = numbers[row["method"], int(row["step"]), row["layouts"]][int(row["seed"])]
             of_seed[row["sub_goal"]] = np.append(of_seed.get(row["sub_goal"], np.empty(0)), float(row[name]))
-    return found
+    return numbers
 
 
-def of_seeds(found: Found, key: tuple[str, int, str], sub_goal: str = "") -> NDArray[np.float64]:
+def of_seeds(numbers: Found, key: tuple[str, int, str], sub_goal: str = "") -> NDArray[np.float64]:
     """Each seed's mean over members, of one sub-goal or of all."""
     goals = [sub_goal] if sub_goal else DOMAIN.sub_goals
-    return np.array([np.mean([of[goal].mean() for goal in goals]) for of in found[key].values()])
+    return np.array([np.mean([members[goal].mean() for goal in goals]) for members in numbers[key].values()])
 
 
-def picked(found: Found, method: str, step: int) -> NDArray[np.float64]:
+def picked(numbers: Found, method: str, step: int) -> NDArray[np.float64]:
     """Each seed's mean over sub-goals on new layouts, of the member that is best on those trained on."""
-    trained, new = (found[method, step, where] for where in WHERE)
+    trained, new = (numbers[method, step, where] for where in WHERE)
     return np.array(
         [np.mean([new[seed][goal][int(np.argmax(trained[seed][goal]))] for goal in DOMAIN.sub_goals]) for seed in new]
     )
@@ -162,8 +164,8 @@ def picked(found: Found, method: str, step: int) -> NDArray[np.float64]:
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     within, wrong = read(path, "within_2"), read(path, "wrong_yes")
-    steps = {method: sorted({step for of, step, _ in within if of == method}) for method in METHODS}
-    there = [method for method in METHODS if steps[method]]
+    steps = {method: sorted({step for name, step, _ in within if name == method}) for method in METHODS}
+    methods = [method for method in METHODS if steps[method]]
     yield f"Zero-shot success within twice the shortest path (wanted: {GOAL}), mean member, mean over five sub-goals;"
     yield "Student's 95 % interval over seeds. Picked: the member that is best on layouts trained on."
     yield ""
@@ -178,19 +180,19 @@ def tables(path: Path) -> Iterator[str]:
                 interval(of_seeds(wrong, (method, step, "new")), 2),
                 str(len(within[method, step, "new"])),
             ]
-            for method in there
+            for method in methods
             for step in steps[method][-LOOKS_SHOWN:]
         ),
     )
     yield "By sub-goal, new layouts, the last look: within twice the shortest path / false positive, mean member."
     yield ""
-    last = [(method, steps[method][-1], "new") for method in there]
+    last = [(method, steps[method][-1], "new") for method in methods]
 
     def both(key: tuple[str, int, str], goal: str) -> str:
-        return " / ".join(f"{of_seeds(of, key, goal).mean():.2f}" for of in (within, wrong))
+        return " / ".join(f"{of_seeds(numbers, key, goal).mean():.2f}" for numbers in (within, wrong))
 
     yield from table(
-        ["sub-goal", *(METHODS[method][0] for method in there)],
+        ["sub-goal", *(METHODS[method][0] for method in methods)],
         ([goal, *(both(key, goal) for key in last)] for goal in DOMAIN.sub_goals),
     )
 

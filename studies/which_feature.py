@@ -58,10 +58,10 @@ def read(path: Path) -> list[Scored]:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     cells = []
-    for (entry, mix, seed), of in grouped(rows, lambda row: (row["entry"], row["mix"], row["seed"])).items():
-        shape = (-1, len({row["factor"] for row in of}))
-        ranked, at_half, at_best = (np.array([float(row[name]) for row in of]).reshape(shape) for name in SCORES)
-        labels = np.array([int(row["labels"]) for row in of[: shape[1]]])
+    for (entry, mix, seed), members in grouped(rows, lambda row: (row["entry"], row["mix"], row["seed"])).items():
+        shape = (-1, len({row["factor"] for row in members}))
+        ranked, at_half, at_best = (np.array([float(row[name]) for row in members]).reshape(shape) for name in SCORES)
+        labels = np.array([int(row["labels"]) for row in members[: shape[1]]])
         cells.append(Scored(entry, float(mix), int(seed), ranked, at_half, at_best, labels))
     return cells
 
@@ -72,13 +72,13 @@ def chosen(cells: Sequence[Scored], objectives: Sequence[str] = OBJECTIVES, mix:
     Objectives of which a weight or a seed is still missing are left out.
     """
     lines = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS and cell.mix == mix], HIGH, LOW)
-    found = {}
+    winners = {}
     for objective in objectives:
         entries = _entries(objective)
-        own = [line for line in lines if line.entry in entries and len(line.coverage) == len(CHOICE_SEEDS)]
-        if len(own) == len(entries):
-            found[objective] = max(own, key=lambda line: (line.coverage.mean(), line.best.mean())).entry
-    return found
+        candidates = [line for line in lines if line.entry in entries and len(line.coverage) == len(CHOICE_SEEDS)]
+        if len(candidates) == len(entries):
+            winners[objective] = max(candidates, key=lambda line: (line.coverage.mean(), line.best.mean())).entry
+    return winners
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -105,8 +105,8 @@ def tables_of_two(path: Path) -> Iterator[str]:
     """What the cells of two features say, members trained at once and one after the other."""
     boards = {}
     for title, cells in (("at once", read(path)), ("one after the other", read(path.with_name(SEQUENTIAL.name)))):
-        what = f"{title.capitalize()}: coverage (best) by weight, seed 100 at mix 1; in bold what the rule chose."
-        yield from _weights(what, cells, chosen(cells, OF_TWO, CHOICE_MIX_OF_TWO))
+        caption = f"{title.capitalize()}: coverage (best) by weight, seed 100 at mix 1; in bold what the rule chose."
+        yield from _weights(caption, cells, chosen(cells, OF_TWO, CHOICE_MIX_OF_TWO))
         for mix in (0.5, 1.0):
             test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS and cell.mix == mix]
             boards[f"{title}, mix {mix:g}"] = test
@@ -133,10 +133,10 @@ def _covered(line: Line | None) -> str:
     return "-" if line is None else f"{with_interval(line.coverage)} ({line.best.mean():.2f})"
 
 
-def _weights(what: str, cells: Iterable[Scored], winners: Mapping[str, str]) -> Iterator[str]:
+def _weights(caption: str, cells: Iterable[Scored], winners: Mapping[str, str]) -> Iterator[str]:
     choice = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS], HIGH, LOW)
     by_entry = {line.entry: line for line in choice}
-    yield what
+    yield caption
     yield ""
     yield from table(
         ["", *(f"{weight:g}" for weight in WEIGHTS)],
@@ -172,10 +172,10 @@ def _choice(line: Line | None, best: bool) -> str:
 
 
 def _by_factor(cells: Sequence[Scored]) -> Iterator[list[str]]:
-    for entry, of in grouped(cells, lambda cell: cell.entry).items():
-        share = np.mean([owned(cell.ranking, HIGH, LOW).any(axis=0) for cell in of], axis=0)
-        best = np.mean([cell.ranking.max(axis=0) for cell in of], axis=0)
-        yield [entry, *(f"{one:.1f} ({two:.2f})" for one, two in zip(share, best, strict=True))]
+    for entry, group in grouped(cells, lambda cell: cell.entry).items():
+        share = np.mean([owned(cell.ranking, HIGH, LOW).any(axis=0) for cell in group], axis=0)
+        best = np.mean([cell.ranking.max(axis=0) for cell in group], axis=0)
+        yield [entry, *(f"{owning:.1f} ({highest:.2f})" for owning, highest in zip(share, best, strict=True))]
 
 
 def main() -> None:

@@ -74,9 +74,11 @@ def test_tables_of_the_readme_and_the_first_page_have_the_numbers_of_the_pages()
     tables = 0
     for section in (*first.split("\n## ")[2:], readme + " ".join(f"({name}.md)" for name in PAGES)):  # not the claims
         pages = {name for name in PAGES if f"({name}.md)" in section}
-        known = {number for name in pages for number in _numbers((RESULTS / f"{name}.md").read_text(encoding="utf-8"))}
-        tables += bool(said := _numbers(section))
-        assert said <= known, section.partition("\n")[0]
+        published = {
+            number for name in pages for number in _numbers((RESULTS / f"{name}.md").read_text(encoding="utf-8"))
+        }
+        tables += bool(shown := _numbers(section))
+        assert shown <= published, section.partition("\n")[0]
     assert tables >= 4
 
 
@@ -114,13 +116,13 @@ def test_agents_of_figure_6_are_told_apart() -> None:
 
 def test_tuned_is_what_the_search_found() -> None:
     """By its rule, from the cells; the drawn settings are those that ran, and Figure 6 pays the best bonus."""
-    found = tuning.read(RESULTS / "tuning-baselines.csv")
+    trials = tuning.read(RESULTS / "tuning-baselines.csv")
     for agent in tuning.AGENTS:
-        for trial, rows in found[agent, tuning.SHORT].items():
+        for trial, rows in trials[agent, tuning.SHORT].items():
             assert {row["settings"] for row in rows} == {tuning.text_of(agent, tuning.settings_of(agent, trial))}
-        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(found, agent))
+        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(trials, agent))
     figure = (RESULTS.parents[1] / "examples" / "figure6.py").read_text(encoding="utf-8")
-    assert re.findall(r"bonus=([\d.]+)", figure) == [str(tuning.best_bonus(found))]
+    assert re.findall(r"bonus=([\d.]+)", figure) == [str(tuning.best_bonus(trials))]
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
