@@ -1,4 +1,4 @@
-"""Above which threshold to predict positive, without labels of another layout: rules for thresholds, compared on DoorKey.
+"""Above which threshold to predict positive, without labels of another layout: rules compared on DoorKey.
 
     python -m studies.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-101
     python -m studies.thresholds docs/results/thresholds-doorkey.csv --layouts test --seeds 0-4
