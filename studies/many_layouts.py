@@ -7,10 +7,10 @@ option play alone, greedily, from the start of 100 layouts that training drew fr
 (``new``), see ``hypogoal.evaluation.zero_shot``. The others are those from ``FIRST`` on whose grid is none of a layout
 that anything was learned on. Kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 
-Controls show what limits success: ``planned`` options take the shortest path to a positive prediction, so what they lack
-is the members' fault; ``oracle`` options learn from true sub-goals, so what they lack is learning's; ``trained`` against
-``new`` layouts shows how policies generalise; ``one-layout`` what variety is worth. More exploration, and convolutions
-over the cells, are what we tried where learning failed.
+Controls show what limits success: ``planned`` options take the shortest path to a positive prediction, so what they
+lack is the members' fault; ``oracle`` options learn from true sub-goals, so what they lack is learning's; ``trained``
+against ``new`` layouts shows how policies generalise; ``one-layout`` what variety is worth. More exploration, and
+convolutions over the cells, are what we tried where learning failed.
 """
 
 from __future__ import annotations
