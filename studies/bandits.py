@@ -36,7 +36,13 @@ def run_cell(run: Path, method: str, truth: str, chooser: str, seed: str) -> lis
         out = Path(folder) / "agent"
         settings = [f"chooser={chooser}", f"world=truth={truth}", f"steps={ENDS[-1]}", "random_episodes=0"]
         command = ["train-meta", str(run / "ensemble" / f"method-{method}-seed-{seed}"), "--out", str(out), "--quiet"]
-        command += ["--seed", seed, "--layout-seed", seed, *(word for one in settings for word in ("--set", one))]
+        command += [
+            "--seed",
+            seed,
+            "--layout-seed",
+            seed,
+            *(word for setting in settings for word in ("--set", setting)),
+        ]
         if hypogoal(command):
             raise SystemExit(f"failed: {' '.join(command)}")
         with (out / "episodes.csv").open(encoding="utf-8", newline="") as file:
@@ -55,12 +61,14 @@ def tables(path: Path) -> Iterator[str]:
     for method, title in METHODS.items():
         for truth in TRUTHS:
             for chooser, name in TITLES.items():
-                of = [r for r in rows if (r["method"], r["truth"], r["chooser"]) == (method, truth, chooser)]
-                if of:
-                    shares = {end: np.array([float(r["success"]) for r in of if int(r["step"]) == end]) for end in ENDS}
+                cells = [r for r in rows if (r["method"], r["truth"], r["chooser"]) == (method, truth, chooser)]
+                if cells:
+                    shares = {
+                        end: np.array([float(r["success"]) for r in cells if int(r["step"]) == end]) for end in ENDS
+                    }
                     good = f"{(shares[200] >= 0.9).sum()} of {len(shares[200])}"
-                    lines.append([truth, title, name, *(interval(values, 2) for values in shares.values()), good])
-    yield from table(["rewarded", "members", "chooser", *map(str, ENDS), "90 % at 200 on"], lines)
+                    lines.append([truth, title, name, *(interval(shares[end], 2) for end in ENDS[1:]), good])
+    yield from table(["rewarded", "members", "chooser", *map(str, ENDS[1:]), "90 % at 200 on"], lines)
 
 
 def main() -> None:

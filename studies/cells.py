@@ -22,7 +22,7 @@ Cell = tuple[str, ...]
 
 
 def parser_of(doc: str | None, seeds: str) -> argparse.ArgumentParser:
-    """What all such experiments can be told; ``doc`` is the module's, ``seeds`` the default."""
+    """The arguments that all such experiments share; ``doc`` is the module's, ``seeds`` the default."""
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
     parser.add_argument("--seeds", type=parse_integers, default=parse_integers(seeds), help="0-9 or 0,2,5")
@@ -51,15 +51,15 @@ def run_cells(
     """
     if not path.exists():
         path.write_text(",".join(columns) + "\n", encoding="utf-8")
-    there: dict[Cell, set[int]] = defaultdict(set)
+    finished: dict[Cell, set[int]] = defaultdict(set)
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            there[tuple(row[key] for key in keys)].add(int(row["step"]))
-    cells = [cell for cell in jobs if not there[cell].issuperset(steps(cell))]
+            finished[tuple(row[key] for key in keys)].add(int(row["step"]))
+    cells = [cell for cell in jobs if not finished[cell].issuperset(steps(cell))]
     with Progress(path.stem, len(cells)) as progress:
 
         def keep(number: int, rows: list[Row]) -> None:
-            new = [row for row in rows if row["step"] not in there[cells[number]]]
+            new = [row for row in rows if row["step"] not in finished[cells[number]]]
             with path.open("a", encoding="utf-8", newline="") as file:
                 csv.DictWriter(file, columns, lineterminator="\n").writerows({**row, **_short(row)} for row in new)
             progress.advance()
@@ -81,6 +81,7 @@ def interval(values: NDArray[np.float64], digits: int = 3) -> str:
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Lines of Markdown, and an empty one."""
-    for cells in (titles, ["---"] * len(titles), *rows):
-        yield f"| {' | '.join(cells)} |"
+    yield f"| {' | '.join(titles)} |"
+    yield f"|{'---|' * len(titles)}"
+    yield from (f"| {' | '.join(cells)} |" for cells in rows)
     yield ""

@@ -45,21 +45,18 @@ METHODS = {  # by what the names of artefacts have in them, the longest first
 BASELINES = ("ppo", "dqn")
 PLANNED = "planned"
 POLICIES = {"learned": "learned options", PLANNED: "planned options"}  # baselines have none
-PRACTICE, PRACTISED = "practice", "practised"  # steps in the plain world, and whether chance solved it by then
+PRACTICE, PRACTISED = (
+    "practice",
+    "practised",
+)  # steps in the plain world, and whether uniform-random choice solved it by then
 MOST_LAYOUTS = 10  # side by side in a table; more are in the rows alone
 ROOMS = {"third": "", "second": "-second", "first": "-first"}  # settings, by what their files' names end in
 COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
-SHOWN = {
-    "success": "solved",
-    "near": "within 1.5 shortest paths",
-    "within_rho": "within-rho",
-    "pair": "better of two",
-    "score": "score",
-}
+SHOWN = {"success": "solved", "within_rho": "within-rho", "pair": "better of two", "score": "score"}
 
 
 def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
-    """Play every agent of a run, frozen, as the evaluation does, and chance with its options: a row per number.
+    """Play every agent of a run, frozen, and uniform-random choice among its options: a row per number.
 
     Of evaluated baselines it takes the last training episodes. Rows that are there of agents that the run has not stay.
     """
@@ -72,11 +69,11 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
         chooser = "uniform" if row["method"] == UNIFORM else "agent"
         value = f"{float(row['value']):.4f}"
         kept.append((method, row.get("policy", ""), row["layout"], row["seed"], chooser, row["quantity"], value))
-    made = {row[:3] for row in kept}
+    played = {row[:3] for row in kept}
     before = [tuple(row[column] for column in COLUMNS) for row in _read(path)] if path.exists() else []
-    kept += [row for row in before if row[:3] not in made]
-    known = (*METHODS, *POLICIES, "agent", "uniform", *OF_PLAY, *OF_CHOICE, PRACTICE, PRACTISED)
-    order = {name: place for place, name in enumerate(("", *known))}
+    kept += [row for row in before if row[:3] not in played]
+    names = (*METHODS, *POLICIES, "agent", "uniform", *OF_PLAY, *OF_CHOICE, PRACTICE, PRACTISED)
+    order = {name: place for place, name in enumerate(("", *names))}
     kept.sort(key=lambda row: (order[row[0]], order[row[1]], int(row[2]), order[row[4]], order[row[5]]))
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -87,16 +84,16 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
 def _played(artefact: Artefact) -> list[dict[str, str]]:
     config, seed = artefact.config, artefact.manifest["seed"]
     policy = PLANNED if config["network"] == PLANNED else "learned"
-    about = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
+    agent = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
     played, rows = play_agent(artefact, seed), []
     assert played is not None
     for method, numbers in ((LEARNED, played), (UNIFORM, played["uniform"])):
-        known = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
-        rows += [about | {"method": method, "quantity": name, "value": str(numbers[name])} for name in known]
+        defined = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
+        rows += [agent | {"method": method, "quantity": name, "value": str(numbers[name])} for name in defined]
     if "options_ended_at" in config:
         options = open_artefact(artefact.input("options"), "options").config
         came = {PRACTICE: options["ended_at"], PRACTISED: int(options["until_reached"])}
-        rows += [about | {"method": LEARNED, "quantity": name, "value": str(value)} for name, value in came.items()]
+        rows += [agent | {"method": LEARNED, "quantity": name, "value": str(value)} for name, value in came.items()]
     return rows
 
 
@@ -116,54 +113,57 @@ def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
     rows = _read(path)
     layouts = sorted({row["layout"] for row in rows}, key=int)
-    there = {(row["method"], row["policy"]) for row in rows}
-    both = set(POLICIES) <= {policy for _, policy in there}
+    present = {(row["method"], row["policy"]) for row in rows}
+    both = set(POLICIES) <= {policy for _, policy in present}
     agents = {
         (method, policy): f"{title}, {POLICIES[policy]}" if both and policy else title
         for (method, title), policy in product(METHODS.items(), ("", *POLICIES))
-        if (method, policy) in there
+        if (method, policy) in present
     }
     optioned = [agent for agent in agents if agent[0] not in BASELINES]
 
-    def of(agent: tuple[str, str], chooser: str, quantity: str) -> NDArray[np.float64]:
-        found = {
+    def values_of(agent: tuple[str, str], chooser: str, quantity: str) -> NDArray[np.float64]:
+        numbers = {
             row["layout"]: float(row["value"])
             for row in rows
             if (row["method"], row["policy"], row["chooser"], row["quantity"]) == (*agent, chooser, quantity)
         }
-        return np.array([found.get(layout, np.nan) for layout in layouts])
+        return np.array([numbers.get(layout, np.nan) for layout in layouts])
 
     def by_layout(cells: Callable[[tuple[str, str]], Iterator[str]], shown: list[tuple[str, str]]) -> Iterator[str]:
         yield ""
         yield from table(["", *layouts], ([agents[agent], *cells(agent)] for agent in shown))
 
     def shares(agent: tuple[str, str]) -> Iterator[str]:
-        for solved, chance in zip(of(agent, "agent", "success"), of(agent, "uniform", "success"), strict=True):
-            yield "-" if np.isnan(solved) else f"{solved:.2f} / {chance:.2f}"
+        for solved, uniform in zip(
+            values_of(agent, "agent", "success"), values_of(agent, "uniform", "success"), strict=True
+        ):
+            yield "-" if np.isnan(solved) else f"{solved:.2f} / {uniform:.2f}"
 
     def practice(agent: tuple[str, str]) -> Iterator[str]:
-        for steps, solved in zip(of(agent, "agent", PRACTICE), of(agent, "agent", PRACTISED), strict=True):
+        for steps, solved in zip(
+            values_of(agent, "agent", PRACTICE), values_of(agent, "agent", PRACTISED), strict=True
+        ):
             yield "-" if np.isnan(steps) else f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
 
     yield f"Mean over {len(layouts)} layouts and Student's 95 % interval; of choices, where they are defined."
     yield ""
     yield from table(
-        ["", "chooser", *SHOWN.values(), "95 % solved on", "90 % on"],
+        ["", "solved by uniform-random choice", *SHOWN.values(), "95 % solved on"],
         (
             [
                 title,
-                "agent" if chooser == "agent" else UNIFORM,
-                *(_mean(of(agent, chooser, quantity)) for quantity in SHOWN),
-                *(f"{(of(agent, chooser, 'success') >= least).sum()} of {len(layouts)}" for least in (0.95, 0.9)),
+                _mean(values_of(agent, "uniform", "success")) if agent in optioned else "-",
+                *(_mean(values_of(agent, "agent", quantity)) for quantity in SHOWN),
+                _reached(values_of(agent, "agent", "success")),
             ]
             for agent, title in agents.items()
-            for chooser in (("agent", "uniform") if agent in optioned else ("agent",))
         ),
     )
     if len(layouts) <= MOST_LAYOUTS:
         yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
         yield from by_layout(shares, optioned)
-    if practised := [agent for agent in optioned if not np.isnan(of(agent, "agent", PRACTICE)).all()]:
+    if practised := [agent for agent in optioned if not np.isnan(values_of(agent, "agent", PRACTICE)).all()]:
         yield "Practice by uniform-random choice, thousands of steps until 95 of 100 were solved, or the limit."
         yield from by_layout(practice, practised)
 
@@ -172,12 +172,12 @@ def rooms(path: Path) -> Iterator[str]:
     """Three settings side by side, and the seeds of the third; every other number is in the rows."""
     settings = {which: _read(path.with_stem(path.stem + suffix)) for which, suffix in ROOMS.items()}
 
-    def of(rows: list[dict[str, str]], method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
+    def values_of(rows: list[dict[str, str]], method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
         wanted = (method, chooser, quantity)
         return np.array([float(r["value"]) for r in rows if (r["method"], r["chooser"], r["quantity"]) == wanted])
 
     def shown(rows: list[dict[str, str]], method: str) -> str:
-        solved, uniform = (of(rows, method, chooser, "success") for chooser in ("agent", "uniform"))
+        solved, uniform = (values_of(rows, method, chooser, "success") for chooser in ("agent", "uniform"))
         many = f"({(solved >= 0.9).sum()})"
         return f"{interval(solved, 2)} {many} / {uniform.mean():.2f}" if len(solved) else "-"
 
@@ -190,16 +190,20 @@ def rooms(path: Path) -> Iterator[str]:
     yield ""
     third = settings["third"]
     seeds = sorted({row["layout"] for row in third}, key=int)
-    known = [method for method in methods if len(of(third, method, "agent", "success"))]
+    complete = [method for method in methods if len(values_of(third, method, "agent", "success"))]
     yield from table(
-        ["", *seeds], ([METHODS[m], *(f"{v:.2f}" for v in of(third, m, "agent", "success"))] for m in known)
+        ["", *seeds], ([METHODS[m], *(f"{v:.2f}" for v in values_of(third, m, "agent", "success"))] for m in complete)
     )
 
 
 def _mean(values: NDArray[np.float64]) -> str:
-    known = values[~np.isnan(values)]
-    few = f" (n = {len(known)})" if len(known) < len(values) else ""
-    return f"{interval(known, 2)}{few}"
+    defined = values[~np.isnan(values)]
+    few = f" (n = {len(defined)})" if len(defined) < len(values) else ""
+    return f"{interval(defined, 2)}{few}"
+
+
+def _reached(shares: NDArray[np.float64]) -> str:
+    return f"{(shares >= 0.95).sum()} of {(~np.isnan(shares)).sum()}"
 
 
 def main() -> None:

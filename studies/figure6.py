@@ -58,28 +58,28 @@ LINES = {  # colour, dashes
 
 def collect(run: Path, path: Path) -> None:
     """A row for every number of every finished agent, those that are there first."""
-    there: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    rows_of: dict[tuple[str, ...], list[dict[str, str]]] = {}
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
-                there.setdefault((row["method"], row["layout"]), []).append(row)
+                rows_of.setdefault((row["method"], row["layout"]), []).append(row)
     for kind in ("meta", "baseline"):
         for artefact in find_artefacts(run, kind):
             read = read_run(artefact, artefact.path.name)
             method = method_of(read.config, artefact.path.name)
             key = (method, str(read.layout["layout_seed"]))
-            if key not in there:
-                about = dict(zip(COLUMNS, (*key, str(read.seed)), strict=False))
-                there[key] = [
-                    about | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"}
+            if key not in rows_of:
+                key_columns = dict(zip(COLUMNS, (*key, str(read.seed)), strict=False))
+                rows_of[key] = [
+                    key_columns | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"}
                     for chooser, name, value in _numbers(artefact, read)
                 ]
     order = list(METHODS)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        for place in sorted(there, key=lambda key: (order.index(key[0]), int(key[1]))):
-            writer.writerows(there[place])
+        for place in sorted(rows_of, key=lambda key: (order.index(key[0]), int(key[1]))):
+            writer.writerows(rows_of[place])
 
 
 def method_of(config: Mapping[str, Any], place: str) -> str:
@@ -94,13 +94,13 @@ def method_of(config: Mapping[str, Any], place: str) -> str:
 def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
     """Chooser, quantity and value of one agent: of its training, and of frozen play where it chooses options."""
     shortest = run.layout["shortest_path"]
-    found = run_numbers(run.episodes, shortest)
-    reached = found["steps_to_95"]
+    numbers = run_numbers(run.episodes, shortest)
+    reached = numbers["steps_to_95"]
     yield "agent", "steps", float(run.budget)
     yield "agent", "shortest_path", float(shortest)
     yield "agent", "steps_to_95", math.inf if reached is None else float(reached)
     for name in ("success", "length_over_shortest", "near"):
-        yield "agent", name, float(found[name] or 0.0)
+        yield "agent", name, float(numbers[name] or 0.0)
     yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
     for step in (1_000 * point for point in POINTS if 1_000 * point <= run.budget):
         seen = run.episodes.at(run.episodes.step <= step).last()
@@ -132,37 +132,36 @@ def tables(path: Path) -> Iterator[str]:
     methods = [method for method in METHODS if any(row["method"] == method for row in rows)]
     layouts = sorted({row["layout"] for row in rows}, key=int)
 
-    def of(method: str, quantity: str, chooser: str = "agent") -> NDArray[np.float64]:
-        found = {
+    def values_of(method: str, quantity: str, chooser: str = "agent") -> NDArray[np.float64]:
+        by_layout = {
             row["layout"]: float(row["value"])
             for row in rows
             if (row["method"], row["quantity"], row["chooser"]) == (method, quantity, chooser)
         }
-        return np.array([found.get(layout, np.nan) for layout in layouts])
+        return np.array([by_layout.get(layout, np.nan) for layout in layouts])
 
-    def known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values[np.isfinite(values)]
 
     def training(method: str) -> list[str]:
-        reached = of(method, "steps_to_95")
+        reached = values_of(method, "steps_to_95")
         ran = int((~np.isnan(reached)).sum())
         soon = np.sort(reached[~np.isnan(reached)])[ran // 2]
-        lowest = known(of(method, "lowest_after"))
+        lowest = finite(values_of(method, "lowest_after"))
         return [
             METHODS[method],
-            f"{np.isfinite(known(reached)).sum()} of {ran}",
+            f"{np.isfinite(finite(reached)).sum()} of {ran}",
             f"{soon:,.0f}" if np.isfinite(soon) else "never",
-            interval(known(of(method, "success")), 2),
-            interval(known(of(method, "length_over_shortest")), 2),
-            interval(known(of(method, "near")), 2),
+            interval(finite(values_of(method, "success")), 2),
+            interval(finite(values_of(method, "length_over_shortest")), 2),
             f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
         ]
 
     yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts, Student's 95 % interval."
     yield ""
-    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest", "within 1.5 shortest paths"]
+    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest"]
     yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
-    frozen = [method for method in methods if len(known(of(method, "success", "frozen")))]
+    frozen = [method for method in methods if len(finite(values_of(method, "success", "frozen")))]
     yield "Without further training: the agent / uniform-random choice among its own options."
     yield ""
     yield from table(
@@ -171,10 +170,10 @@ def tables(path: Path) -> Iterator[str]:
             [
                 METHODS[method],
                 *(
-                    " / ".join(interval(known(of(method, quantity, who)), 2) for who in ("frozen", UNIFORM))
+                    " / ".join(interval(finite(values_of(method, quantity, who)), 2) for who in ("frozen", UNIFORM))
                     for quantity in ("success", "length_over_shortest", "near")
                 ),
-                str(len(known(of(method, "success", "frozen")))),
+                str(len(finite(values_of(method, "success", "frozen")))),
             ]
             for method in frozen
         ),
@@ -183,7 +182,10 @@ def tables(path: Path) -> Iterator[str]:
     yield ""
     yield from table(
         ["", *layouts],
-        ([METHODS[method], *(_thousands(steps) for steps in of(method, "steps_to_95").tolist())] for method in methods),
+        (
+            [METHODS[method], *(_thousands(steps) for steps in values_of(method, "steps_to_95").tolist())]
+            for method in methods
+        ),
     )
 
 
@@ -198,8 +200,8 @@ def draw(path: Path, out: Path) -> None:
             means = []
             for point in POINTS:
                 name = f"{quantity}_at_{1_000 * point}"
-                found = [float(row["value"]) for row in rows if (row["method"], row["quantity"]) == (method, name)]
-                means.append(float(np.mean(found)) if found else math.nan)
+                values = [float(row["value"]) for row in rows if (row["method"], row["quantity"]) == (method, name)]
+                means.append(float(np.mean(values)) if values else math.nan)
             if np.isfinite(means).any():
                 axes.plot(POINTS, means, color=colour, linestyle=dashes, lw=1.8, label=METHODS[method])
         axes.set_xscale("log")

@@ -159,11 +159,11 @@ def crossed(members: dict[str, NDArray[np.float64]], name: str) -> float:
     return cross_fitted(members[f"{name}_first"], members[f"{name}_second"])
 
 
-def curve(numbers: Numbers, method: str, of: Callable[[dict[str, NDArray[np.float64]]], float]) -> dict[int, float]:
+def curve(numbers: Numbers, method: str, score: Callable[[dict[str, NDArray[np.float64]]], float]) -> dict[int, float]:
     """By length of training that all got to, the mean of something over a method's sub-goals and seeds."""
     cells = [steps for (name, _, _), steps in numbers.items() if name == method]
     looks = [step for step in LOOKS if cells and all(step in steps for steps in cells)]
-    return {step: float(np.mean([of(steps[step]) for steps in cells])) for step in looks}
+    return {step: float(np.mean([score(steps[step]) for steps in cells])) for step in looks}
 
 
 def lengths(choice: Numbers) -> dict[str, int]:
@@ -176,12 +176,12 @@ def lengths(choice: Numbers) -> dict[str, int]:
 
 
 def by_seed(
-    numbers: Numbers, method: str, step: int, of: Callable[[dict[str, NDArray[np.float64]]], float], sub_goals: Any
+    numbers: Numbers, method: str, step: int, score: Callable[[dict[str, NDArray[np.float64]]], float], sub_goals: Any
 ) -> NDArray[np.float64]:
     """The mean over sub-goals of something, for each seed of which all of these are there."""
     seeds = sorted({seed for name, _, seed in numbers if name == method})
     means = [[numbers.get((method, goal, seed)) for goal in sub_goals] for seed in seeds]
-    return np.array([np.mean([of(steps[step]) for steps in cells if steps]) for cells in means if all(cells)])
+    return np.array([np.mean([score(steps[step]) for steps in cells if steps]) for cells in means if all(cells)])
 
 
 SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
@@ -224,7 +224,7 @@ def tables(path: Path) -> Iterator[str]:
     yield from table(
         ["", "steps", *SHOWN],
         (
-            [m, str(chosen[m]), *(interval(by_seed(test, m, chosen[m], of, every)) for of in SHOWN.values())]
+            [m, str(chosen[m]), *(interval(by_seed(test, m, chosen[m], score, every)) for score in SHOWN.values())]
             for m in tested
         ),
     )
@@ -256,10 +256,10 @@ def _weights(numbers: Numbers) -> Iterator[list[str]]:
     for method in methods:
         cells = []
         for weight in WEIGHTS:
-            of = f"{method}@{weight:g}"
-            if weight == EnsembleConfig().diversity_weight and of not in {name for name, _, _ in numbers}:
-                of = method
-            steps = curve(numbers, of, SHOWN["ranking, cross-fitted best"])
+            weighted = f"{method}@{weight:g}"
+            if weight == EnsembleConfig().diversity_weight and weighted not in {name for name, _, _ in numbers}:
+                weighted = method
+            steps = curve(numbers, weighted, SHOWN["ranking, cross-fitted best"])
             best = max(steps, key=lambda step: steps[step]) if steps else 0
             cells.append(f"{steps[best]:.3f} ({best})" if steps else "-")
         yield [method, *cells]
@@ -269,8 +269,8 @@ def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -
     for method in tested:
         cells = []
         for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
-            own, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
-            cells.append(f"{interval(own - other)} ({above(own, other).sum()})" if len(own) == len(other) else "-")
+            dbat, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
+            cells.append(f"{interval(dbat - other)} ({above(dbat, other).sum()})" if len(dbat) == len(other) else "-")
         if method != "dbat":
             yield [method, *cells]
 

@@ -108,8 +108,8 @@ def tables(path: Path) -> Iterator[str]:
 
 
 def _goal(rows: list[dict[str, str]], count: int, goal: str) -> str:
-    of = {row["positives"] for row in rows if int(row["labels"]) == count and row["sub_goal"] == goal}
-    return f"{by_seed(rows, 'ranking', count, 'dbat', goal).mean():.3f} ({', '.join(sorted(of))})"
+    positives = {row["positives"] for row in rows if int(row["labels"]) == count and row["sub_goal"] == goal}
+    return f"{by_seed(rows, 'ranking', count, 'dbat', goal).mean():.3f} ({', '.join(sorted(positives))})"
 
 
 def by_seed(rows: list[dict[str, str]], name: str, count: int, method: str, sub_goal: str = "") -> NDArray[np.float64]:

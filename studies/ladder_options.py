@@ -77,16 +77,16 @@ def length(groups: int, method: str) -> int:
     """The rule: the look at which the best member's balanced accuracy over all rooms is highest, mean over seeds."""
     seeds = read_lengths(LENGTHS, groups)[method].values()
     looks = next(iter(seeds))
-    return max(looks, key=lambda look: np.mean([of[look]["balanced_accuracy_all"].max() for of in seeds]))
+    return max(looks, key=lambda look: np.mean([steps[look]["balanced_accuracy_all"].max() for steps in seeds]))
 
 
 def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
     """Where the ensemble is; trained if it is not there."""
     out = work / f"{method}-{groups}-{seed}"
     if not (out / "manifest.json").exists():
-        own = METHODS[method][1]
-        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1, **own}
-        config = TrainEnsembleConfig(**{"steps": own.get("steps") or length(groups, method), **settings})
+        changes = METHODS[method][1]
+        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1, **changes}
+        config = TrainEnsembleConfig(**{"steps": changes.get("steps") or length(groups, method), **settings})
         train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
     return out
 
@@ -131,28 +131,30 @@ Distances = dict[tuple[str, str], dict[int, NDArray[np.float64]]]  # by method a
 
 def read(path: Path, groups: int, name: str = "distance") -> Distances:
     """A number of the cells of one N."""
-    found: Distances = {}
+    numbers: Distances = {}
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             if int(row["groups"]) == groups:
                 method = row["method"] if row["method"] != CARRIED else f"{CARRIED}-{row['step']}"
-                seeds = found.setdefault((method, row["ladder"]), {})
+                seeds = numbers.setdefault((method, row["ladder"]), {})
                 seed = int(row["seed"])
                 seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name]))
-    return found
+    return numbers
 
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     for groups in range(1, 8):
-        if found := read(path, groups):
-            yield from _tables(groups, found, read(path, groups, "reached_base"), read(path, groups, "inside_at_start"))
+        if distances := read(path, groups):
+            yield from _tables(
+                groups, distances, read(path, groups, "reached_base"), read(path, groups, "inside_at_start")
+            )
 
 
-def _tables(groups: int, found: Distances, reached: Distances, inside: Distances) -> Iterator[str]:
-    methods = [method for method in METHODS if any(name == method for name, _ in found)]
+def _tables(groups: int, distances: Distances, reached: Distances, inside: Distances) -> Iterator[str]:
+    methods = [method for method in METHODS if any(name == method for name, _ in distances)]
     learned = [method for method in methods if method != "oracle"]  # the control may lag behind
-    whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in learned)]
+    whole = [ladder for ladder in LADDERS if all((method, ladder) in distances for method in learned)]
     yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one if equal)."
     yield ""
     yield from table(
@@ -160,7 +162,7 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
         (
             [
                 ladder,
-                *(_three(found.get((method, ladder), {})) for method in methods),
+                *(_three(distances.get((method, ladder), {})) for method in methods),
                 " / ".join(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned),
             ]
             for ladder in whole
@@ -168,7 +170,7 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
     )
     if len(whole) < FEWEST:
         return
-    seeds = sorted(set.intersection(*(set(found[method, ladder]) for method in learned for ladder in whole)))
+    seeds = sorted(set.intersection(*(set(distances[method, ladder]) for method in learned for ladder in whole)))
     yield f"Mean over {len(whole)} ladders, Student's 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
     yield ""
     yield from table(
@@ -176,10 +178,10 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
         (
             [
                 METHODS[method][0],
-                interval(over(found, method, whole, seeds, np.min), 1),
-                interval(over(found, method, whole, seeds, np.mean), 1),
+                interval(over(distances, method, whole, seeds, np.min), 1),
+                interval(over(distances, method, whole, seeds, np.mean), 1),
                 interval(over(reached, method, whole, seeds, np.max), 2),
-                _against(found, method, whole, seeds),
+                _against(distances, method, whole, seeds),
             ]
             for method in learned
         ),
@@ -188,19 +190,15 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
 
 def tables_that_hold(path: Path) -> Iterator[str]:
     """What the cells of options that hold say, as lines of Markdown."""
-    found, reached = read(path, 1), read(path, 1, "reached_base")
-    methods = [method for method in ("holds-dbat", "holds-none", "holds-ram", "oracle") if _ladders(found, method)]
+    distances, reached = read(path, 1), read(path, 1, "reached_base")
+    methods = [method for method in ("holds-dbat", "holds-none", "holds-ram", "oracle") if _ladders(distances, method)]
     yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds (how many)."
     yield ""
     yield from table(
-        ["ladder", *(METHODS[method][0] for method in methods), "D-BAT's mean member, seed by seed"],
+        ["ladder", *(METHODS[method][0] for method in methods)],
         (
-            [
-                ladder,
-                *(_bold(found.get((method, ladder), {})) for method in methods),
-                " ".join(f"{members.mean():.1f}" for _, members in sorted(found["holds-dbat", ladder].items())),
-            ]
-            for ladder in _ladders(found, "holds-dbat")
+            [ladder, *(_bold(distances.get((method, ladder), {})) for method in methods)]
+            for ladder in _ladders(distances, "holds-dbat")
         ),
     )
     inside = read(path, 1, "inside_at_start")
@@ -218,47 +216,49 @@ def tables_that_hold(path: Path) -> Iterator[str]:
         ["", *groups],
         (
             *(
-                [METHODS[method][0], *(_of_group(found, [method], ladders) for ladders in groups.values())]
+                [METHODS[method][0], *(_of_group(distances, [method], ladders) for ladders in groups.values())]
                 for method in methods
             ),
             [
                 "no diversity minus D-BAT, same seeds",
-                *(_of_group(found, ["holds-none", "holds-dbat"], ladders) for ladders in groups.values()),
+                *(_of_group(distances, ["holds-none", "holds-dbat"], ladders) for ladders in groups.values()),
             ],
         ),
     )
-    parts = [method for method in ("holds-dbat", "no-context", "no-median", "no-patience") if _ladders(found, method)]
+    parts = [
+        method for method in ("holds-dbat", "no-context", "no-median", "no-patience") if _ladders(distances, method)
+    ]
     if len(parts) > 1:
         yield "Each part left out: best / **mean** / worst member, mean over the same seeds."
         yield ""
         ladders = ("3-9", "2-6")
-        seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in parts for ladder in ladders))
-        of = {
+        seeds = set.intersection(*(set(distances.get((method, ladder), {})) for method in parts for ladder in ladders))
+        shared = {
             key: {seed: members[seed] for seed in seeds}
-            for key, members in found.items()
+            for key, members in distances.items()
             if key[0] in parts and key[1] in ladders
         }
-        rows = ([METHODS[method][0], *(_bold(of[method, ladder]) for ladder in ladders)] for method in parts)
+        rows = ([METHODS[method][0], *(_bold(shared[method, ladder]) for ladder in ladders)] for method in parts)
         yield from table(["", *ladders], rows)
-    if shaped := found.get(("shaped", "14-22")):  # by a setting that is gone: it gained nothing
-        plain = {seed: found["holds-dbat", "14-22"][seed] for seed in shaped}
+    if shaped := distances.get(("shaped", "14-22")):  # by a setting that is gone: it gained nothing
+        plain = {seed: distances["holds-dbat", "14-22"][seed] for seed in shaped}
         yield "14-22 with and without `shaping=0.5`: best / **mean** / worst member, mean over the same seeds."
         yield ""
         yield from table(["", "14-22"], [["without", _bold(plain)], ["with shaping", _bold(shaped)]])
-    if _ladders(found, f"{CARRIED}-0"):
+    if _ladders(distances, f"{CARRIED}-0"):
         yield "Carried over from 1L, 1M and 1R: share of executions that end at a base, mean member (distance)."
         yield ""
         yield from table(
             ["ladder", "as they are", f"after {MORE:,} steps more"],
             (
-                [ladder, *(_share(reached, found, f"{CARRIED}-{step}", ladder) for step in (0, MORE))]
-                for ladder in _ladders(found, f"{CARRIED}-0")
+                [ladder, *(_share(reached, distances, f"{CARRIED}-{step}", ladder) for step in (0, MORE))]
+                for ladder in _ladders(distances, f"{CARRIED}-0")
             ),
         )
 
 
-def _ladders(found: Distances, method: str) -> list[str]:
-    return [ladder for ladder in LADDERS if (method, ladder) in found]
+def _ladders(distances: Distances, method: str) -> list[str]:
+    return [ladder for ladder in LADDERS if (method, ladder) in distances]
 
 
 def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
@@ -271,23 +271,24 @@ def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
 
 def _best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:
     best, mean, worst = (
-        float(np.mean([of(members) for members in seeds.values()])) for of in (np.min, np.mean, np.max)
+        float(np.mean([reduce(members) for members in seeds.values()])) for reduce in (np.min, np.mean, np.max)
     )
     return best, mean, worst
 
 
-def _of_group(found: Distances, methods: list[str], ladders: list[str]) -> str:
+def _of_group(distances: Distances, methods: list[str], ladders: list[str]) -> str:
     """The mean member's mean over ladders, of two methods the first's minus the second's; seeds that have all."""
-    seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in methods for ladder in ladders))
+    seeds = set.intersection(*(set(distances.get((method, ladder), {})) for method in methods for ladder in ladders))
     means = [
-        [np.mean([found[method, ladder][seed].mean() for ladder in ladders]) for method in methods] for seed in seeds
+        [np.mean([distances[method, ladder][seed].mean() for ladder in ladders]) for method in methods]
+        for seed in seeds
     ]
     return interval(np.array([each[0] - sum(each[1:]) for each in means]), 1) if means else "-"
 
 
-def _share(reached: Distances, found: Distances, method: str, ladder: str) -> str:
+def _share(reached: Distances, stops: Distances, method: str, ladder: str) -> str:
     shares, distances = (
-        np.mean([members.mean() for members in of[method, ladder].values()]) for of in (reached, found)
+        np.mean([members.mean() for members in numbers[method, ladder].values()]) for numbers in (reached, stops)
     )
     return f"{shares:.2f} ({distances:.0f})"
 
@@ -300,20 +301,20 @@ def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
 
 
 def over(
-    found: Distances,
+    distances: Distances,
     method: str,
     ladders: list[str],
     seeds: list[int],
-    of: Callable[[NDArray[np.float64]], np.floating[Any]],
+    reduce: Callable[[NDArray[np.float64]], np.floating[Any]],
 ) -> NDArray[np.float64]:
     """A number of each ladder's members, mean over seeds: float64 (ladders,)."""
-    return np.array([np.mean([of(found[method, ladder][seed]) for seed in seeds]) for ladder in ladders])
+    return np.array([np.mean([reduce(distances[method, ladder][seed]) for seed in seeds]) for ladder in ladders])
 
 
-def _against(found: Distances, method: str, ladders: list[str], seeds: list[int]) -> str:
+def _against(distances: Distances, method: str, ladders: list[str], seeds: list[int]) -> str:
     if method == "dbat":
         return "-"
-    apart = [over(found, name, ladders, seeds, np.mean) for name in (method, "dbat")]
+    apart = [over(distances, name, ladders, seeds, np.mean) for name in (method, "dbat")]
     return interval(apart[0] - apart[1], 1)
 
 

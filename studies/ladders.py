@@ -176,7 +176,7 @@ def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
 
     def best_and_mean(method: str, step: int) -> str:
         rankings = [looked[step]["ranking_unseen"] for looked in numbers[method].values()]
-        return " / ".join(f"{np.mean([of(members) for members in rankings]):.3f}" for of in (np.max, np.mean))
+        return " / ".join(f"{np.mean([reduce(members) for members in rankings]):.3f}" for reduce in (np.max, np.mean))
 
     yield from table(
         ["", *map(str, looks)], ([method, *(best_and_mean(method, step) for step in looks)] for method in numbers)
@@ -204,10 +204,14 @@ def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
 
 def _cross_fitted(numbers: Numbers, method: str) -> list[str]:
     seeds = numbers[method]
-    own, dbat = crossed(seeds, "ranking"), crossed(numbers["dbat"], "ranking")
+    rankings, dbat = crossed(seeds, "ranking"), crossed(numbers["dbat"], "ranking")
     steps = f"{picked(seeds, 'first')}, {picked(seeds, 'second')}"
-    versus = ["-", "-"] if method == "dbat" else [interval(dbat - own), f"{above(dbat, own).sum()} of {len(own)}"]
-    return [method, steps, interval(own), interval(crossed(seeds, "balanced_accuracy")), *versus]
+    versus = (
+        ["-", "-"]
+        if method == "dbat"
+        else [interval(dbat - rankings), f"{above(dbat, rankings).sum()} of {len(rankings)}"]
+    )
+    return [method, steps, interval(rankings), interval(crossed(seeds, "balanced_accuracy")), *versus]
 
 
 def _all_rooms(groups: int, method: str, seeds: Seeds) -> list[str]:

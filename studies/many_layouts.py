@@ -7,10 +7,10 @@ option play alone, greedily, from the start of 100 layouts that training drew fr
 (``new``), see ``hypogoal.evaluation.zero_shot``. The others are those from ``FIRST`` on whose grid is none of a layout
 that anything was learned on. Kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 
-What limits success is told by controls: ``planned`` options go the shortest way to where members say yes, so what they
-lack is the members' fault; ``oracle`` options learn with the true sub-goals, so what they lack is learning's;
-``trained`` against ``new`` layouts is what the policies do not generalise; ``one-layout`` what variety is worth. More
-exploration, and convolutions over the cells, are what we tried where learning failed.
+Controls show what limits success: ``planned`` options take the shortest path to a positive prediction, so what they
+lack is the members' fault; ``oracle`` options learn from true sub-goals, so what they lack is learning's; ``trained``
+against ``new`` layouts shows how policies generalise; ``one-layout`` what variety is worth. More exploration, and
+convolutions over the cells, are what we tried where learning failed.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ TRAINED, FIRST, TRIED = "1000-1999", 5000, 100  # layouts to learn in; where the
 LEARNT = (0, 1, 2)  # layouts of the states that ensembles learn from
 PLANNED = (1,)  # step: where there is nothing to learn
 LOOKS = (100_000, 300_000, 1_000_000, 3_000_000)  # environment steps, of all options together
+LOOKS_SHOWN = 2  # the last ones; earlier looks are in the cells alone
 GOAL = 0.7  # zero-shot success within twice the shortest path
 ENSEMBLE_STEPS = 150
 EXPLORING = {"epsilon_steps": 1_000_000, "epsilon_final": 0.2}  # steps of an option's own: it hardly falls
@@ -72,14 +73,14 @@ WHERE = ("trained", "new")
 
 def new_layouts() -> list[int]:
     """The first seeds from ``FIRST`` on whose grids nothing was learned on, and which differ from each other."""
-    known = {layout_of(seed).grid for seed in (*LEARNT, *layout_seeds(TRAINED))}
-    found: list[int] = []
+    grids = {layout_of(seed).grid for seed in (*LEARNT, *layout_seeds(TRAINED))}
+    new: list[int] = []
     for seed in itertools.count(FIRST):
-        if (grid := layout_of(seed).grid) not in known:
-            known.add(grid)
-            found.append(seed)
-        if len(found) == TRIED:
-            return found
+        if (grid := layout_of(seed).grid) not in grids:
+            grids.add(grid)
+            new.append(seed)
+        if len(new) == TRIED:
+            return new
     raise AssertionError("there is always another seed")
 
 
@@ -99,8 +100,8 @@ def run_cell(work: Path, method: str, seed: int, looks: tuple[int, ...]) -> list
     source = open_artefact(ensemble_of(work, method, seed), "ensemble")
     config = TrainOptionsConfig(**{"layouts": TRAINED, **METHODS[method][2]})
     loop = assemble(DOMAIN, source.path, source.config, config, seed)
-    there = layout_seeds(config.layouts)
-    tried = {"trained": there[:: max(1, len(there) // TRIED)][:TRIED], "new": new_layouts()}
+    trained = layout_seeds(config.layouts)
+    tried = {"trained": trained[:: max(1, len(trained) // TRIED)][:TRIED], "new": new_layouts()}
     tests: dict[str, OptionLoop] = {}
     rows: list[Row] = []
     spent = 0.0
@@ -126,8 +127,10 @@ def tried_out(loop: OptionLoop, sub_goals: list[str]) -> Iterator[Row]:
     ways, members = shortest_ways(loop.engine), loop.terminations.options // len(sub_goals)
     for option in range(loop.terminations.options):
         sub_goal, goal = sub_goals[option // members], DOMAIN.sub_goals.index(sub_goals[option // members])
-        told = alone(loop, option, goal, ways[:, goal])
-        yield {"sub_goal": sub_goal, "member": option % members} | {name: float(told[name].mean()) for name in told}
+        numbers = alone(loop, option, goal, ways[:, goal])
+        yield {"sub_goal": sub_goal, "member": option % members} | {
+            name: float(numbers[name].mean()) for name in numbers
+        }
 
 
 # By method, step and layouts; then by seed and sub-goal: the members' numbers (K,).
@@ -136,23 +139,23 @@ Found = dict[tuple[str, int, str], dict[int, dict[str, NDArray[np.float64]]]]
 
 def read(path: Path, name: str) -> Found:
     """A number of all cells."""
-    found: Found = defaultdict(lambda: defaultdict(dict))
+    numbers: Found = defaultdict(lambda: defaultdict(dict))
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            of_seed = found[row["method"], int(row["step"]), row["layouts"]][int(row["seed"])]
+            of_seed = numbers[row["method"], int(row["step"]), row["layouts"]][int(row["seed"])]
             of_seed[row["sub_goal"]] = np.append(of_seed.get(row["sub_goal"], np.empty(0)), float(row[name]))
-    return found
+    return numbers
 
 
-def of_seeds(found: Found, key: tuple[str, int, str], sub_goal: str = "") -> NDArray[np.float64]:
+def of_seeds(numbers: Found, key: tuple[str, int, str], sub_goal: str = "") -> NDArray[np.float64]:
     """Each seed's mean over members, of one sub-goal or of all."""
     goals = [sub_goal] if sub_goal else DOMAIN.sub_goals
-    return np.array([np.mean([of[goal].mean() for goal in goals]) for of in found[key].values()])
+    return np.array([np.mean([members[goal].mean() for goal in goals]) for members in numbers[key].values()])
 
 
-def picked(found: Found, method: str, step: int) -> NDArray[np.float64]:
+def picked(numbers: Found, method: str, step: int) -> NDArray[np.float64]:
     """Each seed's mean over sub-goals on new layouts, of the member that is best on those trained on."""
-    trained, new = (found[method, step, where] for where in WHERE)
+    trained, new = (numbers[method, step, where] for where in WHERE)
     return np.array(
         [np.mean([new[seed][goal][int(np.argmax(trained[seed][goal]))] for goal in DOMAIN.sub_goals]) for seed in new]
     )
@@ -160,14 +163,14 @@ def picked(found: Found, method: str, step: int) -> NDArray[np.float64]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    within, wrong, speed = (read(path, name) for name in ("within_2", "wrong_yes", "steps_per_second"))
-    steps = {method: sorted({step for of, step, _ in within if of == method}) for method in METHODS}
-    there = [method for method in METHODS if steps[method]]
+    within, wrong = read(path, "within_2"), read(path, "wrong_yes")
+    steps = {method: sorted({step for name, step, _ in within if name == method}) for method in METHODS}
+    methods = [method for method in METHODS if steps[method]]
     yield f"Zero-shot success within twice the shortest path (wanted: {GOAL}), mean member, mean over five sub-goals;"
     yield "Student's 95 % interval over seeds. Picked: the member that is best on layouts trained on."
     yield ""
     yield from table(
-        ["options", "steps", "trained layouts", "**new layouts**", "picked", "false positives", "steps/s", "seeds"],
+        ["options", "steps", "trained layouts", "**new layouts**", "picked", "false positives", "seeds"],
         (
             [
                 METHODS[method][0],
@@ -175,22 +178,21 @@ def tables(path: Path) -> Iterator[str]:
                 *(interval(of_seeds(within, (method, step, where)), 2) for where in WHERE),
                 interval(picked(within, method, step), 2),
                 interval(of_seeds(wrong, (method, step, "new")), 2),
-                f"{of_seeds(speed, (method, step, 'new')).mean():,.0f}",
                 str(len(within[method, step, "new"])),
             ]
-            for method in there
-            for step in steps[method]
+            for method in methods
+            for step in steps[method][-LOOKS_SHOWN:]
         ),
     )
     yield "By sub-goal, new layouts, the last look: within twice the shortest path / false positive, mean member."
     yield ""
-    last = [(method, steps[method][-1], "new") for method in there]
+    last = [(method, steps[method][-1], "new") for method in methods]
 
     def both(key: tuple[str, int, str], goal: str) -> str:
-        return " / ".join(f"{of_seeds(of, key, goal).mean():.2f}" for of in (within, wrong))
+        return " / ".join(f"{of_seeds(numbers, key, goal).mean():.2f}" for numbers in (within, wrong))
 
     yield from table(
-        ["sub-goal", *(METHODS[method][0] for method in there)],
+        ["sub-goal", *(METHODS[method][0] for method in methods)],
         ([goal, *(both(key, goal) for key in last)] for goal in DOMAIN.sub_goals),
     )
 

@@ -1,4 +1,4 @@
-"""Where a member should say yes, without a label of another layout: rules for thresholds, compared on DoorKey.
+"""Above which threshold to predict positive, without labels of another layout: rules compared on DoorKey.
 
     python -m studies.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-101
     python -m studies.thresholds docs/results/thresholds-doorkey.csv --layouts test --seeds 0-4
@@ -40,14 +40,15 @@ KEYS = ("layouts", "method", "sub_goal", "seed", "step", "member")
 
 
 def base_rate(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> float:
-    """As many unlabelled states get a yes as labelled ones have: the share of positives is the same elsewhere."""
+    """Predict positive on as large a share of the unlabelled states as of the labelled ones."""
     return float(np.quantile(unlabelled, len(negatives) / (len(positives) + len(negatives)), method="higher"))
 
 
 def adjusted(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> float:
     """Saerens et al. (2002): the share of positives that the unlabelled probabilities are most likely under, by EM.
 
-    Members are trained on batches half of which are positive. A yes is what is likelier than not under that share.
+    Members are trained on batches half of which are positive. A prediction is positive if
+    it is likelier than not under that share.
     """
     share = 0.5
     for _ in range(1_000):
@@ -86,13 +87,13 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
     rows: list[Row] = []
 
     def look(step: int, ensemble: Ensemble) -> None:
-        own, elsewhere, heldout = (
+        labelled, elsewhere, heldout = (
             ensemble.predict(states.observations).astype(np.float64)
             for states in (data.labelled, data.unlabelled, data.heldout)
         )
         for member in range(len(ensemble)):
             place = dict(zip(KEYS, (layouts, method, sub_goal, seed, step, member), strict=True))
-            seen = (own[labels, member], own[~labels, member], elsewhere[:, member])
+            seen = (labelled[labels, member], labelled[~labels, member], elsewhere[:, member])
             thresholds = np.array([rule(*seen) for rule in RULES.values()])
             scores = member_scores(heldout[:, [member]] > np.minimum(thresholds, np.nextafter(1, 0)), truth)
             best = best_threshold(heldout[:, [member]].astype(np.float32), truth)[1]
@@ -131,7 +132,7 @@ def tables(path: Path) -> Iterator[str]:
                     title,
                     f"{by_seed(choice, rule).mean():.3f}",
                     interval(by_seed(test, rule)),
-                    *(interval(by_seed(test, rule, *cell)) for cell in cells.values()),
+                    *(f"{by_seed(test, rule, *cell).mean():.3f}" for cell in cells.values()),
                 ]
                 for title, rule in rules.items()
             ),

@@ -122,22 +122,24 @@ def text_of(agent: str, settings: Settings) -> str:
 def run_trial(agent: str, trial: int, steps: int) -> list[Row]:
     """Train on each layout; what the training episodes were like."""
     chosen = settings_of(agent, trial)
-    about = {"agent": agent, "trial": trial, "step": steps, "settings": text_of(agent, chosen)}
-    return tried(chosen, steps, about)
+    columns = {"agent": agent, "trial": trial, "step": steps, "settings": text_of(agent, chosen)}
+    return tried(chosen, steps, columns)
 
 
 def run_bonus(trial: int, chosen: Settings, work: Path) -> list[Row]:
-    """PPO with its best setting and a bonus for the first yes of each member of the ensemble in ``work``."""
-    about = {"agent": BONUS, "trial": trial, "step": LONG, "settings": f"bonus={BONUSES[trial]}"}
+    """PPO with its best setting and a bonus for each member's first positive prediction."""
+    columns = {"agent": BONUS, "trial": trial, "step": LONG, "settings": f"bonus={BONUSES[trial]}"}
     ensemble = work / "ensemble"
     if not ensemble.exists():
         collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), work / "data.h5", quiet=True)  # held-out ones nobody looks at
         config = TrainEnsembleConfig(diversity="dbat", members=3, workers=1)
         train_ensemble(work / "data.h5", config, ensemble, seed=4000, quiet=True)
-    return tried(chosen, LONG, about, BONUSES[trial], open_artefact(ensemble, "ensemble"))
+    return tried(chosen, LONG, columns, BONUSES[trial], open_artefact(ensemble, "ensemble"))
 
 
-def tried(chosen: Settings, steps: int, about: Row, bonus: float = 0.0, ensemble: Artefact | None = None) -> list[Row]:
+def tried(
+    chosen: Settings, steps: int, columns: Row, bonus: float = 0.0, ensemble: Artefact | None = None
+) -> list[Row]:
     """A row of each layout: ``about``, and what training there was like."""
     prepare()
     rows = []
@@ -150,11 +152,13 @@ def tried(chosen: Settings, steps: int, about: Row, bonus: float = 0.0, ensemble
             paid = Bonus(members.of, members.options, engine.count, bonus, members)
         env = EngineEnv(engine, paid)
         train(env, chosen, steps, SEEDS[steps])
-        rows.append({**about, "layout": layout, **told(env, steps), "seconds": time.process_time() - begun})
+        rows.append(
+            {**columns, "layout": layout, **training_numbers(env, steps), "seconds": time.process_time() - begun}
+        )
     return rows
 
 
-def told(env: EngineEnv, steps: int) -> Row:
+def training_numbers(env: EngineEnv, steps: int) -> Row:
     """The share of all episodes that were solved, and the step of the first; where none was, the last step."""
     solved = [bool(row[4]) for row in env.episodes]
     first = next((row[0] for row in env.episodes if row[4]), steps)
@@ -166,11 +170,11 @@ Found = dict[tuple[str, int], dict[int, list[dict[str, str]]]]  # by agent and s
 
 def read(path: Path) -> Found:
     """The trials there are."""
-    found: Found = {}
+    search: Found = {}
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            found.setdefault((row["agent"], int(row["step"])), {}).setdefault(int(row["trial"]), []).append(row)
-    return found
+            search.setdefault((row["agent"], int(row["step"])), {}).setdefault(int(row["trial"]), []).append(row)
+    return search
 
 
 def mean(rows: list[dict[str, str]], name: str) -> float:
@@ -183,41 +187,41 @@ def rank(trials: Mapping[int, list[dict[str, str]]]) -> list[int]:
     return sorted(trials, key=lambda trial: (-mean(trials[trial], "solved"), mean(trials[trial], "first"), trial))
 
 
-def finalists(found: Found, agent: str) -> list[int]:
+def finalists(search: Found, agent: str) -> list[int]:
     """The best of the short trials, and number 0."""
-    return sorted({0, *rank(found[agent, SHORT])[:FINALISTS]})
+    return sorted({0, *rank(search[agent, SHORT])[:FINALISTS]})
 
 
-def over(found: Found, agent: str) -> bool:
+def over(search: Found, agent: str) -> bool:
     """Whether the search for an agent's settings came to its end."""
-    short = len(found.get((agent, SHORT), {})) >= TRIALS
-    return short and found.get((agent, LONG), {}).keys() >= set(finalists(found, agent))
+    short = len(search.get((agent, SHORT), {})) >= TRIALS
+    return short and search.get((agent, LONG), {}).keys() >= set(finalists(search, agent))
 
 
-def best(found: Found, agent: str) -> int:
+def best(search: Found, agent: str) -> int:
     """The trial that is called tuned: the one by hand until the search is over."""
-    return rank(found[agent, LONG])[0] if over(found, agent) else 0
+    return rank(search[agent, LONG])[0] if over(search, agent) else 0
 
 
-def best_bonus(found: Found) -> float:
+def best_bonus(search: Found) -> float:
     """What Figure 6 pays."""
-    return BONUSES[rank(found[BONUS, LONG])[0]]
+    return BONUSES[rank(search[BONUS, LONG])[0]]
 
 
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
-    found = read(path)
+    search = read(path)
     where = f"{SHORT:,} steps on each of {len(LAYOUTS)} layouts"
     yield f"Short trials, {where}: share of episodes solved, mean over layouts."
     yield ""
     yield from table(
         ["", "trials", "some success", "best", "median", "by hand (0)", "core minutes, long ones too"],
-        (_round(found, agent) for agent in AGENTS if (agent, SHORT) in found),
+        (_round(search, agent) for agent in AGENTS if (agent, SHORT) in search),
     )
     for agent in AGENTS:
-        if not over(found, agent):
+        if not over(search, agent):
             continue
-        long = found[agent, LONG]
+        long = search[agent, LONG]
         yield f"{AGENTS[agent]}, {LONG:,} steps, the best first."
         yield ""
         yield from table(
@@ -225,18 +229,18 @@ def tables(path: Path) -> Iterator[str]:
             (
                 [
                     f"{trial} (by hand)" if not trial else str(trial),
-                    str(1 + rank(found[agent, SHORT]).index(trial)),
+                    str(1 + rank(search[agent, SHORT]).index(trial)),
                     *_numbers(long[trial]),
                     long[trial][0]["settings"],
                 ]
                 for trial in rank(long)
             ),
         )
-    if (BONUS, LONG) not in found:
+    if (BONUS, LONG) not in search:
         return
-    none = best(found, "ppo")
-    paid = [("none", found["ppo", LONG][none])]
-    paid += [(str(BONUSES[trial]), rows) for trial, rows in sorted(found[BONUS, LONG].items())]
+    none = best(search, "ppo")
+    paid = [("none", search["ppo", LONG][none])]
+    paid += [(str(BONUSES[trial]), rows) for trial, rows in sorted(search[BONUS, LONG].items())]
     yield f"PPO's best setting (trial {none}), {LONG:,} steps, a bonus for each member's first positive in an episode."
     yield ""
     yield from table(
@@ -245,13 +249,13 @@ def tables(path: Path) -> Iterator[str]:
     )
 
 
-def _round(found: Found, agent: str) -> list[str]:
-    trials = found[agent, SHORT]
+def _round(search: Found, agent: str) -> list[str]:
+    trials = search[agent, SHORT]
     scores = {trial: mean(rows, "solved") for trial, rows in trials.items()}
     seconds = sum(
         float(row["seconds"])
         for step in (SHORT, LONG)
-        for rows in found.get((agent, step), {}).values()
+        for rows in search.get((agent, step), {}).values()
         for row in rows
     )
     some = sum(score > 0 for score in scores.values())

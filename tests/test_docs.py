@@ -62,11 +62,11 @@ class Sources(HTMLParser):
         self.found: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = dict(attrs)
+        attributes = dict(attrs)
         if tag in ("script", "img", "iframe"):
-            self.found.append(given.get("src") or "")
-        if tag == "link" and given.get("rel") in ("stylesheet", "icon", "preload", "preconnect"):
-            self.found.append(given.get("href") or "")
+            self.found.append(attributes.get("src") or "")
+        if tag == "link" and attributes.get("rel") in ("stylesheet", "icon", "preload", "preconnect"):
+            self.found.append(attributes.get("href") or "")
 
 
 def test_the_site_builds_and_needs_no_network(site: Path) -> None:
@@ -117,7 +117,7 @@ def test_the_other_pages_name_commands_that_are_there() -> None:
 
     from hypogoal.cli import app
 
-    known = get_command(app).commands  # type: ignore[attr-defined]
+    ours = get_command(app).commands  # type: ignore[attr-defined]
     seen = 0
     for page in (*DOCS.rglob("*.md"), ROOT / "README.md"):
         for words in commands(page):
@@ -125,9 +125,9 @@ def test_the_other_pages_name_commands_that_are_there() -> None:
                 continue
             assert words[0] in ("hypogoal", "python"), (page.name, words)
             if words[0] == "hypogoal":
-                options = {name for option in known[words[1]].params for name in option.opts}
-                given = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
-                assert given <= options, (page.name, words)
+                options = {name for option in ours[words[1]].params for name in option.opts}
+                used = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
+                assert used <= options, (page.name, words)
                 seen += 1
     assert seen > 20
 

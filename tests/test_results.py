@@ -1,7 +1,8 @@
 """Published tables are drawn from the committed cells (Spec F5)."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -46,16 +47,22 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_tables_are_those_of_the_cells(name: str) -> None:
-    """Every line of every table stands on the page, and the page has no other."""
-    cells = RESULTS / f"{name}.csv"
-    drawn = [line for line in PAGES[name](cells) if line.startswith("|")] if cells.exists() else []
-    page = (RESULTS / f"{name}.md").read_text(encoding="utf-8")
-    assert drawn == [line for line in page.splitlines() if line.startswith("|")]
+def test_the_table_of_a_page_is_drawn_from_its_cells(name: str) -> None:
+    """A page shows one whole table of those that its study prints, Figure 3 one for each N."""
+    printed = tables_in(PAGES[name](RESULTS / f"{name}.csv"))
+    shown = tables_in((RESULTS / f"{name}.md").read_text(encoding="utf-8").splitlines())
+    assert len(shown) == 1 or name == "figure3-ladders"
+    assert all(table in printed for table in shown)
+
+
+def tables_in(lines: Iterable[str]) -> list[list[str]]:
+    """The tables among lines of Markdown, each as its lines."""
+    blocks = groupby(lines, key=lambda line: line.startswith("|"))
+    return [list(block) for is_table, block in blocks if is_table]
 
 
 def test_no_page_has_a_table_without_cells() -> None:
-    """What nothing redraws is told in sentences; the first page's tables are taken from the others."""
+    """Numbers that no study can redraw stand in sentences; the first page's tables are taken from the others."""
     with_tables = {page.stem for page in RESULTS.glob("*.md") if "\n|" in page.read_text(encoding="utf-8")}
     assert with_tables == {"index", *PAGES}
 
@@ -67,10 +74,12 @@ def test_tables_of_the_readme_and_the_first_page_have_the_numbers_of_the_pages()
     tables = 0
     for section in (*first.split("\n## ")[2:], readme + " ".join(f"({name}.md)" for name in PAGES)):  # not the claims
         pages = {name for name in PAGES if f"({name}.md)" in section}
-        known = {number for name in pages for number in _numbers((RESULTS / f"{name}.md").read_text(encoding="utf-8"))}
-        tables += bool(said := _numbers(section))
-        assert said <= known, section.partition("\n")[0]
-    assert tables >= 5
+        published = {
+            number for name in pages for number in _numbers((RESULTS / f"{name}.md").read_text(encoding="utf-8"))
+        }
+        tables += bool(shown := _numbers(section))
+        assert shown <= published, section.partition("\n")[0]
+    assert tables >= 4
 
 
 def _numbers(text: str) -> set[str]:
@@ -107,13 +116,13 @@ def test_agents_of_figure_6_are_told_apart() -> None:
 
 def test_tuned_is_what_the_search_found() -> None:
     """By its rule, from the cells; the drawn settings are those that ran, and Figure 6 pays the best bonus."""
-    found = tuning.read(RESULTS / "tuning-baselines.csv")
+    trials = tuning.read(RESULTS / "tuning-baselines.csv")
     for agent in tuning.AGENTS:
-        for trial, rows in found[agent, tuning.SHORT].items():
+        for trial, rows in trials[agent, tuning.SHORT].items():
             assert {row["settings"] for row in rows} == {tuning.text_of(agent, tuning.settings_of(agent, trial))}
-        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(found, agent))
+        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(trials, agent))
     figure = (RESULTS.parents[1] / "examples" / "figure6.py").read_text(encoding="utf-8")
-    assert re.findall(r"bonus=([\d.]+)", figure) == [str(tuning.best_bonus(found))]
+    assert re.findall(r"bonus=([\d.]+)", figure) == [str(tuning.best_bonus(trials))]
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
