@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from hypogoal.evaluation.table import Pairs, Row
 
 Block = dict[str, Any]
+WIDTH = 79  # of tables in a terminal
 Entry = Mapping[str, Any]
 # What a browser may do with the page. Attributes of style are matplotlib's; they run and fetch nothing.
 POLICY = (
@@ -171,7 +172,7 @@ def table(
 def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
     """The same table for a terminal, 79 columns wide; a line between groups of rows."""
     drawn = table(columns, entries)
-    printed = Table(title=title, title_justify="left", width=79)
+    printed = Table(title=title, title_justify="left", width=WIDTH)
     for column in columns:
         if column.number:
             printed.add_column(column.title, justify="right", no_wrap=True)
@@ -361,8 +362,10 @@ def _between(bounds: Sequence[float | None], digits: int) -> str:
     return "" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
-    """Sections as one HTML file that needs nothing else.
+def draw_page(
+    title: str, subtitle: str, sections: Sequence[Block], version: str, lead: Mapping[str, Any] | None = None
+) -> str:
+    """Sections as one HTML file that needs nothing else; ``lead``: task, verdict and baselines above them all.
 
     Every text in it is escaped but our own style and script and what matplotlib drew; should a text of a file ever slip
     through, the page's policy still lets nothing run and nothing be fetched.
@@ -380,6 +383,7 @@ def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str
         css=css,
         script=script,
         sections=sections,
+        lead=lead or {},
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
 
