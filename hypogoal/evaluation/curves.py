@@ -352,13 +352,8 @@ def sections(material: Material) -> list[Block]:
 
 
 def summary_section(material: Material) -> Block:
-    """The question, a film, curves, and the headline numbers."""
+    """Curves, and the headline numbers."""
     metrics = material.metrics
-    question = (
-        "The question: each sub-goal is known from one context. Each member of an ensemble is a hypothesis about it "
-        "and becomes an option. Does a policy over all these options solve layouts that no data came from, and does it "
-        "choose the hypotheses that are true there?"
-    )
     headline = page.table(
         (AGENT, *HEADLINE),
         metrics["agents"],
@@ -370,9 +365,9 @@ def summary_section(material: Material) -> Block:
         "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
-    row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": ""}
+    row = {"kind": "row", "blocks": drawn}
     blocks = [row, headline] if drawn else []
-    return page.section("summary", "Summary", [question], blocks, metrics["missing"])
+    return page.section("summary", "Summary", [], blocks, metrics["missing"])
 
 
 def runs_of(agent: Entry) -> str:

@@ -365,7 +365,7 @@ def _between(bounds: Sequence[float | None], digits: int) -> str:
 def draw_page(
     title: str, subtitle: str, sections: Sequence[Block], version: str, lead: Mapping[str, Any] | None = None
 ) -> str:
-    """Sections as one HTML file that needs nothing else; ``lead``: task, verdict and baselines above them all.
+    """Sections as one HTML file that needs nothing else; ``lead``: task, verdict, baselines and films above.
 
     Every text in it is escaped but our own style and script and what matplotlib drew; should a text of a file ever slip
     through, the page's policy still lets nothing run and nothing be fetched.

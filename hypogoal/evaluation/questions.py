@@ -74,6 +74,8 @@ def render(material: Material, version: str) -> str:
         "task": " ".join(metrics.get("verdict", {}).get("task", [])),
         "verdict": verdict.verdict(metrics),
         "baselines": verdict.baselines(metrics),
+        "question": verdict.ASKED if material.of_agents() else "",
+        "films": material.films,
     }
     return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version, lead)
 

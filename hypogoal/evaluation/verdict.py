@@ -18,7 +18,7 @@ from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM
 from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name
-from hypogoal.evaluation.numbers import Metrics, by_unit, compare_pairs, grouped, mean_of
+from hypogoal.evaluation.numbers import ORACLE, Metrics, by_unit, compare_pairs, grouped, mean_of
 from hypogoal.evaluation.page import Question, listed, percent
 from hypogoal.evaluation.table import Row, select
 
@@ -30,6 +30,11 @@ BETTER, WORSE, ALIKE, UNDECIDED = "better", "worse", "alike", "undecided"
 CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a finding is about
 OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "hsic": "HSIC"}
 ONE = "one classifier"
+ASKED = (
+    "Each sub-goal is known from one context, and each member of an ensemble is a hypothesis about it that becomes an "
+    "option. Does a policy over all these options solve layouts that no data came from, and does it choose the "
+    "hypotheses that hold there?"
+)
 
 
 @dataclass(frozen=True)
@@ -262,7 +267,8 @@ def _of_options(metrics: Metrics) -> Iterator[str]:
     of_method = grouped(metrics["distance"]["options"], lambda entry: str(entry["method"]))
     for name, entries in of_method.items():
         shares = [entry["options"][entry["validated"] or 0]["reached_base"] for entry in entries]
-        yield f"Options of {ensemble_called(name)} stop at the base in {percent(mean_of(shares))} of their executions."
+        options = "Options that end at true sub-goals" if name == ORACLE else f"Options of {ensemble_called(name)}"
+        yield f"{options} stop at the base in {percent(mean_of(shares))} of their executions."
     if of_method:
         yield "Whether hypotheses mattered is unknown: the run has no options of one classifier to compare with."
 
