@@ -1,6 +1,6 @@
 """Which artefacts of a run are out of date, why, and the commands that renew them, for ``hypogoal status``.
 
-An artefact is stale if an input is gone, was changed or is stale itself, if its own files were changed, or if the preset
+An artefact is stale if an input is gone, was changed or is stale itself, if its files were changed, or if the preset
 file that its command names was edited since. An evaluation is stale, too, if the run got an artefact that it lacks.
 """
 
@@ -14,7 +14,6 @@ from pathlib import Path
 
 from hypogoal.core.artefacts import Artefact, check_files, find_input, open_artefact
 from hypogoal.core.config import preset_digest
-from hypogoal.core.errors import UserError
 from hypogoal.inspection import parts_of
 
 EVALUATION = "evaluation"
@@ -98,7 +97,7 @@ def _of_presets(artefact: Artefact) -> Iterator[str]:
 
 
 def _since(artefact: Artefact, artefacts: Mapping[Path, Artefact]) -> Iterator[str]:
-    """Of an evaluation the artefacts of its run that it does not know; options that an agent continues are part of it."""
+    """Of an evaluation the artefacts of its run that it lacks; options that an agent continues are part of that one."""
     if artefact.kind != EVALUATION:
         return
     known, run = {*_places(artefact)}, artefact.path.parent.resolve()

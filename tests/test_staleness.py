@@ -30,7 +30,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     made = tmp_path / "before"
     make(made, "ensemble", "ensemble", command="hypogoal train-ensemble data.h5 --out before/ensemble")
     make(made, "options", "options", "ensemble", command=f"hypogoal train-options {made}/ensemble --out before/options")
-    make(made, "meta", "meta", "ensemble", "options")
+    make(made, "meta", "meta", "ensemble", "options", command="hypogoal.train_meta()")
     make(made, "evaluation", "evaluation", "ensemble", "meta", command="hypogoal evaluate before")
     return made.rename(tmp_path / "run")
 
