@@ -109,6 +109,8 @@ def test_the_tutorial_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     for block in blocks(DOCS / "tutorial.md", "python"):
         exec(compile(block, "tutorial.md", "exec"), {})
     assert (tmp_path / "runs/tutorial/report/index.html").is_file()
+    for block in blocks(ROOT / "README.md", "python"):
+        exec(compile(block.replace("runs/demo", "runs/tutorial"), "README.md", "exec"), {})
 
 
 def test_the_other_pages_name_commands_that_are_there() -> None:

@@ -229,6 +229,10 @@ def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["make", *arguments], cwd=folder, env=environment, capture_output=True, text=True)
 
 
+def test_the_readme_is_short() -> None:
+    assert len(readme().split()) <= 700
+
+
 def test_readme_commands_exist() -> None:
     """Every ``make X`` and ``hypogoal X`` of the README is a target of the Makefile or a command of the program."""
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))

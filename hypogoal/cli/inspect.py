@@ -57,6 +57,16 @@ def verify(path: Made, as_json: cli.AsJson = False) -> None:
         raise typer.Exit(2)
 
 
+@cli.command(cli.LOOK, "status runs/mine")
+def status(path: Annotated[Path, Argument(help="A run.")], as_json: cli.AsJson = False) -> None:
+    """Say which artefacts are stale, why, and which commands renew them."""
+    from hypogoal.staleness import lines, states_of
+
+    states = states_of(path)
+    details = [{"path": str(each.path), "reasons": each.reasons, "command": each.command} for each in states]
+    cli.echo(details, as_json, lines(states))
+
+
 @cli.command(cli.LOOK, "watch runs/mine")
 def watch(
     run: Annotated[Path, Argument(help="A run, finished or not.")],

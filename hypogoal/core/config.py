@@ -13,8 +13,9 @@ import math
 import os
 import re
 import typing
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -79,6 +80,14 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
     if not isinstance(values, dict):
         raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
     return values
+
+
+def preset_digests(commands: Iterable[Sequence[str]]) -> dict[str, str]:
+    """The preset files that commands name, as ``--preset FILE`` or ``--preset=FILE``, each with its digest."""
+    words = [word for command in commands for option in command for word in option.split("=", 1)]
+    named = {value for option, value in pairwise(words) if option == "--preset" and value.endswith(".toml")}
+    files = map(os.path.abspath, named)
+    return {path: preset_digest(path) for path in sorted(files)}
 
 
 def preset_digest(path: str) -> str:

@@ -378,6 +378,13 @@ class Domain(ABC):
         checked: Any = from_values(self.config_class, values, "collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
+    def task(self, world: Mapping[str, Any]) -> str:
+        """What is rewarded and what ends an episode, in a sentence or two for people.
+
+        ``world``: as of :meth:`world`; settings that it lacks have their defaults.
+        """
+        return f"The reward and the end of an episode are those of the domain '{self.name}'."
+
     def shortened(self, config: Any, steps: int) -> Any:
         """The settings with which ``check`` collects a slow domain in about ``steps``; needs ``collected_steps``."""
         return config

@@ -5,7 +5,7 @@ See also ``doorkey_env`` (the Gymnasium environment and the sub-goals) and ``doo
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -145,6 +145,11 @@ class DoorKeyDomain(Domain):
         where = f"labelled_seed={config.labelled_seed}, keyring={config.keyring}"
         require_classes(training.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or keyring=true.")
         return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, training, others, test)
+
+    def task(self, world: Mapping[str, Any]) -> str:
+        ends = world.get("wrong_key") == "ends"
+        keys = "the blue or the green key ends the episode" if ends else "the blue and the green key open nothing"
+        return f"Take the red key, open the red door and reach the goal behind it, for a reward of 1; {keys}."
 
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = env.MAX_STEPS, **arguments: Any

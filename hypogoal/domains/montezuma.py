@@ -238,6 +238,9 @@ class MontezumaDomain(Domain):
         """
         return MontezumaEngine(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
 
+    def task(self, world: Mapping[str, Any]) -> str:
+        return "Climb down a ladder to its base; options begin at its top, and a lost life ends the episode."
+
     def rooms_of(self, start: str) -> tuple[int, ...]:
         """The rooms of a ladder, from its top to its base."""
         ladder = ladder_named(start)

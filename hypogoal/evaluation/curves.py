@@ -334,13 +334,8 @@ def sections(material: Material) -> list[Block]:
 
 
 def summary_section(material: Material) -> Block:
-    """What was asked, what came out."""
+    """Curves, and the headline numbers."""
     metrics = material.metrics
-    question = (
-        "The question: each sub-goal is known from one context. Each member of an ensemble is a hypothesis about it "
-        "and becomes an option. Does a policy over all these options solve layouts that no data came from, and does it "
-        "choose the hypotheses that are true there?"
-    )
     headline = page.table(
         (AGENT, *HEADLINE),
         metrics["agents"],
@@ -348,58 +343,9 @@ def summary_section(material: Material) -> Block:
         caption=f"{HEADLINE_CAPTION}; steps of train-options count.",
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
-    row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": question}
+    row = {"kind": "row", "blocks": drawn}
     blocks = [row, headline] if drawn else []
-    return page.section("summary", "Summary", _answers(material), blocks, metrics["missing"])
-
-
-def _answers(material: Material) -> list[str]:
-    """What came out: a paragraph for each variant of the option agent, with its name where there are several.
-
-    Where no such agent was trained, one for each that was.
-    """
-    agents = material.metrics["agents"]
-    shown = variants(agents)
-    if not shown:
-        return [f"No policy over options was trained. {_achieved(agent, agent['name'])}" for agent in agents]
-    paragraphs = []
-    for agent in shown:
-        text = _achieved(agent, f"the agent '{agent['name']}'" if len(shown) > 1 else "the option agent")
-        if len(shown) == 1:
-            text += "".join(f" {_briefly(other)}" for other in material.metrics["agents"] if other is not agent)
-        for entry in (entry for entry in material.metrics["choosing"] if entry["name"] == agent["name"]):
-            solved = [page.percent(numbers["success"]["mean"]) for numbers in (entry, entry["uniform"])]
-            form = " Without further training it solves {}; uniform-random choice among its options {}."
-            text += form.format(*solved)
-        if len(agent["runs"]) < SEVERAL and len(shown) == 1:
-            text += " So few runs decide nothing: run more seeds and layouts."
-        paragraphs.append(text)
-    return paragraphs
-
-
-def _achieved(agent: Mapping[str, Any], name: str) -> str:
-    success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
-    if success is None:
-        return f"No episode of {name} came to its end ({runs_of(agent)}): it needs more steps."
-    against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
-    return (
-        f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
-        f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
-    )
-
-
-def _briefly(agent: Entry) -> str:
-    """The same of another agent."""
-    success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
-    outcome = "no episode ended" if success is None else f"{page.percent(success)}, {steps} steps"
-    return f"{agent['name'][0].upper()}{agent['name'][1:]}: {outcome}."
-
-
-def _episodes(agent: Mapping[str, Any]) -> str:
-    """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
-    windows = sorted({run["window"] for run in agent["runs"] if run["window"]})
-    count = f"{windows[0]} to {windows[-1]}" if len(windows) > 1 else str(windows[0])
-    return f"{count} training episode{'s' if windows[-1] > 1 else ''}"
+    return page.section("summary", "Summary", [], blocks, metrics["missing"])
 
 
 def runs_of(agent: Entry) -> str:

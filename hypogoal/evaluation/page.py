@@ -28,6 +28,7 @@ from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 from hypogoal.evaluation.table import Pairs, Row
 
 Block = dict[str, Any]
+WIDTH = 79  # of tables in a terminal
 Entry = Mapping[str, Any]
 # What a browser may do with the page. Attributes of style are matplotlib's; they run and fetch nothing.
 POLICY = (
@@ -167,7 +168,7 @@ def table(
 
 def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
     """The same table for a terminal, 79 columns wide; a line between groups of rows."""
-    printed = Table(title=title, title_justify="left", width=79)
+    printed = Table(title=title, title_justify="left", width=WIDTH)
     for column in columns:
         how: dict[str, Any] = (
             {"justify": "right", "no_wrap": True} if column.number else {"ratio": 1, "overflow": "fold"}
@@ -354,8 +355,10 @@ def _between(bounds: Sequence[float | None], digits: int) -> str:
     return "" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
-    """Sections as one HTML file that needs nothing else.
+def draw_page(
+    title: str, subtitle: str, sections: Sequence[Block], version: str, lead: Mapping[str, Any] | None = None
+) -> str:
+    """Sections as one HTML file that needs nothing else; ``lead``: task, verdict, baselines and films above.
 
     Every text is escaped but our own style and script and matplotlib's drawings; the page's policy lets nothing else
     run or be fetched.
@@ -373,6 +376,7 @@ def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str
         css=css,
         script=script,
         sections=sections,
+        lead=lead or {},
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
 

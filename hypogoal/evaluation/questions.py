@@ -18,14 +18,18 @@ from hypogoal.evaluation import (
     rooms,
     saliency,
     selection,
+    verdict,
     zero_shot,
 )
 from hypogoal.evaluation.numbers import Metrics
-from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed, packaged
+from hypogoal.evaluation.page import WIDTH, Drawn, Material, Question, draw_page, listed, packaged
 from hypogoal.evaluation.provenance import domains_of, provenance_section
 
 # In the order of the page; the numbers of one are there for those below it.
-PARTS = curves, rooms, distance, exploits, hypotheses, ranking, explorer, saliency, selection, choosing, zero_shot
+PARTS = (
+    *(curves, rooms, distance, exploits, hypotheses, ranking, explorer, saliency, selection, choosing, zero_shot),
+    verdict,
+)
 QUESTIONS: list[Question] = [part.QUESTION for part in PARTS]
 
 
@@ -42,8 +46,8 @@ def meanings() -> dict[str, dict[str, str]]:
     return {name: {"unit": unit, "meaning": meaning} for name, (unit, meaning) in quantities.items()}
 
 
-def summary_table(metrics: Metrics) -> Table | Group:
-    """The headline numbers of a run, mean over seeds; at most 80 columns wide.
+def summary_table(metrics: Metrics) -> Group:
+    """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide.
 
     A table for each kind of thing that there is: ensembles, options on ladders, agents.
     """
@@ -51,7 +55,11 @@ def summary_table(metrics: Metrics) -> Table | Group:
     if metrics["missing"]:
         last = tables[-1]
         last.caption, last.caption_justify = f"In this run: {'; '.join(metrics['missing'])}.", "left"
-    return tables[0] if len(tables) == 1 else Group(*tables)
+    sentences = Table.grid()
+    sentences.width = WIDTH
+    for sentence in verdict.verdict(metrics):
+        sentences.add_row(sentence)
+    return Group(*tables, sentences)
 
 
 def render(material: Material, version: str) -> str:
@@ -62,7 +70,14 @@ def render(material: Material, version: str) -> str:
     subtitle = f"{listed(domains_of(metrics))}; {evaluated}; hypogoal {version}"
     sections = [section for question in QUESTIONS for section in question.sections(material)]
     sections.sort(key=itemgetter("folded"))  # what is open comes first
-    return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version)
+    lead = {
+        "task": " ".join(metrics.get("verdict", {}).get("task", [])),
+        "verdict": verdict.verdict(metrics),
+        "baselines": verdict.baselines(metrics),
+        "question": verdict.ASKED if material.of_agents() else "",
+        "films": material.films,
+    }
+    return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version, lead)
 
 
 def paper_figures(material: Material) -> tuple[list[Drawn], list[str]]:

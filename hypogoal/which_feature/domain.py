@@ -141,6 +141,16 @@ class RoomsDomain(Domain):
         )
         return Collected(self.observation_shape, SUB_GOALS, labelled, unlabelled, heldout)
 
+    def task(self, world: Mapping[str, Any]) -> str:
+        settings = RoomsConfig(**world)
+        others = [name for name in settings.factors if name != settings.truth]
+        rivals = f"{', '.join(others)} always {'agrees' if len(others) == 1 else 'agree'} with it"
+        return (
+            f"Enter one of {settings.rooms} rooms; only one is right and gives a reward of 1: the room where "
+            f"{states.MEANINGS[settings.truth]} ({settings.truth}). "
+            f"In the labelled states {rivals}; in these rooms not."
+        )
+
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
         settings = {name: arguments.get(name, getattr(RoomsConfig(), name)) for name in self.engine_settings}
         return RoomsEngine(layout_seed, count, max_steps, **settings)

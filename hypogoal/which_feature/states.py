@@ -15,6 +15,13 @@ from hypogoal.core.seeding import rng_for
 FACTORS = ("colour", "shape", "place", "count")
 MOVED = "moved"  # needs two frames
 KNOWN = (*FACTORS, MOVED)
+MEANINGS = {
+    "colour": "the object is blue",
+    "shape": "the object is a ball",
+    "place": "the object is in the right half",
+    "count": "there are three or four boxes",
+    MOVED: "the object has moved",
+}
 INNER, TILE = 4, 8  # free cells per side within the walls; pixels per cell
 SIDE = (INNER + 2) * TILE  # pixels of an image
 CELLS = INNER * INNER
@@ -25,11 +32,7 @@ FLOOR, WALL, AGENT, OBJECT, BOX, GOAL = 0, 1, 2, 6, 10, 13  # index of the first
 
 @dataclass(frozen=True)
 class Scenes:
-    """Scenes and which factors hold in them.
-
-    ``colour``: the object is blue; ``shape``: it is a ball; ``place``: it is in the right half; ``count``: there are
-    three or four boxes; ``moved``: the object was in another cell in the frame before.
-    """
+    """Scenes and which factors hold in them, see ``MEANINGS``; ``moved``: since the frame before."""
 
     observations: NDArray[np.uint8]  # (N, 48, 48, 3); with ``moved`` (N, 48, 48, 6), the frame before and the frame now
     factors: NDArray[np.bool_]  # (N, F), the requested ones; others are drawn evenly

@@ -1,0 +1,303 @@
+"""The first thing on a page: what the task is, and whether hypotheses mattered there, by one rule (Spec F7).
+
+Two comparisons say so: the agent with uniform-random choice among its own options (did choosing matter?), and an agent
+with several members with one that has a single classifier (did hypotheses matter?).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hypogoal.core.artefacts import Artefact
+from hypogoal.core.rounding import DIGITS
+from hypogoal.domains.base import installed_domain
+from hypogoal.evaluation.choosing import FROZEN, UNIFORM
+from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name
+from hypogoal.evaluation.numbers import ORACLE, Metrics, by_unit, compare_pairs, grouped, mean_of
+from hypogoal.evaluation.page import Question, listed, percent
+from hypogoal.evaluation.table import Row, select
+
+if TYPE_CHECKING:
+    from hypogoal.evaluation.judging import Work
+
+MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
+BETTER, WORSE, ALIKE, UNDECIDED = "better", "worse", "alike", "undecided"
+CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a finding is about
+OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "hsic": "HSIC"}
+ONE = "one classifier"
+ASKED = (
+    "Each sub-goal is known from one context, and each member of an ensemble is a hypothesis about it that becomes an "
+    "option. Does a policy over all these options solve layouts that no data came from, and does it choose the "
+    "hypotheses that hold there?"
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Two shares of solved episodes, compared run by run; each layout counts once, or each run of a single layout."""
+
+    subject: str
+    first: str  # of the agent, or of the method
+    second: str  # what it is compared with
+    success: float  # of the first, mean over units
+    other: float  # of the second
+    difference: float  # first - second
+    interval: tuple[float, float]  # Student's 95 % of the difference, cut at -1 and 1; NaN for one unit
+    units: int
+    unit: str  # layout, seed or ladder
+    outcome: str
+
+
+def outcome_of(difference: float, low: float, high: float) -> str:
+    """What a difference of shares says; of one unit, whose bounds are NaN, the difference alone.
+
+    An interval within ``MARGIN`` of 0 is no difference, one above or below 0 is a difference, any other undecided.
+    """
+    if math.isnan(low):
+        low = high = difference
+        return ALIKE if abs(difference) < MARGIN else BETTER if difference > 0 else WORSE
+    if max(abs(low), abs(high)) < MARGIN:
+        return ALIKE
+    return BETTER if low > 0 else WORSE if high < 0 else UNDECIDED
+
+
+def compare(
+    subject: str, first: str, second: str, pairs: Sequence[tuple[Row, Row]], unit: str = "layout"
+) -> Finding | None:
+    """The finding of pairs of rows, each a run's share of solved episodes; None without pairs."""
+    if not pairs:
+        return None
+    places = [row.ladder or row.layout for row, _ in pairs]
+    several = len(set(places)) > 1
+    units = places if several else [row.seed for row, _ in pairs]
+    shares = np.array([[row.value for row in pair] for pair in pairs], np.float64)
+    result = compare_pairs(shares[:, 0], shares[:, 1], units)
+    low, high = (float(np.clip(bound, -1, 1)) for bound in result["difference_interval"])
+    first_mean, second_mean = (mean_of(by_unit(shares[:, column], units)) for column in (0, 1))
+    difference = float(result["difference"])
+    kind = unit if several or result["units"] == 1 else "seed"
+    outcome = outcome_of(difference, low, high)
+    return Finding(
+        subject, first, second, first_mean, second_mean, difference, (low, high), result["units"], kind, outcome
+    )
+
+
+def paired(rows: Iterable[Row], others: Iterable[Row], *fields: str) -> list[tuple[Row, Row]]:
+    """Rows of the first with those of the second that agree in ``fields``."""
+    by_place = {tuple(getattr(row, field) for field in fields): row for row in others}
+    places = ((row, by_place.get(tuple(getattr(row, field) for field in fields))) for row in rows)
+    return [(row, other) for row, other in places if other is not None]
+
+
+def findings(work: Work) -> Iterator[Finding]:
+    """Of every agent that chooses among several members: choosing, and hypotheses against one classifier."""
+    kinds = {name: base_name(runs[0].kind, runs[0].config) for name, runs in work.agents.items()}
+    agents = {name: runs for name, runs in work.agents.items() if kinds[name] in (LEARNED, THOMPSON)}
+    several = [name for name, runs in agents.items() if runs[0].config["members"] > 1]
+    single = [name for name, runs in agents.items() if runs[0].config["members"] == 1]
+    frozen, trained = select(work.rows, quantity="success", scope=FROZEN), at_the_end(work.rows)
+    uniform = select(frozen, method=UNIFORM)
+    learning = [row for name, kind in kinds.items() if kind == RANDOM for row in select(trained, method=name)]
+    for name in several:
+        played, own = select(frozen, method=name), called(agents[name][0])
+        pairs = paired(played, uniform, "artefact") or paired(select(trained, method=name), learning, "layout", "seed")
+        yield from filter(None, [compare(CHOOSING, own, "uniform-random choice", pairs)])
+        for other in single:
+            rows = frozen if played and select(frozen, method=other) else trained
+            pairs = paired(select(rows, method=name), select(rows, method=other), "layout", "seed")
+            yield from filter(None, [compare(HYPOTHESES, own, ONE, pairs)])
+
+
+def at_the_end(rows: Iterable[Row]) -> list[Row]:
+    """Each run's share of solved episodes among its last of training."""
+    return select(rows, quantity="success", scope="", step="", member="")
+
+
+def on_ladders(work: Work) -> Iterator[Finding]:
+    """Of options on ladders: how often the member that validation picks stops at the base, against one classifier."""
+    options = work.metrics["distance"]["options"]
+    rows = [
+        Row(
+            "reached_base",
+            entry["options"][entry["validated"] or 0]["reached_base"],
+            entry["method"],
+            seed=entry["seed"],
+            ladder=entry["ladder"],
+            N=entry["groups"],
+        )
+        for entry in options
+    ]
+    methods = list(dict.fromkeys(row.method for row in rows if row.N is not None))
+    for method in methods:
+        if method != "single CNN":
+            pairs = paired(select(rows, method=method), select(rows, method="single CNN"), "ladder", "seed", "N")
+            yield from filter(None, [compare(OPTIONS, ensemble_called(method), ONE, pairs, "ladder")])
+
+
+def called(run: Run) -> str:
+    """An agent by its ensemble: 'D-BAT, 3 members'."""
+    name = ensemble_called(run.config["ensemble"])
+    return f"{name}, Thompson sampling" if run.config["chooser"] == "thompson" else name
+
+
+def ensemble_called(name: str) -> str:
+    """'dbat, K=3' for people: 'D-BAT, 3 members'."""
+    objective, members, rest = (*name.split(", ", 2), "", "")[:3]
+    if name.startswith("single CNN"):
+        return name.replace("single CNN", ONE)
+    size = members.replace("K=", "") + " members" if members.startswith("K=") else members
+    return ", ".join(filter(None, [OBJECTIVES.get(objective, objective), size, rest]))
+
+
+def tasks(work: Work) -> list[str]:
+    """What every agent of the run has to do, and how long it may take."""
+    sentences = []
+    for name, runs in work.agents.items():
+        config = work.artefact(runs[0].path).config
+        sentences.append(" ".join(filter(None, [task_of(config), cap_of(config, work.agents[name])])))
+    sentences += [task_of(artefact.config) for artefact in work.contents.ladders] if not sentences else []
+    return list(dict.fromkeys(filter(None, sentences)))
+
+
+def task_of(config: Mapping[str, Any]) -> str:
+    """The domain's own words; nothing where it is not installed."""
+    domain = installed_domain(config["domain"]) if config.get("domain") else None
+    return domain.task(domain.world(config.get("domain_config") or {})) if domain else ""
+
+
+def cap_of(config: Mapping[str, Any], runs: Sequence[Run]) -> str:
+    """After how many steps an episode is cut; nothing where each has a single step."""
+    if all((run.episodes.length <= 1).all() for run in runs):
+        return ""
+    shortest = [run.layout.get("shortest_path") for run in runs]
+    if config.get("cap") and all(shortest):
+        caps = sorted({math.ceil(round(config["cap"] * steps, DIGITS)) for steps in shortest})
+        count = str(caps[0]) if len(caps) == 1 else f"{caps[0]} to {caps[-1]}"
+        return f"An episode is cut after {count} steps, {config['cap']:g} times the shortest path."
+    return f"An episode is cut after {config['max_episode_steps']} steps." if config.get("max_episode_steps") else ""
+
+
+def as_in_paper(artefacts: Iterable[Artefact]) -> bool:
+    """Whether the task is one of the paper's: DoorKey with harmless keys and no cap, or ladders."""
+    configs = [artefact.config for artefact in artefacts]
+    return bool(configs) and all(
+        config.get("domain") == "montezuma"
+        or (
+            config.get("domain") == "doorkey"
+            and not config.get("cap")
+            and (config.get("domain_config") or {}).get("wrong_key", "harmless") == "harmless"
+        )
+        for config in configs
+    )
+
+
+def view(work: Work) -> dict[str, Any]:
+    """``verdict``: the task, whether it is the paper's, and the findings."""
+    artefacts = [*work.contents.agents, *work.contents.ladders]
+    found = [asdict(finding) for finding in (*findings(work), *on_ladders(work))]
+    return {"verdict": {"task": tasks(work), "paper": as_in_paper(artefacts), "findings": found}}
+
+
+QUESTION = Question(view=view)
+
+OUTCOMES = {
+    (CHOOSING, BETTER): "Choosing mattered",
+    (CHOOSING, WORSE): "Choosing made it worse",
+    (CHOOSING, ALIKE): "Choosing made no difference",
+    (CHOOSING, UNDECIDED): "Whether choosing mattered is undecided",
+    (HYPOTHESES, BETTER): "Several hypotheses mattered",
+    (HYPOTHESES, WORSE): "Several hypotheses made it worse",
+    (HYPOTHESES, ALIKE): "Several hypotheses made no difference",
+    (HYPOTHESES, UNDECIDED): "Whether several hypotheses mattered is undecided",
+}
+OUTCOMES |= {(OPTIONS, outcome): OUTCOMES[HYPOTHESES, outcome] for outcome in (BETTER, WORSE, ALIKE, UNDECIDED)}
+SECONDS = {
+    CHOOSING: "{first} solves {a} of the episodes, uniform-random choice among its own options {b}",
+    HYPOTHESES: "with {first} the agent solves {a} of the episodes, with {second} {b}",
+    OPTIONS: "options of {first} stop at the base in {a} of the executions, those of {second} in {b}",
+}
+
+
+def sentence(finding: Mapping[str, Any], *, alone: bool = True) -> str:
+    """A finding for people; ``alone``: no other agent of the run chooses among several members."""
+    units, unit = finding["units"], finding["unit"]
+    place = f"on this {unit}" if units == 1 else f"over {units} {unit}s"
+    first = "the agent" if finding["subject"] == CHOOSING and alone else finding["first"]
+    shares = {"a": percent(finding["success"]), "b": percent(finding["other"])}
+    text = SECONDS[finding["subject"]].format(first=first, second=finding["second"], **shares)
+    low, high = finding["interval"]
+    points = "" if low is None else f" ({100 * finding['difference']:+.0f} points [{100 * low:.0f}, {100 * high:.0f}])"
+    return f"{OUTCOMES[finding['subject'], finding['outcome']]} {place}: {text}{points}."
+
+
+def verdict(metrics: Metrics) -> list[str]:
+    """Sentences: what the comparisons say, and how much evidence it is; without any, what is missing for one."""
+    found = metrics.get("verdict", {}).get("findings", [])
+    alone = sum(finding["subject"] == CHOOSING for finding in found) < 2
+    lines = [sentence(finding, alone=alone) for finding in found]
+    if found and max(finding["units"] for finding in found) == 1:
+        lines.append("One run is not evidence: train more layouts or seeds.")
+    if not found and metrics["agents"]:
+        best = [agent for agent in metrics["agents"] if agent["success"]["mean"] is not None][:1]
+        lines += [
+            f"The {_kind(agent)} solves {percent(agent['success']['mean'])} of its last episodes." for agent in best
+        ]
+        lines.append(
+            "Whether hypotheses mattered is unknown: the run has neither uniform-random choice nor an agent with one "
+            "classifier to compare with."
+        )
+    if not found and not metrics["agents"]:
+        options = list(_of_options(metrics))
+        lines += options or ["No agent has been trained yet, so no reward has shown which hypotheses transfer."]
+        lines += [] if options else list(_of_members(metrics))
+    return lines
+
+
+def _kind(agent: Mapping[str, Any]) -> str:
+    return f"agent '{agent['name']}'"
+
+
+def _of_options(metrics: Metrics) -> Iterator[str]:
+    """How often options on ladders stop at the base, of each method."""
+    of_method = grouped(metrics["distance"]["options"], lambda entry: str(entry["method"]))
+    for name, entries in of_method.items():
+        shares = [entry["options"][entry["validated"] or 0]["reached_base"] for entry in entries]
+        options = "Options that end at true sub-goals" if name == ORACLE else f"Options of {ensemble_called(name)}"
+        yield f"{options} stop at the base in {percent(mean_of(shares))} of their executions."
+    if of_method:
+        yield "Whether hypotheses mattered is unknown: the run has no options of one classifier to compare with."
+
+
+def _of_members(metrics: Metrics) -> Iterator[str]:
+    """How far members differ on held-out states, mean over sub-goals, of each method."""
+    names = dict.fromkeys(entry["name"] for entry in metrics["hypotheses"])
+    for name in names:
+        entries = [entry for entry in metrics["hypotheses"] if entry["name"] == name]
+        means = [
+            mean_of([entry[which]["mean"] for entry in entries if entry[which]["mean"] is not None])
+            for which in ("best", "mean", "worst")
+        ]
+        best, middle, worst = (f"{value:.2f}" for value in means)
+        yield (
+            f"{ensemble_called(name)}: balanced accuracy on held-out states {best} for the best member, {middle} on "
+            f"average, {worst} for the worst."
+        )
+
+
+def baselines(metrics: Metrics) -> str:
+    """What agents on primitive actions reach, and with how many steps; nothing without one."""
+    agents = [
+        agent for agent in metrics["agents"] if agent["kind"] == "baseline" and agent["success"]["mean"] is not None
+    ]
+    if not agents:
+        return ""
+    parts = []
+    for agent in agents:
+        steps = max(run["steps"] for run in agent["runs"])
+        parts.append(f"{agent['name']} {percent(agent['success']['mean'])} (after {steps:,} steps)")
+    return f"On primitive actions, with the same cap: {listed(parts)}."

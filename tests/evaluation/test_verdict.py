@@ -1,0 +1,165 @@
+"""The verdict on made-up shares of solved episodes, where the right sentence is known (Spec F7)."""
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import pytest
+
+from hypogoal.evaluation.numbers import plain
+from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.verdict import (
+    ALIKE,
+    BETTER,
+    CHOOSING,
+    HYPOTHESES,
+    ONE,
+    OPTIONS,
+    UNDECIDED,
+    WORSE,
+    baselines,
+    compare,
+    ensemble_called,
+    outcome_of,
+    sentence,
+    verdict,
+)
+
+
+def pairs_of(*shares: tuple[float, float], layouts: bool = True) -> list[tuple[Row, Row]]:
+    """Shares of solved episodes, a pair a layout, or a pair a seed of one layout."""
+    places: list[dict[str, Any]] = [
+        {"layout": number if layouts else 0, "seed": number} for number in range(len(shares))
+    ]
+    return [tuple(Row("success", value, **place) for value in pair) for pair, place in zip(shares, places, strict=True)]
+
+
+def said(subject: str, *shares: tuple[float, float], **more: Any) -> str:
+    """The sentence of these pairs, as a page has it."""
+    finding = compare(subject, "D-BAT, 3 members", ONE, pairs_of(*shares, **more))
+    assert finding is not None
+    return sentence(plain(asdict(finding)))
+
+
+@pytest.mark.parametrize(
+    ("shares", "outcome"),
+    [
+        ([(0.96, 0.23)], BETTER),
+        ([(0.2, 0.9)], WORSE),
+        ([(1.0, 0.98)], ALIKE),
+        ([(1.0, 0.5), (0.9, 0.4), (1.0, 0.45)], BETTER),
+        ([(0.5, 1.0), (0.4, 0.9), (0.45, 1.0)], WORSE),
+        ([(1.0, 1.0), (0.99, 1.0), (1.0, 0.99)], ALIKE),
+        ([(1.0, 0.2), (0.2, 1.0), (0.6, 0.5)], UNDECIDED),
+        ([(1.0, 1.0)] * 10, ALIKE),
+        ([(1.0, 0.0)] * 10, BETTER),
+    ],
+)
+def test_each_kind_of_outcome(shares: list[tuple[float, float]], outcome: str) -> None:
+    finding = compare(CHOOSING, "", "", pairs_of(*shares))
+    assert finding is not None and finding.outcome == outcome
+    assert finding.units == len(shares)
+    assert finding.difference == pytest.approx(sum(first - second for first, second in shares) / len(shares))
+
+
+def test_a_small_certain_difference_is_none() -> None:
+    """An interval within the margin is no difference, also where 0 lies outside of it."""
+    assert outcome_of(0.05, 0.02, 0.08) == ALIKE
+    assert outcome_of(0.09, 0.02, 0.16) == BETTER
+
+
+def test_several_runs_of_a_layout_count_once() -> None:
+    pairs = pairs_of((1.0, 0.0), (0.0, 1.0))
+    again = [tuple(row._replace(layout=0) for row in pairs[0]) for _ in range(9)]
+    finding = compare(CHOOSING, "", "", [*again, pairs[1]])
+    assert finding is not None and (finding.units, finding.difference) == (2, 0.0)
+
+
+def test_seeds_are_the_units_of_a_single_layout() -> None:
+    assert "over 3 seeds" in said(CHOOSING, (1.0, 0.5), (0.9, 0.4), (1.0, 0.45), layouts=False)
+    assert "on this layout" in said(CHOOSING, (1.0, 0.5), layouts=False)
+
+
+def test_sentences() -> None:
+    assert said(CHOOSING, (0.96, 0.23)) == (
+        "Choosing mattered on this layout: the agent solves 96 % of the episodes, uniform-random choice among its own "
+        "options 23 %."
+    )
+    assert said(HYPOTHESES, *[(1.0, 0.99)] * 3) == (
+        "Several hypotheses made no difference over 3 layouts: with D-BAT, 3 members the agent solves 100 % of the "
+        "episodes, with one classifier 99 % (+1 points [1, 1])."
+    )
+    assert said(HYPOTHESES, (1.0, 0.2), (0.2, 1.0)).startswith("Whether several hypotheses mattered is undecided over")
+    assert "stop at the base in 50 % of the executions" in said(OPTIONS, (0.5, 0.1))
+
+
+def test_intervals_stay_within_what_a_difference_can_be() -> None:
+    finding = compare(CHOOSING, "", "", pairs_of((1.0, 0.0), (0.5, 0.5)))
+    assert finding is not None and finding.interval == (-1.0, 1.0)
+
+
+def test_no_pairs_no_finding() -> None:
+    assert compare(CHOOSING, "", "", []) is None
+
+
+def metrics_of(*findings: Any, **parts: Any) -> dict[str, Any]:
+    empty: dict[str, Any] = {"agents": [], "hypotheses": [], "distance": {"options": []}}
+    return {**empty, **parts, "verdict": {"findings": [plain(asdict(finding)) for finding in findings]}}
+
+
+def test_one_run_is_called_no_evidence() -> None:
+    one, three = (compare(CHOOSING, "", "", pairs_of(*[(1.0, 0.2)] * count)) for count in (1, 3))
+    assert verdict(metrics_of(one))[-1] == "One run is not evidence: train more layouts or seeds."
+    assert len(verdict(metrics_of(three))) == 1
+
+
+def test_agents_are_named_where_several_choose() -> None:
+    first, second = (compare(CHOOSING, name, "", pairs_of((1.0, 0.2))) for name in ("D-BAT", "no diversity"))
+    assert [line.split(": ")[1].split(" solves")[0] for line in verdict(metrics_of(first, second))[:2]] == [
+        "D-BAT",
+        "no diversity",
+    ]
+
+
+def test_without_controls_nothing_is_claimed() -> None:
+    agent = {"name": "options (learned members)", "kind": "meta", "success": {"mean": 0.5}}
+    lines = verdict(metrics_of(agents=[agent]))
+    assert "50 %" in lines[0] and "unknown" in lines[1]
+
+
+def test_an_ensemble_alone_has_shown_nothing_yet() -> None:
+    scores = {name: {"mean": value} for name, value in (("best", 0.94), ("mean", 0.76), ("worst", 0.59))}
+    lines = verdict(metrics_of(hypotheses=[{"name": "dbat, K=3", "sub_goal": "door", **scores}]))
+    assert lines[0].startswith("No agent has been trained yet")
+    assert ".94 for the best member" in lines[1] and ".59 for the worst" in lines[1]
+
+
+def test_options_without_a_comparison() -> None:
+    options = [{"method": "dbat, K=3", "validated": 1, "options": [{"reached_base": 0.0}, {"reached_base": 0.25}]}]
+    lines = verdict(metrics_of(distance={"options": options}))
+    assert lines[0] == "Options of D-BAT, 3 members stop at the base in 25 % of their executions."
+    assert "unknown" in lines[1]
+
+
+def test_baselines_stand_beside_what_they_were_given() -> None:
+    agent = {"name": "PPO tuned", "kind": "baseline", "success": {"mean": 0.0}, "runs": [{"steps": 250_000}]}
+    assert baselines(metrics_of(agents=[agent])).endswith("PPO tuned 0 % (after 250,000 steps).")
+    assert baselines(metrics_of()) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("dbat, K=3", "D-BAT, 3 members"),
+        ("no diversity, K=3", "no diversity, 3 members"),
+        ("single CNN", ONE),
+        ("dbat, K=3, position oracle", "D-BAT, 3 members, position oracle"),
+        ("oracle termination", "oracle termination"),
+    ],
+)
+def test_names_of_ensembles_for_people(name: str, title: str) -> None:
+    assert ensemble_called(name) == title
+
+
+def test_nan_bounds_are_those_of_one_unit() -> None:
+    assert outcome_of(0.5, math.nan, math.nan) == BETTER
