@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hypogoal.cli import with_notes
+from hypogoal.cli import notes_of
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
 from hypogoal.core.errors import Killed
@@ -38,7 +38,7 @@ def test_a_process_that_the_system_kills_is_one_line(tmp_path: Path) -> None:
     """Spec G1, G2: what happened and what to do, and that the checkpoint is kept."""
     with pytest.raises(Killed, match=r"lack of memory.*workers=1") as caught:
         stage(tmp_path / "ensemble")
-    assert "the last checkpoint is kept" in with_notes(str(caught.value), caught.value)
+    assert "the last checkpoint is kept" in "; ".join(notes_of(caught.value))
 
 
 def fail_after(begun: Path) -> None:
