@@ -195,7 +195,8 @@ PRACTISED = (
 
 def summary(metrics: Entry) -> list[Table]:
     """What options do, for a terminal, where no policy over them tells it."""
-    agents = [] if variants(metrics["selection"]) else metrics["selection"]
+    selection = metrics.get("selection", [])
+    agents = [] if variants(selection) else selection
     goals = [goal for agent in agents for run in agent["runs"] for goal in run["sub_goals"]]
     rows = [
         practised(name, [member for goal in alike for member in goal["members"]])
