@@ -68,7 +68,7 @@ def sweep(
     device: cli.Device = "auto",
     engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
-    yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
+    assume_yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
     status: Annotated[bool, Option("--status", help="Only show how far the sweep is.")] = False,
     cancel: Annotated[bool, Option("--cancel", help="Only cancel its Slurm jobs; they save first.")] = False,
     gather: Annotated[bool, Option("--gather", help="Only write results.csv of the cells done so far.")] = False,
@@ -130,7 +130,7 @@ def sweep(
     if dry_run:
         _list(planned)
         return
-    ask = None if yes or not sys.stdin.isatty() else _confirm
+    ask = None if assume_yes or not sys.stdin.isatty() else _confirm
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
         with own_code.given(*cli.values_of(set_)):

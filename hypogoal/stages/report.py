@@ -125,9 +125,9 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
 
     if kind not in KINDS:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(KINDS)}.")
-    found = read_evaluation(run)
-    with fitting(found.source.path):
-        drawn, missing = paper_figures(Material(found.metrics, found.arrays))
+    evaluation = read_evaluation(run)
+    with fitting(evaluation.source.path):
+        drawn, missing = paper_figures(Material(evaluation.metrics, evaluation.arrays))
     files = {folder / f"{slug(figure.stem)}.{kind}": figure for figure in drawn}
     captions = folder / "captions.md"
     for path in (*files, captions):
@@ -139,7 +139,7 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
             if drawing.figure is not None:
                 with replacing(path) as fresh:
                     fresh.write_bytes(to_file(drawing.figure, drawing.stem, kind))
-        text = [f"## {path.name}\n\n{escape(of.caption, quote=False)}\n" for path, of in files.items()]
+        text = [f"## {path.name}\n\n{escape(drawing.caption, quote=False)}\n" for path, drawing in files.items()]
         replace_text(captions, "\n".join([*text, *(f"{line}\n" for line in missing)]))
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None

@@ -219,32 +219,22 @@ def cancel(run: Path) -> int:
     return len(alive)
 
 
-class _Signals:
-    """Slurm's signals to the job, passed on to the cell as SIGTERM, at which its stage saves."""
-
-    def __init__(self) -> None:
-        self.warned = self.stopped = False
-        self.running: Running | None = None
-        for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._receive)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        self.warned |= number == signal.SIGUSR2
-        self.stopped |= number != signal.SIGUSR2
-        self.pass_on()
-
-    def pass_on(self) -> None:
-        """Stop the cell if a signal was received."""
-        if self.running is not None and (self.warned or self.stopped):
-            self.running.process.terminate()
-
-
 def run_job(run: Path, name: str) -> None:
     """Run the cell called ``name`` of the sweep in ``run`` on the job's processors.
 
-    An unknown cell, a missing input or a failure is a ``UserError``.
+    Slurm's signals are passed on to the cell as SIGTERM, at which its stage saves. An unknown cell, a missing input or
+    a failure is a ``UserError``.
     """
-    signals = _Signals()
+    received: set[int] = set()
+    running: list[Running] = []
+
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        received.add(number)
+        for started in running:
+            started.process.terminate()
+
+    for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, pass_on)
     plan = read_plan(run)
     cell = next((cell for cell in plan.cells if cell.name == name), None)
     if cell is None:
@@ -257,14 +247,16 @@ def run_job(run: Path, name: str) -> None:
     before = _saved(cell)
     processors = os.environ.get("SLURM_CPUS_PER_TASK", "1")
     cores = int(processors) if processors.isdigit() else 1
-    signals.running = start(cell, run, cores=cores, force=name in plan.anew)
-    signals.pass_on()  # what came in between
-    code = signals.running.process.wait()
-    again = code in STOPPED and signals.warned and not signals.stopped
+    started = start(cell, run, cores=cores, force=name in plan.anew)
+    running.append(started)
+    if received:  # in between
+        started.process.terminate()
+    code = started.process.wait()
+    again = code in STOPPED and received == {signal.SIGUSR2}
     if again and _saved(cell) in ([], before):  # or it would never end
-        signals.running.log.write(f"hypogoal: {SLOW}\n".encode())
+        started.log.write(f"hypogoal: {SLOW}\n".encode())
         again, code = False, 1
-    reason = signals.running.ended(code)
+    reason = started.ended(code)
     if again:
         # By array and element: the last element's own number is also the array's and would queue all of them again.
         job = "_".join(os.environ.get(name, "") for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID"))
