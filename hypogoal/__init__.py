@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from hypogoal.core.surroundings import Around
+from hypogoal.core.surroundings import Around, close_library_path
 
 __version__ = "0.16.0"
 
@@ -58,3 +58,4 @@ else:
     # Importing Gymnasium here would take longer than the rest of this package. An entry point ``gymnasium.envs`` would
     # need an installed package and load hypogoal in every program that uses Gymnasium.
     sys.meta_path.insert(0, Around("gymnasium", _registered))
+close_library_path()

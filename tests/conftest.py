@@ -52,6 +52,14 @@ def few_states_to_browse() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def nothing_allowed_before() -> None:
+    """Each test as in a process of its own: printed commands name the code that this one allowed."""
+    from hypogoal.core import own_code
+
+    own_code._before.clear()
+
+
 @pytest.fixture
 def small_gru(monkeypatch: pytest.MonkeyPatch) -> None:
     """The paper's option networks with a GRU of 32 units instead of 512: 10.5 M parameters each say no more."""

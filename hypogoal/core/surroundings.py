@@ -38,13 +38,19 @@ class Around:
         return spec
 
 
+def close_library_path() -> None:
+    """Keep the current folder off the path of libraries, where an empty part means that folder.
+
+    OpenCV adds the variable, or an empty part in its place, to its own: so it must not be empty.
+    """
+    os.environ[LIBRARIES] = ":".join(filter(None, os.environ.get(LIBRARIES, "").split(":"))) or os.devnull
+
+
 def shield() -> None:
     """Isolate a process of hypogoal, before it loads libraries.
 
     Not for hypogoal as a library: there matplotlib is also the user's, with the user's settings.
     """
-    # An empty part means the current folder; OpenCV would add the variable, or an empty part in its place, to its own.
-    os.environ[LIBRARIES] = ":".join(filter(None, os.environ.get(LIBRARIES, "").split(":"))) or os.devnull
     if not any(isinstance(finder, Around) and finder.name == "matplotlib" for finder in sys.meta_path):
         sys.meta_path.insert(0, Around("matplotlib", _plain_matplotlib))
 

@@ -385,6 +385,10 @@ class Domain(ABC):
         """
         return f"The reward and the end of an episode are those of the domain '{self.name}'."
 
+    def small(self, config: Any) -> Any:
+        """The settings with which ``check`` collects: ``config`` with fewer states."""
+        return config
+
     def shortened(self, config: Any, steps: int) -> Any:
         """The settings with which ``check`` collects a slow domain in about ``steps``; needs ``collected_steps``."""
         return config

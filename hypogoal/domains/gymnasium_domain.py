@@ -161,6 +161,9 @@ class GymnasiumDomain(Domain):
             success=self.success,
         )
 
+    def small(self, config: GymnasiumConfig) -> GymnasiumConfig:
+        return replace(config, states=min(config.states, 200))
+
     def shortened(self, config: GymnasiumConfig, steps: int) -> GymnasiumConfig:
         """Fewer steps on each layout; if that leaves few, one layout per set, unless recorded play needs the others."""
         seeds = {name: getattr(config, name) for name in SEEDS}

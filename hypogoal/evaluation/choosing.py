@@ -23,7 +23,7 @@ from hypogoal.core.rounding import DIGITS, above, at_least
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, NEARLY
+from hypogoal.evaluation.curves import LEARNED, NEARLY, titled
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import Metrics, mean_of
 from hypogoal.evaluation.page import Block, Material, Question
@@ -209,7 +209,7 @@ TABLE = Table(
     {"name": "method"}, {name: Number(name, FROZEN, UNITS.get(name, "fraction")) for name in (*OF_PLAY, *OF_CHOICE)}
 )
 COLUMNS = (
-    page.label("chooser", "chooser"),
+    page.label("chooser", lambda entry: titled(entry["chooser"])),
     page.number("solved", "success", page.spread, 2),
     page.number(*NEARLY, page.spread, 2),
     page.number("steps", "length", page.spread, 1),

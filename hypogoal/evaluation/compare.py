@@ -203,13 +203,16 @@ def _curves(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
                 values = curves.values_of(agent, arrays[run][f"curves/{index}/{quantity}"])
                 label = run if common else f"{run}: {agent['name']}"
                 lines.append(curves.Line(label, arrays[run]["curves/grid"], values, colour, style))
+            if curves.is_flat(quantity, lines):
+                continue
             counts = "; ".join(f"{run}, {curves.runs_of(agent)}" for run, _, agent in shown)
             caption = (
                 f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and "
                 f"seeds; {curves.BANDS} over them ({counts})."
             )
             title = f"{heading}: {name}"
-            yield Drawn(f"{quantity}-{number}", title, curves.learning_curves(lines, quantity), caption, heading=title)
+            kind = "reward" if quantity == "reward" else "length"
+            yield Drawn(f"{kind}-{number}", title, curves.learning_curves(lines, quantity), caption, heading=title)
 
 
 def _pairs(comparison: Mapping[str, Any]) -> Block:

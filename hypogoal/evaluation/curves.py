@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -17,7 +18,16 @@ from rich.table import Table as Printed
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, Metrics, by_layout, ensemble_name, grouped, mean_of, name_apart
+from hypogoal.evaluation.numbers import (
+    BOOTSTRAP_FROM,
+    Metrics,
+    by_layout,
+    ensemble_name,
+    ensemble_title,
+    grouped,
+    mean_of,
+    name_apart,
+)
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import BLUE, GREEN, GREY, NARROW, ORANGE, PURPLE, SKY, STYLES, VERMILLION, drawing
 from hypogoal.evaluation.run import read_layout
@@ -44,6 +54,10 @@ UNITS = {
     "length": "steps",
     "length_over_shortest": "ratio to the layout's shortest path",
     "near": "share of episodes",
+    "solved_length": "steps",
+    "solved_over_shortest": "ratio to the layout's shortest path",
+    "ended": "share of episodes",
+    "cut": "share of episodes",
 }
 LAYOUTS_OR_RUNS = "layouts (or runs of one layout)"  # what numbers and curves are over, see ``numbers.by_layout``
 BANDS = (
@@ -52,7 +66,7 @@ BANDS = (
 )
 AXES = {  # of curves: title, and the y axis's label
     "reward": ("Undiscounted reward per episode", "reward per episode"),
-    "length": ("Episode length", "episode length (steps)"),
+    "solved_length": ("Length of solved episodes", "steps of solved episodes"),
 }
 SHARES = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
 SOLID, DASHED, MIXED, LONG, SHORT = STYLES
@@ -85,9 +99,13 @@ class Run:
     @property
     def budget(self) -> int:
         """Environment steps, those of earlier stages included."""
-        config = self.config  # practice may have ended before its limit
-        steps = config["ended_at" if "ended_at" in config else "steps"]
-        return int(steps) + int(config.get("options_ended_at", config.get("options_steps", 0)))
+        steps = self.config["ended_at" if "ended_at" in self.config else "steps"]
+        return int(steps) + self.practice
+
+    @property
+    def practice(self) -> int:
+        """The steps of the options that the agent continues, which may have ended before their limit."""
+        return int(self.config.get("options_ended_at", self.config.get("options_steps", 0)))
 
 
 def read_run(artefact: Artefact, path: str) -> Run:
@@ -115,10 +133,18 @@ def trailing_mean(
 
 
 def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = LAST) -> dict[str, NDArray[np.float64]]:
-    """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`."""
-    values = {"reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length}
+    """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`.
+
+    ``solved_length``: of the solved ones among them; NaN where none is.
+    """
+    solved_length = episodes.length * episodes.succeeded
+    values = {
+        "reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length, "solved": solved_length
+    }  # fmt: skip
     floats = {name: numbers.astype(np.float64) for name, numbers in values.items()}
-    return {name: trailing_mean(episodes.step, numbers, grid, window, FIRST) for name, numbers in floats.items()}
+    means = {name: trailing_mean(episodes.step, numbers, grid, window, FIRST) for name, numbers in floats.items()}
+    success = np.where(means["success"] > 0, means["success"], np.nan)
+    return means | {"solved_length": means.pop("solved") / success}
 
 
 def steps_to_solve(episodes: Episodes, window: int = LAST) -> int | None:
@@ -151,7 +177,7 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = LAS
     numbers: episodes actually averaged.
     """
     last, shortest = episodes.last(window), shortest_path or math.nan
-    length = mean_of(last.length)
+    length, solved_length = mean_of(last.length), mean_of(last.length[last.succeeded])
     return {
         "episodes": len(episodes.step),
         "window": len(last.step),
@@ -160,6 +186,10 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = LAS
         "length": length,
         "length_over_shortest": length / shortest,
         "near": mean_of(scores(last.succeeded, last.length, shortest)["near"]),
+        "solved_length": solved_length,
+        "solved_over_shortest": solved_length / shortest,
+        "ended": mean_of(last.terminated & ~last.succeeded),
+        "cut": mean_of(~last.terminated & ~last.succeeded),
         "steps_to_95": steps_to_solve(episodes, window),
     }
 
@@ -194,8 +224,9 @@ PAIRS = Pairs("agents", {name: Number(name, higher=name != "length") for name in
 def rows_of_run(run: Run, name: str) -> Iterator[Row]:
     """Spec F5: what is said of one trained agent at the end of its training."""
     shortest = run.layout.get("shortest_path")
-    numbers = {"steps": run.budget, **run_numbers(run.episodes, shortest), "shortest_path": shortest}
-    return rows_of(numbers, **_place(run, name))
+    budget = {"steps": run.budget, "practice": run.practice}
+    numbers = run_numbers(run.episodes, shortest)
+    return rows_of({**budget, **numbers, "shortest_path": shortest}, **_place(run, name))
 
 
 def _place(run: Run, name: str) -> dict[str, Any]:
@@ -283,36 +314,40 @@ def solved(steps: Mapping[str, Any]) -> str:
     return f"{steps['reached']} of {steps['n']}"
 
 
-AGENT = page.label("agent", "name")
+AGENT = page.label("agent", lambda agent: titled(agent["name"]))
 RUNS = page.number("runs", lambda agent: len(agent["runs"]))
 NEARLY = (f"within {NEAR} shortest paths", "near")
 SOLVED_AT = page.number("95 % at", "steps_to_95", solved)
 HEADLINE = (
     RUNS,
     page.number("success, %", "success", page.spread, 1, 100),
-    page.number("steps", "length", page.spread, 0),
-    page.number("× shortest", "length_over_shortest", page.spread, 2),
+    page.number("steps", "solved_length", page.spread, 0),
+    page.number("× shortest", "solved_over_shortest", page.spread, 2),
     page.number(*NEARLY, page.spread, 2),
+    page.number("failed: ended", "ended.mean", page.fixed, 2),
+    page.number("cut", "cut.mean", page.fixed, 2),
     SOLVED_AT,
 )
 HEADLINE_CAPTION = (
-    "Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs of one layout. "
-    "Steps: length of an episode, failures counted at the cap; × shortest: against the layout's shortest path. Within "
-    f"{NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. 95 % at: median number of "
-    "environment steps, in thousands, at which 95 of the last 100 episodes succeeded, or how many runs got there"
+    "Over the last 100 training episodes of each run, or all of fewer: mean ± standard error over layouts, or over "
+    "runs of one layout. Steps: mean length of solved episodes; × shortest: against the layout's shortest path. "
+    "Failed: the share of episodes that ended without success, and that were cut. "
+    f"Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. 95 % at: median "
+    "number of environment steps, in thousands, at which 95 of the last 100 episodes succeeded, or how many runs got "
+    "there"
 )
 PLAIN = (
     AGENT,
     RUNS,
     page.number("success", "success.mean", page.percent),
-    page.number("length", "length.mean", page.fixed, 0),
-    page.number("x shortest", "length_over_shortest.mean", page.fixed, 1),
+    page.number("steps", "solved_length.mean", page.fixed, 0),
+    page.number("x shortest", "solved_over_shortest.mean", page.fixed, 1),
     SOLVED_AT,
 )
 INTERVALS = (
     AGENT,
     page.number("success, %", "success", page.interval, 1, 100),
-    page.number("steps", "length", page.interval, 0),
+    page.number("steps", "solved_length", page.interval, 0),
     page.number(*NEARLY, page.interval, 2),
     page.number("runs", "success.n"),
 )
@@ -375,40 +410,50 @@ def runs_section(material: Material) -> Block:
 
 
 def figures(material: Material) -> list[Drawn]:
-    """Figure 6 and the same of episode length."""
-    return [_curve(material, quantity) for quantity in AXES] if material.metrics["agents"] else []
+    """Figure 6 and the same of the length of solved episodes, where it is not the same everywhere."""
+    drawn = [_curve(material, quantity) for quantity in AXES] if material.metrics["agents"] else []
+    return [figure for figure in drawn if figure is not None]
 
 
-def _curve(material: Material, quantity: str) -> Drawn:
+def _curve(material: Material, quantity: str) -> Drawn | None:
     agents, layouts, arrays = material.metrics["agents"], material.metrics["layouts"], material.arrays
     used = {COLOURS.get(agent["name"]) for agent in agents}
     others = cycle(look for look in OTHERS if look not in used)
     lines = [
         Line(
-            agent["name"],
+            titled(agent["name"]),
             arrays["curves/grid"],
             values_of(agent, arrays[f"curves/{index}/{quantity}"]),
             *(COLOURS.get(agent["name"]) or next(others)),
         )
         for index, agent in enumerate(agents)
     ]
+    if is_flat(quantity, lines):
+        return None
+    lines = [line for line in lines if quantity == "reward" or np.isfinite(line.values).any()]
+    of_paper = material.metrics.get("verdict", {}).get("paper", False)
     if quantity == "reward":
         # A share of episodes says nothing on an axis of other rewards.
         values = [layout["random_success"] for layout in layouts if limits_of(quantity, lines) == SHARES]
-        which_figure, name, dotted = "Figure 6 of the paper", "random play", "uniformly random play"
+        which_figure, name, dotted = "Figure 6 of the paper: ", "random play", "uniformly random play"
     else:
         values = [layout["shortest_path"] or None for layout in layouts]
-        which_figure, name, dotted = "Beside Figure 6 of the paper", "shortest path", "the shortest path"
+        which_figure, name, dotted = "Beside Figure 6 of the paper: ", "shortest path", "the shortest path"
     values = [value for value in values if value is not None]
     title, _ = AXES[quantity]
     drawn = learning_curves(lines, quantity, {name: float(np.mean(values))} if values else {})
     reference = f" Dotted: mean over layouts of {dotted}." if values else ""
+    practised = [run["practice"] for agent in agents for run in agent["runs"] if run.get("practice")]
+    practice = " Agents begin after the practice of their options" if practised else ""
+    practice += f", on average {page.thousands(float(np.mean(practised)))} steps." if practised else ""
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
-        f"{which_figure}: {title.lower()}, mean of the last 100 at each step.{several} {agents[0]['name']}: "
-        f"{runs_of(agents[0])}; other agents' runs: numbers.csv.{reference}"
+        f"{f'{which_figure}{title.lower()}' if of_paper else title}, mean of the last 100 episodes at each step."
+        f"{practice}{several} {titled(agents[0]['name'])}: {runs_of(agents[0])}; other agents' runs: numbers.csv."
+        f"{reference}"
     )
-    return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
+    name = "reward" if quantity == "reward" else "length"
+    return Drawn(name, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
 
 
 @dataclass(frozen=True)
@@ -422,9 +467,24 @@ class Line:
     style: Any = SOLID
 
 
+def titled(name: str) -> str:
+    """An agent's name for people: 'options (learned members), ensemble=dbat, K=3' is 'D-BAT, 3 members'."""
+    of_ensemble = re.search(r"ensemble=(single CNN|[^,]+, K=\d+)(, position oracle)?", name)
+    if of_ensemble:
+        name = name.replace(of_ensemble[0], ensemble_title(of_ensemble[0].removeprefix("ensemble=")))
+        return name.removeprefix(f"{LEARNED}, ")
+    return name.replace(LEARNED, "option agent")
+
+
+def is_flat(quantity: str, lines: Sequence[Line]) -> bool:
+    """Whether a figure of lengths would show nothing: no episode was solved, or all took as long."""
+    every = np.concatenate([line.values[np.isfinite(line.values)] for line in lines])
+    return quantity != "reward" and (not len(every) or bool(np.ptp(every) == 0))
+
+
 def limits_of(quantity: str, lines: Sequence[Line]) -> tuple[float | None, float | None]:
     """The y axis: 0 to 1 where rewards are shares of episodes, else what fits them; lengths from 0."""
-    if quantity == "length":
+    if quantity != "reward":
         return 0.0, None
     values = np.concatenate([line.values.ravel() for line in lines])
     return (None, None) if ((values < 0) | (values > 1)).any() else SHARES

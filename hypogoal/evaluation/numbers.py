@@ -40,6 +40,8 @@ NOT_A_VARIANT = frozenset(
 IDLE = {"single CNN": {"diversity", "diversity_weight", "schedule", "members"}, "no diversity": {"diversity_weight"}}
 METHODS = {"dbat": "D-BAT", "no diversity": "an ensemble without diversity", "single CNN": "a single CNN"}
 ORACLE = "oracle termination"
+OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "hsic": "HSIC"}
+ONE = "one classifier"
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
@@ -247,6 +249,15 @@ def ensemble_name(config: Mapping[str, Any]) -> str:
     name = "single CNN" if config["members"] == 1 else f"{objective}, K={config['members']}"
     oracle = config.get("view") == "agent-crop" and config.get("localiser") == "ram"
     return f"{name}, position oracle" if oracle else name
+
+
+def ensemble_title(name: str) -> str:
+    """'dbat, K=3' for people: 'D-BAT, 3 members'."""
+    objective, members, rest = (*name.split(", ", 2), "", "")[:3]
+    if name.startswith("single CNN"):
+        return name.replace("single CNN", ONE)
+    size = members.replace("K=", "") + " members" if members.startswith("K=") else members
+    return ", ".join(filter(None, [OBJECTIVES.get(objective, objective), size, rest]))
 
 
 def ensemble_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:

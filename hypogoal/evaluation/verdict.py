@@ -18,7 +18,7 @@ from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM
 from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name
-from hypogoal.evaluation.numbers import ORACLE, Metrics, by_unit, compare_pairs, grouped, mean_of
+from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
 from hypogoal.evaluation.page import Question, listed, percent
 from hypogoal.evaluation.table import Row, select
 
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
 BETTER, WORSE, ALIKE, UNDECIDED = "better", "worse", "alike", "undecided"
 CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a finding is about
-OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "hsic": "HSIC"}
-ONE = "one classifier"
 ASKED = (
     "Each sub-goal is known from one context, and each member of an ensemble is a hypothesis about it that becomes an "
     "option. Does a policy over all these options solve layouts that no data came from, and does it choose the "
@@ -136,22 +134,13 @@ def on_ladders(work: Work) -> Iterator[Finding]:
     for method in methods:
         if method != "single CNN":
             pairs = paired(select(rows, method=method), select(rows, method="single CNN"), "ladder", "seed", "N")
-            yield from filter(None, [compare(OPTIONS, ensemble_called(method), ONE, pairs, "ladder")])
+            yield from filter(None, [compare(OPTIONS, ensemble_title(method), ONE, pairs, "ladder")])
 
 
 def called(run: Run) -> str:
     """An agent by its ensemble: 'D-BAT, 3 members'."""
-    name = ensemble_called(run.config["ensemble"])
+    name = ensemble_title(run.config["ensemble"])
     return f"{name}, Thompson sampling" if run.config["chooser"] == "thompson" else name
-
-
-def ensemble_called(name: str) -> str:
-    """'dbat, K=3' for people: 'D-BAT, 3 members'."""
-    objective, members, rest = (*name.split(", ", 2), "", "")[:3]
-    if name.startswith("single CNN"):
-        return name.replace("single CNN", ONE)
-    size = members.replace("K=", "") + " members" if members.startswith("K=") else members
-    return ", ".join(filter(None, [OBJECTIVES.get(objective, objective), size, rest]))
 
 
 def tasks(work: Work) -> list[str]:
@@ -242,6 +231,8 @@ def verdict(metrics: Metrics) -> list[str]:
     lines = [sentence(finding, alone=alone) for finding in found]
     if found and max(finding["units"] for finding in found) == 1:
         lines.append("One run is not evidence: train more layouts or seeds.")
+    if metrics["agents"] and all(agent["success"]["mean"] is None for agent in metrics["agents"]):
+        return ["No episode of an agent has ended yet: train with more steps."]
     if not found and metrics["agents"]:
         best = [agent for agent in metrics["agents"] if agent["success"]["mean"] is not None][:1]
         lines += [
@@ -267,7 +258,7 @@ def _of_options(metrics: Metrics) -> Iterator[str]:
     of_method = grouped(metrics["distance"]["options"], lambda entry: str(entry["method"]))
     for name, entries in of_method.items():
         shares = [entry["options"][entry["validated"] or 0]["reached_base"] for entry in entries]
-        options = "Options that end at true sub-goals" if name == ORACLE else f"Options of {ensemble_called(name)}"
+        options = "Options that end at true sub-goals" if name == ORACLE else f"Options of {ensemble_title(name)}"
         yield f"{options} stop at the base in {percent(mean_of(shares))} of their executions."
     if of_method:
         yield "Whether hypotheses mattered is unknown: the run has no options of one classifier to compare with."
@@ -275,16 +266,14 @@ def _of_options(metrics: Metrics) -> Iterator[str]:
 
 def _of_members(metrics: Metrics) -> Iterator[str]:
     """How far members differ on held-out states, mean over sub-goals, of each method."""
-    names = dict.fromkeys(entry["name"] for entry in metrics["hypotheses"])
-    for name in names:
-        entries = [entry for entry in metrics["hypotheses"] if entry["name"] == name]
+    for name, entries in grouped(metrics["hypotheses"], lambda entry: str(entry["name"])).items():
         means = [
             mean_of([entry[which]["mean"] for entry in entries if entry[which]["mean"] is not None])
             for which in ("best", "mean", "worst")
         ]
         best, middle, worst = (f"{value:.2f}" for value in means)
         yield (
-            f"{ensemble_called(name)}: balanced accuracy on held-out states {best} for the best member, {middle} on "
+            f"{ensemble_title(name)}: balanced accuracy on held-out states {best} for the best member, {middle} on "
             f"average, {worst} for the worst."
         )
 

@@ -253,12 +253,12 @@ class _Contract:
             return error.collected
 
     def collection(self) -> str:
-        self.collected_with = self.config
-        planned = self.domain.collected_steps(self.config)
+        self.collected_with = self.domain.small(self.config)
+        planned = self.domain.collected_steps(self.collected_with)
         affordable = int(COLLECTING_SHARE * (self.end - monotonic()) / 2 / self.pace)
         self.hurried = planned > affordable
         if self.hurried:
-            self.collected_with = self.domain.shortened(self.config, affordable)
+            self.collected_with = self.domain.shortened(self.collected_with, affordable)
             steps = self.domain.collected_steps(self.collected_with)
             text = f"played {steps:,} of the {planned:,} steps that 'collect' plays, for want of time"
             warnings.warn(f"{text}: --minutes gives it more", stacklevel=2)

@@ -6,20 +6,18 @@ from typing import Any
 
 import pytest
 
-from hypogoal.evaluation.numbers import plain
+from hypogoal.evaluation.numbers import ONE, ensemble_title, plain
 from hypogoal.evaluation.table import Row
 from hypogoal.evaluation.verdict import (
     ALIKE,
     BETTER,
     CHOOSING,
     HYPOTHESES,
-    ONE,
     OPTIONS,
     UNDECIDED,
     WORSE,
     baselines,
     compare,
-    ensemble_called,
     outcome_of,
     sentence,
     verdict,
@@ -158,7 +156,7 @@ def test_baselines_stand_beside_what_they_were_given() -> None:
     ],
 )
 def test_names_of_ensembles_for_people(name: str, title: str) -> None:
-    assert ensemble_called(name) == title
+    assert ensemble_title(name) == title
 
 
 def test_nan_bounds_are_those_of_one_unit() -> None:

@@ -165,7 +165,10 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
         assert main(["label", *words, "--out", str(tmp_path / "marked")]) == 2
         assert "only observations that are images can be shown" in capsys.readouterr().err
     for setting in ("network=paper", "meta_network=paper"):
-        assert main(["train-meta", ensemble, "--out", str(tmp_path / "m"), "-q", *settings(setting)]) == 2
+        assert (
+            main(["train-meta", ensemble, "--out", str(tmp_path / "m"), "-q", *settings(setting, "experience=own")])
+            == 2
+        )
         assert f"see pictures only: {setting}" in capsys.readouterr().err
     minari = tmp_path / "played-v0"
     assert main(["export", meta, "--out", str(minari), "--episodes", "2", "-q"]) == 0
