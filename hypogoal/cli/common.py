@@ -68,7 +68,7 @@ def _short_types(options: Any) -> Any:
 app = typer.Typer(
     cls=Commands,
     help="Transferable sub-goals by hypothesising which features generalise.\n\nStart here: "
-    "[bold]hypogoal run which-feature --preset demo[/bold], minutes from nothing to a report.",
+    "[bold]hypogoal run which-feature --preset demo[/bold], two minutes from nothing to a report.",
     epilog="Each command's --help ends with an example. Settings: hypogoal config.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -106,8 +106,8 @@ def play_films(agents: Sequence[Artefact], run: Path, count: int) -> list[Film]:
         steps, options = frames[-1].step, sum(bool(frame.ended) for frame in frames)
         caption = (
             f"An episode of {path}, layout {config['layout_seed']}: {steps} steps, {options} "
-            f"option{'' if options == 1 else 's'}. Below each state: the option, by sub-goal and hypothesis; what its "
-            "classifier says; its time left."
+            f"option{'' if options == 1 else 's'}. Below each state: the running option's sub-goal and member, that "
+            "classifier's prediction, and the steps left to the option (the bar)."
         )
         films.append(Film(artefact, f"{path.replace('/', '-')}-episode-{episode}.gif", caption, gif))
     return films

@@ -174,7 +174,7 @@ def test_what_is_drawn_of_a_frame():
     stack = np.zeros((84, 84, 4), np.uint8)
     stack[..., 3] = 200
     frame = Frame(stack, 12, 3, False, 5, "")
-    assert frame_lines(frame, ["red", "door"], 2) == ["door, member 1", "step 12   reached? no   5 left", ""]
+    assert frame_lines(frame, ["red", "door"], 2) == ["door, member 1", "step 12   negative   5 steps left", ""]
     assert frame_lines(replace(frame, ended="its time is up"), ["red", "door"], 2)[2] == "ends: its time is up"
     picture = draw_frame(frame, ["red", "door"], 2, timeout=10)
     assert picture.shape[1] == 336 and (picture[:336] == 200).all()
