@@ -1,5 +1,6 @@
 """The list of stages with settings. A new stage is a line here, a file and a command."""
 
+import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -45,6 +46,19 @@ def described(config_class: type, stage: str, domain: str, preset: str | None = 
         checked = as_dict(from_values(config_class, values, stage))
         instead.append(({key: checked[key] for key in values}, f"preset {preset}"))
     return describe(config_class, *instead)
+
+
+def preset_text(stage: str, rows: Iterable[Mapping[str, Any]]) -> str:
+    """Settings as :func:`described` has them, as a TOML preset of the stage to edit; unset ones are commented out."""
+    lines = [f"[{stage}]"]
+    for row in rows:
+        allowed = f" ({row['allowed']})" if row["allowed"] else ""
+        value = row["default"]
+        lines += ["", f"# {row['meaning']}{allowed}"]
+        lines.append(
+            f"# {row['name']} =" if value is None else f"{row['name']} = {json.dumps(value, ensure_ascii=False)}"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def configuration(

@@ -13,8 +13,9 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.config import DOMAIN
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import replace_text
 from hypogoal.core.terminal import draw, give, say
-from hypogoal.settings import CONFIGS, OFTEN, TABLES, described
+from hypogoal.settings import CONFIGS, OFTEN, TABLES, described, preset_text
 
 Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
 
@@ -89,6 +90,7 @@ def config(
     ] = None,
     domain: Annotated[str, Option(help=f"Settings for: {cli.DOMAINS}", autocompletion=cli.offer("domain"))] = DOMAIN,
     preset: cli.Preset = None,
+    write: Annotated[Path | None, Option(help="Write them as a preset to edit: a new .toml file for --preset.")] = None,
     as_json: cli.AsJson = False,
 ) -> None:
     """List every setting of a stage: default, unit, meaning, source."""
@@ -102,6 +104,12 @@ def config(
 
         config_class = config_class_of(stage, domain)
     rows = described(config_class, stage, domain, preset)
+    if write is not None:
+        if write.exists() or write.suffix != ".toml":
+            raise UserError("a preset needs a new .toml file", write, "Choose another name.")
+        replace_text(write, preset_text(stage, rows))
+        give(write)
+        return
     if as_json:
         give(json.dumps(rows, indent=1))
         return

@@ -1,5 +1,6 @@
 """The commands that make something, one stage each."""
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -110,7 +111,7 @@ def audit(
 @cli.command(cli.MAKE, "evaluate runs/mine")
 def evaluate(
     run: Annotated[Path, Argument(help="A run: a folder with artefacts in it.")],
-    out: Annotated[Path | None, Option("--out", help="Default: RUN/evaluation.")] = None,
+    out: Annotated[Path | None, Option(help="Default: RUN/evaluation.")] = None,
     layouts: Annotated[
         str | None, Option(help="Agents, and each option alone, also play these without learning: 2000-2099 or 7,9.")
     ] = None,
@@ -166,14 +167,17 @@ def report(
 @cli.command(cli.LOOK, "compare runs/mine runs/other --out runs/both")
 def compare(
     runs: Annotated[list[Path], Argument(metavar="RUN RUN ...", help="Evaluated; each is compared with the first.")],
-    out: cli.Out,
+    out: Annotated[Path | None, Option("--out", help="Where to write a page; else who wins is printed.")] = None,
     force: cli.Force = False,
 ) -> None:
     """Put evaluated runs side by side: what differs, who wins."""
     from hypogoal.inspection import outcome
     from hypogoal.stages.compare import compare as compared
 
-    page = compared(runs, out, force=force)
-    for line in outcome("comparison", out):
-        say(line)
-    give(page)
+    with tempfile.TemporaryDirectory() as folder:
+        place = out or Path(folder, "comparison")
+        page = compared(runs, place, force=force)
+        for line in outcome("comparison", place):
+            say(line)
+    if out is not None:
+        give(page)

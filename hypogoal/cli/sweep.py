@@ -40,7 +40,7 @@ def run(
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
-    out = place_of(out or Path("runs", Path(experiment.rpartition(":")[2]).stem))
+    out = place_of(out or _folder_of(experiment))
     seeds = None if seed is None else str(seed)
     with own_code.given(experiment):
         planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
@@ -60,8 +60,11 @@ def run(
 
 @cli.command(cli.MANY, "sweep figure6 --out runs/figure6 --seeds 0-2 --dry-run")
 def sweep(
-    out: Annotated[Path, Option("--out", help="The sweep's folder. Give it again to continue the sweep.")],
     experiment: Annotated[str | None, Argument(help=KNOWN, autocompletion=cli.offer("experiment"))] = None,
+    out: Annotated[
+        Path | None,
+        Option(help="The sweep's folder, given again to continue the sweep. [dim]\\[default: runs/EXPERIMENT][/dim]"),
+    ] = None,
     preset: cli.Preset = None,
     set_: cli.Set = None,
     seeds: Annotated[str | None, Option(help="The run seeds: 0-9, or 0,3,7.")] = None,
@@ -92,7 +95,9 @@ def sweep(
     """
     from hypogoal.core.drafts import place_of
 
-    out = place_of(out)
+    if experiment is None and out is None:
+        raise UserError("which experiment?", "sweep", advice("Which there are", "sweep", "--help"))
+    out = place_of(out or _folder_of(experiment or ""))
     if cell is not None:
         from hypogoal.experiments.runners.slurm import run_job
 
@@ -142,6 +147,11 @@ def sweep(
     for job in jobs:
         say(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
     give(out)
+
+
+def _folder_of(experiment: str) -> Path:
+    """The default folder of an experiment's run."""
+    return Path("runs", Path(experiment.rpartition(":")[2]).stem)
 
 
 def _list(planned: Any) -> None:
