@@ -55,9 +55,8 @@ def preset_text(stage: str, rows: Iterable[Mapping[str, Any]]) -> str:
         allowed = f" ({row['allowed']})" if row["allowed"] else ""
         value = row["default"]
         lines += ["", f"# {row['meaning']}{allowed}"]
-        lines.append(
-            f"# {row['name']} =" if value is None else f"{row['name']} = {json.dumps(value, ensure_ascii=False)}"
-        )
+        text = f"{row['name']} = {json.dumps(value, ensure_ascii=False)}"
+        lines.append(f"# {row['name']} =" if value is None else text)
     return "\n".join(lines) + "\n"
 
 

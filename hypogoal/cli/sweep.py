@@ -93,7 +93,9 @@ def sweep(
 
     Finished cells are not run again. --set takes KEY=VALUE or STAGE.KEY=VALUE; AXIS=VALUES if the experiment is yours.
     """
+    from hypogoal.core.commands import advice
     from hypogoal.core.drafts import place_of
+    from hypogoal.core.errors import UserError
 
     if experiment is None and out is None:
         raise UserError("which experiment?", "sweep", advice("Which there are", "sweep", "--help"))
@@ -117,9 +119,7 @@ def sweep(
         return
 
     from hypogoal.core import own_code
-    from hypogoal.core.commands import advice
     from hypogoal.core.compute import prepare
-    from hypogoal.core.errors import UserError
     from hypogoal.experiments.runners.slurm import Options
     from hypogoal.stages import sweep as stage
 

@@ -1,4 +1,4 @@
-"""``hypogoal config STAGE --write``: a preset to edit that means what the stage's defaults mean; commands without --out."""
+"""``hypogoal config STAGE --write``: a preset to edit with the stage's settings; and commands without ``--out``."""
 
 from pathlib import Path
 
@@ -28,8 +28,8 @@ def test_a_dry_run_of_a_sweep_needs_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["sweep", "figure6", "--seeds", "0", "--dry-run"]) == 0
-    assert "--out runs/figure6/" in capsys.readouterr().out
+    assert main(["sweep", "figure3", "--seeds", "0", "--dry-run"]) == 0
+    assert "--out runs/figure3/" in capsys.readouterr().out
     assert not [*tmp_path.iterdir()]
     assert main(["sweep"]) == 2
     assert "which experiment?" in capsys.readouterr().err
