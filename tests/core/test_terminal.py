@@ -108,7 +108,7 @@ def test_nothing_in_results_drives_a_terminal(name: str, capsys: pytest.CaptureF
 
     mean = {"mean": 0.5}
     hypotheses = dict.fromkeys(("best", "mean", "worst", "disagreement_heldout"), mean)
-    agent = {"success": mean, "length": mean, "length_over_shortest": mean, "runs": [1]}
+    agent = {"success": mean, "solved_length": mean, "solved_over_shortest": mean, "runs": [1], "kind": "meta"}
     numbers = {
         "rooms": [], "choosing": [], "distance": {"options": []}, "missing": [f"g{PAYLOADS[name]}"],
         "hypotheses": [{"name": f"h{PAYLOADS[name]}", "sub_goal": "[red]one", **hypotheses}],

@@ -329,7 +329,7 @@ def test_ids_and_files_are_named_by_no_stranger(changed):
     page = report(changed).read_text(encoding="utf-8")
     assert "<img src=x" not in page and "<script>document" not in page
     ids = re.findall(r'<figure id="([^"]*)"', page)
-    assert len(ids) == len(set(ids)) == len(names) + 6 and all(re.fullmatch(r"[\w-]+", one) for one in ids)
+    assert len(ids) == len(set(ids)) == len(names) + 5 and all(re.fullmatch(r"[\w-]+", one) for one in ids)
     files, _ = draw_figures(changed, changed / "figures")
     assert len(files) > len(names) and {file.parent for file in files} == {changed / "figures"}
     assert "<img" not in (changed / "figures" / "captions.md").read_text(encoding="utf-8")

@@ -76,6 +76,7 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path: Path, monkeypatc
     assert "--resize 160" in str(refused.value)
     named = re.search(r"--set batch_size=(\d+)", str(refused.value))
     assert named
+    (tmp_path / "memory.max").write_text("1600000000")  # this process has grown meanwhile
     preflight.preflight("train-ensemble", tmp_path / "out", needs(TrainEnsembleConfig(batch_size=int(named[1]))))
 
 

@@ -32,7 +32,7 @@ def test_the_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     shown = [value._repr_html_() for value in values if value is not None]
     assert len(plt.get_fignums()) == 4
     plt.close("all")
-    words = ("open-red-door", "labelled loss", "success", "options (learned members)", "first wins")
+    words = ("open-red-door", "labelled loss", "success", "option agent", "first wins")
     assert len(shown) == len(words)
     for html, word in zip(shown, words, strict=True):
         assert html.startswith("<pre") and word in html
