@@ -39,7 +39,7 @@ $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 demo: $(USER) ## where an ensemble is needed, in runs/rooms, then three-key DoorKey, in runs/demo: from nothing to a report
 	$(BIN)/hypogoal run which-feature --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
-	@echo "open $(DEMO)/report/index.html in a browser; for the command hypogoal type: source $(BIN)/activate"
+	@echo "open $(ROOMS)/report/index.html and $(DEMO)/report/index.html in a browser; for the command hypogoal type: source $(BIN)/activate"
 
 # A file's tests share what they made; files in the order that tests/conftest.py gives them, the longest first.
 PARALLEL := -n $(JOBS) --dist loadfile --no-loadscope-reorder
