@@ -17,7 +17,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM
-from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name
+from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name, titled
 from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
 from hypogoal.evaluation.page import Question, listed, percent
 from hypogoal.evaluation.table import Row, select
@@ -172,13 +172,14 @@ def cap_of(config: Mapping[str, Any], runs: Sequence[Run]) -> str:
 
 
 def as_in_paper(artefacts: Iterable[Artefact]) -> bool:
-    """Whether the task is one of the paper's: DoorKey with harmless keys and no cap, or ladders."""
+    """Whether the task is one of the paper's: one DoorKey layout with harmless keys and no cap, or ladders."""
     configs = [artefact.config for artefact in artefacts]
     return bool(configs) and all(
         config.get("domain") == "montezuma"
         or (
             config.get("domain") == "doorkey"
             and not config.get("cap")
+            and not config.get("layouts")
             and (config.get("domain_config") or {}).get("wrong_key", "harmless") == "harmless"
         )
         for config in configs
@@ -235,9 +236,9 @@ def verdict(metrics: Metrics) -> list[str]:
         return ["No episode of an agent has ended yet: train with more steps."]
     if not found and metrics["agents"]:
         best = [agent for agent in metrics["agents"] if agent["success"]["mean"] is not None][:1]
-        lines += [
-            f"The {_kind(agent)} solves {percent(agent['success']['mean'])} of its last episodes." for agent in best
-        ]
+        for agent in best:
+            share = percent(agent["success"]["mean"])
+            lines.append(f"{_capital(titled(agent['name']))}: {share} of the last training episodes solved.")
         lines.append(
             "Whether hypotheses mattered is unknown: the run has neither uniform-random choice nor an agent with one "
             "classifier to compare with."
@@ -249,8 +250,8 @@ def verdict(metrics: Metrics) -> list[str]:
     return lines
 
 
-def _kind(agent: Mapping[str, Any]) -> str:
-    return f"agent '{agent['name']}'"
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _of_options(metrics: Metrics) -> Iterator[str]:
