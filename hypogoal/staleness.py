@@ -14,9 +14,8 @@ from pathlib import Path
 
 from hypogoal.core.artefacts import Artefact, check_files, find_input, open_artefact
 from hypogoal.core.config import preset_digest
-from hypogoal.inspection import parts_of
+from hypogoal.inspection import EVALUATION, parts_of
 
-EVALUATION = "evaluation"
 READS_ALL = (EVALUATION, "comparison", "report")  # kinds that other artefacts are not made from
 EVALUATED = ("ensemble", "options", "meta", "baseline")
 

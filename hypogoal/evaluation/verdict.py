@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
 MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
+LEAST = 3  # units; two that agree by accident would have an interval without width
 BETTER, WORSE, ALIKE, UNDECIDED = "better", "worse", "alike", "undecided"
 CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a finding is about
 ASKED = (
@@ -102,13 +103,17 @@ def findings(work: Work) -> Iterator[Finding]:
     uniform = select(frozen, method=UNIFORM)
     learning = [row for name, kind in kinds.items() if kind == RANDOM for row in select(trained, method=name)]
     for name in several:
-        played, own = select(frozen, method=name), called(agents[name][0])
-        pairs = paired(played, uniform, "artefact") or paired(select(trained, method=name), learning, "layout", "seed")
-        yield from filter(None, [compare(CHOOSING, own, "uniform-random choice", pairs)])
+        played, title = select(frozen, method=name), called(agents[name][0])
+        if pairs := paired(played, uniform, "artefact"):
+            second = "uniform-random choice among its own options"
+        else:
+            second = "an agent whose choice is uniform-random"  # it has learned other options
+            pairs = paired(select(trained, method=name), learning, "layout", "seed")
+        yield from filter(None, [compare(CHOOSING, title, second, pairs)])
         for other in single:
             rows = frozen if played and select(frozen, method=other) else trained
             pairs = paired(select(rows, method=name), select(rows, method=other), "layout", "seed")
-            yield from filter(None, [compare(HYPOTHESES, own, ONE, pairs)])
+            yield from filter(None, [compare(HYPOTHESES, title, ONE, pairs)])
 
 
 def at_the_end(rows: Iterable[Row]) -> list[Row]:
@@ -189,8 +194,8 @@ def as_in_paper(artefacts: Iterable[Artefact]) -> bool:
 def view(work: Work) -> dict[str, Any]:
     """``verdict``: the task, whether it is the paper's, and the findings."""
     artefacts = [*work.contents.agents, *work.contents.ladders]
-    found = [asdict(finding) for finding in (*findings(work), *on_ladders(work))]
-    return {"verdict": {"task": tasks(work), "paper": as_in_paper(artefacts), "findings": found}}
+    compared = [asdict(finding) for finding in (*findings(work), *on_ladders(work))]
+    return {"verdict": {"task": tasks(work), "paper": as_in_paper(artefacts), "findings": compared}}
 
 
 QUESTION = Question(view=view)
@@ -207,7 +212,7 @@ OUTCOMES = {
 }
 OUTCOMES |= {(OPTIONS, outcome): OUTCOMES[HYPOTHESES, outcome] for outcome in (BETTER, WORSE, ALIKE, UNDECIDED)}
 SECONDS = {
-    CHOOSING: "{first} solves {a} of the episodes, uniform-random choice among its own options {b}",
+    CHOOSING: "{first} solves {a} of the episodes, {second} {b}",
     HYPOTHESES: "with {first} the agent solves {a} of the episodes, with {second} {b}",
     OPTIONS: "options of {first} stop at the base in {a} of the executions, those of {second} in {b}",
 }
@@ -227,14 +232,15 @@ def sentence(finding: Mapping[str, Any], *, alone: bool = True) -> str:
 
 def verdict(metrics: Metrics) -> list[str]:
     """Sentences: what the comparisons say, and how much evidence it is; without any, what is missing for one."""
-    found = metrics.get("verdict", {}).get("findings", [])
-    alone = sum(finding["subject"] == CHOOSING for finding in found) < 2
-    lines = [sentence(finding, alone=alone) for finding in found]
-    if found and max(finding["units"] for finding in found) == 1:
-        lines.append("One run is not evidence: train more layouts or seeds.")
+    comparisons = metrics.get("verdict", {}).get("findings", [])
+    alone = sum(finding["subject"] == CHOOSING for finding in comparisons) < 2
+    lines = [sentence(finding, alone=alone) for finding in comparisons]
+    if comparisons and (most := max(finding["units"] for finding in comparisons)) < LEAST:
+        count = "One run is" if most == 1 else "Two runs are"
+        lines.append(f"{count} not evidence: train more layouts or seeds.")
     if metrics["agents"] and all(agent["success"]["mean"] is None for agent in metrics["agents"]):
         return ["No episode of an agent has ended yet: train with more steps."]
-    if not found and metrics["agents"]:
+    if not comparisons and metrics["agents"]:
         best = [agent for agent in metrics["agents"] if agent["success"]["mean"] is not None][:1]
         for agent in best:
             share = percent(agent["success"]["mean"])
@@ -243,7 +249,7 @@ def verdict(metrics: Metrics) -> list[str]:
             "Whether hypotheses mattered is unknown: the run has neither uniform-random choice nor an agent with one "
             "classifier to compare with."
         )
-    if not found and not metrics["agents"]:
+    if not comparisons and not metrics["agents"]:
         options = list(_of_options(metrics))
         lines += options or ["No agent has been trained yet, so no reward has shown which hypotheses transfer."]
         lines += [] if options else list(_of_members(metrics))

@@ -34,7 +34,8 @@ def pairs_of(*shares: tuple[float, float], layouts: bool = True) -> list[tuple[R
 
 def said(subject: str, *shares: tuple[float, float], **more: Any) -> str:
     """The sentence of these pairs, as a page has it."""
-    finding = compare(subject, "D-BAT, 3 members", ONE, pairs_of(*shares, **more))
+    second = "uniform-random choice among its own options" if subject == CHOOSING else ONE
+    finding = compare(subject, "D-BAT, 3 members", second, pairs_of(*shares, **more))
     assert finding is not None
     return sentence(plain(asdict(finding)))
 
@@ -107,6 +108,8 @@ def metrics_of(*findings: Any, **parts: Any) -> dict[str, Any]:
 
 def test_one_run_is_called_no_evidence() -> None:
     one, three = (compare(CHOOSING, "", "", pairs_of(*[(1.0, 0.2)] * count)) for count in (1, 3))
+    two = compare(CHOOSING, "", "", pairs_of((1.0, 0.2), (1.0, 0.2)))
+    assert verdict(metrics_of(two))[-1].startswith("Two runs are not evidence")
     assert verdict(metrics_of(one))[-1] == "One run is not evidence: train more layouts or seeds."
     assert len(verdict(metrics_of(three))) == 1
 
