@@ -3,8 +3,9 @@
     python -m studies.ladders docs/results/hypotheses-ladders.csv --groups 1 --seeds 0-9
 
 A cell is N (labelled ladder groups), a method and a seed: one training, looked at after each of ``LOOKS`` steps.
-Length and member are picked on half of the rooms and scored on the other half, and the other way round. Cells are kept
-and gone on with as in ``studies.hypotheses``; ``--tables`` draws them.
+Up to N = 3, length and member are picked on half of the rooms and scored on the other half, and the other way round.
+From N = 4 on a half has no base, so all rooms are scored, at the length that is best for the other seeds. Cells are
+kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws them.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ MEMBERS = 3
 LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
 SHOWN = (10, 25, 50, 100, 300, 600, 1000)  # of these in the table
 SCOPES = ("all", "unseen", "first", "second")  # all rooms; those of no training set, and both halves of these
+ALL_ROOMS_FROM = 4  # groups: one half of the unseen rooms has no base
 KEYS = ("groups", "method", "seed", "step", "member")
 COLUMNS = (*KEYS, *(f"{name}_{scope}" for scope in SCOPES for name in ("ranking", "balanced_accuracy", "accuracy")))
 (SUB_GOAL,) = DOMAIN.sub_goals
@@ -160,12 +162,40 @@ def crossed(seeds: Seeds, name: str) -> NDArray[np.float64]:
     return scores
 
 
+def best_at_others_length(seeds: Seeds, name: str) -> NDArray[np.float64]:
+    """The best member's score over all rooms, each seed at the length picked on all others: float64 (seeds,)."""
+    best = []
+    for seed, steps in seeds.items():
+        step = picked({other: looks for other, looks in seeds.items() if other != seed}, "all")
+        best.append(steps[step][f"{name}_all"].max())
+    return np.array(best)
+
+
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     for groups in range(1, 8):
         numbers = read(path, groups)
-        if numbers.get("dbat"):
+        seeds = len(numbers.get("dbat", {}))
+        if groups < ALL_ROOMS_FROM and seeds:
             yield from _tables(groups, numbers)
+        elif seeds > 1:
+            yield from _tables_of_all_rooms(groups, numbers)
+
+
+def _tables_of_all_rooms(groups: int, numbers: Numbers) -> Iterator[str]:
+    yield f"N = {groups}, {len(numbers['dbat'])} seeds: the best member over all rooms, at the others' length."
+    yield ""
+    yield from table(
+        ["", "ranking", "balanced accuracy", "accuracy", "D-BAT minus it, balanced accuracy", "the authors' accuracy"],
+        (_at_others_length(groups, numbers, method) for method in numbers),
+    )
+
+
+def _at_others_length(groups: int, numbers: Numbers, method: str) -> list[str]:
+    names = ("ranking", "balanced_accuracy", "accuracy")
+    scores, dbat = ({name: best_at_others_length(numbers[each], name) for name in names} for each in (method, "dbat"))
+    versus = "-" if method == "dbat" else interval(dbat["balanced_accuracy"] - scores["balanced_accuracy"])
+    return [method, *(interval(scores[name]) for name in names), versus, _of_authors(groups, method)]
 
 
 def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
@@ -219,8 +249,11 @@ def _all_rooms(groups: int, method: str, seeds: Seeds) -> list[str]:
     for name in ("balanced_accuracy_all", "accuracy_all"):
         of_half = [[steps[picked(seeds, half)][name].max() for steps in seeds.values()] for half in ("first", "second")]
         best.append(interval(np.mean(of_half, axis=0)))
-    authors = AUTHORS.get(method, {}).get(groups)
-    return [method, *best, " ".join(f"{value:.3f}" for value in authors) if authors else "-"]
+    return [method, *best, _of_authors(groups, method)]
+
+
+def _of_authors(groups: int, method: str) -> str:
+    return " ".join(f"{value:.3f}" for value in AUTHORS.get(method, {}).get(groups, ())) or "-"
 
 
 def main() -> None:
