@@ -1,7 +1,9 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
+import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -67,7 +69,11 @@ class Head(nn.Module):
         raise NotImplementedError
 
     def log_prob(self, scores: Tensor, offered: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
-        """Log probability of the draws and the entropy, float32 (N,) each."""
+        """Log probability of the draws and the entropy of what is drawn, float32 (N,) each."""
+        raise NotImplementedError
+
+    def probabilities(self, scores: Tensor, offered: Tensor) -> Tensor:
+        """Of each option to be chosen, float32 (N, O); rows sum to 1, and options not offered have 0."""
         raise NotImplementedError
 
     def best(self, scores: Tensor, offered: Tensor) -> Tensor:
@@ -91,13 +97,22 @@ class CategoricalHead(Head):
         entropy = -(log.exp() * log.masked_fill(~offered, 0.0)).sum(1)
         return log.gather(1, drawn.long()).squeeze(1), entropy
 
+    def probabilities(self, scores: Tensor, offered: Tensor) -> Tensor:
+        return self._log(scores, offered).exp()
+
     @staticmethod
     def _log(scores: Tensor, offered: Tensor) -> Tensor:
         return scores.masked_fill(~offered, -torch.inf).log_softmax(1)
 
 
 class GaussianHead(Head):
-    """The paper's Gaussian policy head: scores (N, O) are drawn, and remembered; the best offered is played."""
+    """The paper's Gaussian policy head: scores (N, O) are drawn, and remembered; the best offered is played.
+
+    Its entropy is that of the drawn scores. It depends on their spread alone, so an entropy bonus cannot keep the
+    choice from becoming certain (``docs/results/shock-doorkey.md``).
+    """
+
+    NODES = 16  # of the quadrature; a test holds it against draws
 
     def __init__(self, options: int):
         super().__init__()
@@ -112,6 +127,18 @@ class GaussianHead(Head):
     def log_prob(self, scores: Tensor, offered: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
         normal = torch.distributions.Normal(scores, self.log_std.to(scores.device).exp().expand_as(scores))
         return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
+
+    def probabilities(self, scores: Tensor, offered: Tensor) -> Tensor:
+        """That an option's draw is the highest of those offered, by Gauss-Hermite quadrature over that draw."""
+        spread = self.log_std.to(scores.device).exp()
+        chosen = torch.zeros_like(scores)
+        for node, weight in zip(*np.polynomial.hermite_e.hermegauss(self.NODES), strict=True):
+            lead = (scores + spread * node)[:, :, None] - scores[:, None, :]
+            below = torch.special.log_ndtr(lead / spread).masked_fill(~offered[:, None, :], 0.0)
+            others = below.sum(2) - below.diagonal(dim1=1, dim2=2)
+            chosen += weight / math.sqrt(2 * math.pi) * others.exp()
+        chosen = chosen.masked_fill(~offered, 0.0)
+        return chosen / chosen.sum(1, keepdim=True)
 
 
 HEADS: dict[str, Callable[[int], Head]] = {"categorical": CategoricalHead, "gaussian": GaussianHead}

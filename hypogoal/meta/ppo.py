@@ -136,7 +136,8 @@ class MetaPolicy(Chooser):
         """Learn from decisions, those of an environment side by side in the order in which they were taken."""
         config, states = self.config, decisions.state
         with torch.no_grad():
-            values = self._outputs(states)[:, -1].double().cpu().numpy()
+            outputs = self._outputs(states)
+            values = outputs[:, -1].double().cpu().numpy()
             next_values = self._outputs(decisions.next_state)[:, -1].double().cpu().numpy()
         begins = np.flatnonzero(np.diff(decisions.environment)) + 1
         advantages = np.concatenate(
@@ -156,9 +157,10 @@ class MetaPolicy(Chooser):
         offered, drawn, old = (
             tensor(values, self.device) for values in (decisions.offered, decisions.drawn, decisions.log_prob)
         )
+        with torch.no_grad():
+            certainty = certainty_of(self.head.probabilities(outputs[:, :-1], offered))
         goal = tensor(advantages + values, self.device).float()
         scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
-        entropy_seen = 0.0
         for epoch in range(config.epochs):
             order = self.rng.permutation(len(states))
             for begin in range(0, len(states), config.meta_batch):
@@ -170,9 +172,8 @@ class MetaPolicy(Chooser):
                 loss = loss + VALUE_WEIGHT * (out[:, -1] - goal[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
                 self._step(loss, f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}")
-                entropy_seen = float(entropy.mean().detach())
         self.updates += 1
-        return {"entropy": entropy_seen, "value": float(values.mean())}
+        return {**certainty, "value": float(values.mean())}
 
     def _step(self, loss: Tensor, where: str) -> None:
         descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, "the meta-policy", where)
@@ -195,6 +196,15 @@ class MetaPolicy(Chooser):
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
         self._finished = [Decisions(**snapshot["finished"])]
+
+
+def certainty_of(probabilities: Tensor) -> dict[str, float]:
+    """How sure a policy is: ``choice_entropy`` (nats) and the probability of the ``top_choice``, means over decisions.
+
+    ``probabilities`` are (n, O). Where ``top_choice`` is near 1, an option that stops working is not left again soon.
+    """
+    entropy = torch.special.entr(probabilities).sum(1).mean()
+    return {"choice_entropy": float(entropy), "top_choice": float(probabilities.amax(1).mean())}
 
 
 def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
