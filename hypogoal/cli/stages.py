@@ -1,6 +1,7 @@
 """The commands that make something, one stage each."""
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -35,13 +36,21 @@ def train_ensemble(
     from hypogoal.domains.base import installed_domain
     from hypogoal.inspection import result_of
 
-    call.make(data, unlabelled=tuple(unlabelled or ()))
+    accuracies = [trained["heldout"] for trained in call.make(data, unlabelled=tuple(unlabelled or ()))]
     installed = installed_domain(domain_of(data, "train-ensemble"))
     defaults = installed.defaults if installed else {}
     run, practised = call.out.parent, "train-options" in defaults or "train-meta" not in defaults
     then = ("train-options", call.out, "--out", run / "options")
     then = then if practised else ("train-meta", call.out, "--out", run / "meta")
-    call.end(result_of(call.out), *(then if installed else ("evaluate", run)))
+    call.end(_mean_accuracy(accuracies) or result_of(call.out), *(then if installed else ("evaluate", run)))
+
+
+def _mean_accuracy(accuracies: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Best, mean and worst member, means over sub-goals, with titles; empty if no sub-goal can be judged."""
+    judged = [each for each in accuracies if each["best"] == each["best"]]
+    over = f", mean of {len(judged)} sub-goals" if len(judged) > 1 else ""
+    titles = {"best": f"held-out balanced accuracy{over}: best member", "mean": "mean", "worst": "worst"}
+    return {title: sum(each[key] for each in judged) / len(judged) for key, title in titles.items() if judged}
 
 
 @cli.stage(cli.MAKE, "train-options", "train-options runs/mine/ensemble --out runs/mine/options")

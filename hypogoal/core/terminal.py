@@ -26,6 +26,11 @@ def printable(text: str) -> str:
     return "".join(sign if sign.isprintable() or unicodedata.category(sign) == "Zs" else "?" for sign in text)
 
 
+def amount(count: int, noun: str) -> str:
+    """``1 cell``, ``2 cells``."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def say(text: object, *, err: bool = False) -> None:
     """A line for people, on standard output or error."""
     give(printable(str(text)), err=err)

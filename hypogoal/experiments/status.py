@@ -161,7 +161,8 @@ def is_finished(cell: Cell) -> bool:
     if cell.stage in DERIVED:
         return not faults and is_current(cell)
     if faults:
-        raise UserError(faults[0], cell.out, "Move it out of the run to have it made again.")
+        do = f"Give --from {cell.stage}, or move it out of the run, to have it made again."
+        raise UserError(faults[0], cell.out, do)
     return True
 
 
