@@ -11,7 +11,7 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 from hypogoal.settings import configuration
-from hypogoal.stages import domain_of
+from hypogoal.stages import domain_of, inherited_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
@@ -65,7 +65,8 @@ def train_options(
     numbers = call.make(ensemble, options=options)
     domain = domain_of(ensemble, "train-options")
     config = call.config(domain)
-    plain = configuration("train-meta", domain, call.preset, ())
+    inherited = inherited_of("train-meta", call.out)
+    plain = configuration("train-meta", domain, call.preset, (), inherited=inherited)  # a preset may say otherwise
     fixed = [f"--set={name}={getattr(config, name)}" for name in FIXED if getattr(config, name) != getattr(plain, name)]
     preset, run = ["--preset", call.preset] if call.preset else [], call.out.parent
     then = ("train-meta", ensemble, "--options", call.out, *preset, *fixed, "--out", run / "meta")

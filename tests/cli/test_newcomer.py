@@ -192,23 +192,28 @@ def test_show_and_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     train = ["train-ensemble", str(data), "--out", str(run / "ensemble"), "--steps", "2", "--set", "workers=1"]
     assert main([*train, "--set", "sub_goals=collect-blue-key", "--set", "score_every=2"]) == 0
     result, then, path = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"best member's balanced accuracy 0?\.?[\d.]+, labelled loss [\d.]+", result)
+    assert re.fullmatch(r"held-out balanced accuracy: best member [\d.]+, mean [\d.]+, worst [\d.]+", result)
     assert then == f"next: hypogoal train-options {run}/ensemble --out {run}/options"
     assert path == str(run / "ensemble")
     quick = "--steps 60 --option-timeout 5 --set warm_up=100 --set max_episode_steps=20 --set random_episodes=1"
     options = ["train-options", path, "--out", str(run / "options"), "--layout-seed", "101", *quick.split()]
     assert main(options) == 0
     then = capsys.readouterr().out.splitlines()[-2]
-    assert then.startswith(f"next: hypogoal train-meta {path} --options {run}/options ")
-    following = then.removeprefix("next: hypogoal ").split()
-    assert main([*following, "--steps", "60", "--set", "max_episode_steps=20", "--set", "random_episodes=1"]) == 0
+    assert then == f"next: hypogoal train-meta {path} --options {run}/options --out {run}/meta"
+    following = [*then.removeprefix("next: hypogoal ").split(), "--steps", "60", "--set", "max_episode_steps=20"]
+    assert main([*following, "--set", "option_timeout=6"]) == 2
+    assert "trained with option_timeout=5, not 6" in capsys.readouterr().err
+    assert main([*following, "--set", "random_episodes=1"]) == 0
+    config = json.loads((run / "meta" / "manifest.json").read_text())["config"]
+    assert (config["option_timeout"], config["layout_seed"]) == (5, 101)  # as of the options
     assert capsys.readouterr().out.splitlines()[-2] == f"next: hypogoal evaluate {run}"
     assert main(["show", path]) == 0
     shown = capsys.readouterr().out.splitlines()
-    assert shown[0] == f"{path}: ensemble; {result}"
+    logged = shown[0].removeprefix(f"{path}: ensemble; ")
+    assert re.fullmatch(r"best member's balanced accuracy [\d.]+, labelled loss [\d.]+", logged)
     assert shown.index("config:") < shown.index("files:")
     assert main(["show", str(run)]) == 0
-    assert f"{path}: ensemble; {result}" in capsys.readouterr().out.splitlines()
+    assert f"{path}: ensemble; {logged}" in capsys.readouterr().out.splitlines()
     assert main([*options, "-q", "--force"]) == 0
     assert capsys.readouterr().out.splitlines() == [str(run / "options")]
 
