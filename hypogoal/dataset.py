@@ -311,7 +311,8 @@ class Dataset:
         with self._file() as file:
             labels = self._labels(file, base)
             classes = (np.flatnonzero(labels), np.flatnonzero(~labels))
-            rows = np.unique(np.concatenate([rows[part] for rows in classes for part in _spread(len(rows), count)]))
+            chosen = [rows[part] for rows in classes if len(rows) > count for part in _spread(len(rows), count)]
+            rows = np.sort(np.concatenate([*chosen, *(rows for rows in classes if len(rows) <= count)]))
             origins = {name: values[rows] for name, values in self._origins(file, base, len(labels)).items()}
             return States(self._observations(file, base, rows), labels[rows], origins)
 

@@ -35,7 +35,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``toy.toml`` and its complete run ``out``."""
     folder = tmp_path_factory.mktemp("again")
     toy = write_toy(folder / "toy.toml", "0", AGENT)
-    text = toy.read_text().replace("evaluate = false\naxes = { seed = \"0\" }", "evaluate = true")
+    text = toy.read_text().replace('evaluate = false\naxes = { seed = "0" }', "evaluate = true")
     toy.write_text(text.replace('axes = ["seed"]\n', "").replace("--seed {seed} ", ""))
     with forked():
         assert main(["run", str(toy), "--out", str(folder / "out"), "-q"]) == 0
