@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST, check_files, find_input, open_artefact, sha256_of
+from hypogoal.core.drafts import drafts_in
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import duration
+from hypogoal.core.terminal import amount
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.run import find
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
@@ -22,6 +24,7 @@ from hypogoal.experiments.records import Record, is_running, last_line, log_of, 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
 STOPS = (None, 0, 130, 143, -2, -15)  # exit codes of cells that were stopped, or died with their runner
 MOST_SHOWN = 20
+INTERRUPTED = "interrupted; its command with --resume continues it"
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,17 @@ def lines(status: Status) -> list[str]:
         if len(shown) > MOST_SHOWN:
             text.append(f"  and {len(shown) - MOST_SHOWN} more {state}")
     return text
+
+
+def in_the_making(path: Path) -> list[str]:
+    """A line for each output below a path that is not complete, and for its sweep how many cells are done."""
+    text = [f"{place}: {'in progress' if active else INTERRUPTED}" for place, active in drafts_in(path).items()]
+    try:
+        status = read_status(path)
+    except UserError:  # no sweep
+        return text
+    left = len(status.states) - status.count(DONE)
+    return [*text, f"{path}: {status.count(DONE)} of {amount(len(status.states), 'cell')} done"] if left else text
 
 
 def as_json(status: Status) -> dict[str, Any]:

@@ -235,6 +235,8 @@ def train(
                     **({"until_reached": solved} if until else {}),
                 )
                 progress.update(min(recorder.steps - begin, steps), **shown)
+            else:
+                progress.update(recorder.steps - begin)
             checkpoints.offer(state)
     if solved:
         progress.expect(recorder.steps - begin)
