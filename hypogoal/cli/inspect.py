@@ -130,7 +130,9 @@ def config(
         for row in settings:
             default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple | list) else row["default"]
             allowed = f"   ({row['allowed']})" if row["allowed"] else ""
-            say(f"  {row['name']} = {default} {row['unit']}".rstrip() + allowed)
+            head = f"  {row['name']} = {default} {row['unit']}".rstrip()
+            for line in [head + allowed] if len(head + allowed) <= width else [head, " " * 6 + allowed.strip()]:
+                say(line)
             text = row["meaning"] + (f" [{row['source']}]" if row["source"] else "")
             for line in wrapped.wrap(text):
                 say(line)

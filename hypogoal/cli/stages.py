@@ -74,7 +74,7 @@ def train_options(
     call.end(numbers, *(("evaluate", run) if config.restart_options else then))
 
 
-@cli.stage(cli.MAKE, "train-meta", "train-meta runs/mine/ensemble --options runs/mine/options --out runs/mine/meta")
+@cli.stage(cli.MAKE, "train-meta", "train-meta runs/mine/ensemble --out runs/mine/meta")
 def train_meta(
     call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
@@ -97,7 +97,7 @@ def train_baseline(
     call.end(call.make(domain, data=data, ensemble=ensemble), "evaluate", call.out.parent)
 
 
-@cli.stage(cli.OWN, "audit", "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out audit")
+@cli.stage(cli.OWN, "audit", "audit ensemble --domain doorkey --sub-goal go-to-goal --out audit")
 def audit(
     call: cli.StageCall,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
@@ -176,7 +176,7 @@ def report(
 
 @cli.command(cli.LOOK, "compare runs/mine runs/other --out runs/both")
 def compare(
-    runs: Annotated[list[Path], Argument(metavar="RUN RUN ...", help="Evaluated; each is compared with the first.")],
+    runs: Annotated[list[Path], Argument(metavar="RUN", help="Evaluated; each is compared with the first.")],
     out: Annotated[Path | None, Option("--out", help="Where to write a page; else who wins is printed.")] = None,
     force: cli.Force = False,
 ) -> None:

@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from hypogoal.cli import common as cli
-from hypogoal.core.terminal import draw, give, say
+from hypogoal.core.terminal import amount, draw, give, say
 
 KNOWN = (
     "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or one of your own: "
@@ -66,7 +66,7 @@ def run(
     give(out / "report" / "index.html")
 
 
-@cli.command(cli.MANY, "sweep figure6 --out runs/figure6 --seeds 0-2 --dry-run")
+@cli.command(cli.MANY, "sweep figure3 --out runs/figure3 --seeds 0-2 --dry-run")
 def sweep(
     experiment: Annotated[str | None, Argument(help=KNOWN, autocompletion=cli.offer("experiment"))] = None,
     out: Annotated[
@@ -125,7 +125,7 @@ def sweep(
     if cancel:
         from hypogoal.experiments.runners.slurm import cancel as end
 
-        say(f"{end(out)} jobs ended; give the same command as before to continue", err=True)
+        say(f"{amount(end(out), 'job')} ended; give the same command as before to continue", err=True)
         return
 
     from hypogoal.core import own_code
@@ -157,7 +157,7 @@ def sweep(
     with own_code.given(*cli.values_of(set_)):
         jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask, only=chosen)
     for job in jobs:
-        say(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
+        say(f"job {job['id']}: {job['name']}, {amount(max(1, len(job['cells'])), 'cell')}", err=True)
     give(out)
 
 

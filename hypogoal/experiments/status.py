@@ -116,7 +116,7 @@ def lines(status: Status) -> list[str]:
     numbers = [f"{status.count(state)} {state}" for state in (DONE, RUNNING, FAILED)]
     left, held = status.count(STOPPED, WAITING, HELD), status.count(HELD)
     numbers.append(f"{left} left{f' ({held} wait for failed ones)' if held else ''}")
-    text = [f"{status.run}: {status.experiment}, {len(status.states)} cells: {', '.join(numbers)}"]
+    text = [f"{status.run}: {status.experiment}, {amount(len(status.states), 'cell')}: {', '.join(numbers)}"]
     if status.count(RUNNING, STOPPED, WAITING):
         seconds = status.seconds_left
         text.append(f"time left: {'not known yet' if seconds is None else f'about {duration(seconds)}'}")
