@@ -25,6 +25,7 @@ from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
+from hypogoal.core.terminal import amount
 
 if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # it promotes integers differently, which fails late
     raise UserError("hypogoal needs NumPy 2", f"found {np.__version__}", "pip install 'numpy>=2,<3'")
@@ -129,8 +130,8 @@ def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
         positives = int(column.sum())
         fewest = min(positives, len(labels) - positives)
         if fewest < max(FEW, RARE * len(labels)):
-            which = "positives" if fewest == positives else "negatives"
-            lines.append(f"{goal} has {fewest} {which} among {len(labels)} labelled states: classes are unbalanced")
+            few = amount(fewest, "positive" if fewest == positives else "negative")
+            lines.append(f"{goal} has {few} among {len(labels)} labelled states: classes are unbalanced")
     return lines
 
 

@@ -209,7 +209,7 @@ def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
     """Print the results of training. NaN (no episode has ended) is left out: the number of episodes says it too."""
     if numbers and not quiet:
         texts = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in numbers.items()}
-        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"))
+        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"), wrap=True)
 
 
 def print_next(quiet: bool, *words: object) -> None:

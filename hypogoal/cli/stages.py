@@ -48,8 +48,7 @@ def train_ensemble(
 def _mean_accuracy(accuracies: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Best, mean and worst member, means over sub-goals, with titles; empty if no sub-goal can be judged."""
     judged = [each for each in accuracies if each["best"] == each["best"]]
-    over = f", mean of {len(judged)} sub-goals" if len(judged) > 1 else ""
-    titles = {"best": f"held-out balanced accuracy{over}: best member", "mean": "mean", "worst": "worst"}
+    titles = {"best": "held-out balanced accuracy: best member", "mean": "mean", "worst": "worst"}
     return {title: sum(each[key] for each in judged) / len(judged) for key, title in titles.items() if judged}
 
 
@@ -188,6 +187,6 @@ def compare(
         place = out or Path(folder, "comparison")
         page = compared(runs, place, force=force)
         for line in outcome("comparison", place):
-            say(line)
+            say(line, wrap=True)
     if out is not None:
         give(page)

@@ -47,6 +47,7 @@ def test_help_ends_with_an_example_that_can_be_typed(name: str) -> None:
     text = "\n".join(lines)
     example = " ".join(text[text.index(" Example: ") :].split())
     assert example.startswith(f"Example: hypogoal {name} ")
+    assert [line.strip() for line in lines if line.strip()][-1] == example.removeprefix("Example: "), "a line to copy"
     options = {option for param in COMMANDS[name].params for option in param.opts}
     given = {word for word in example.split() if word.startswith("--")}
     assert given <= options | {"--out"}
@@ -124,6 +125,19 @@ def test_config_lists_stages_and_the_most_changed_first(capsys: pytest.CaptureFi
     assert len(named) == len({*named}) > 40
     assert lines[0] == "Most changed:" and "PPO over options, with SMDP returns:" in lines
     assert max(len(line) for line in lines if line.startswith("      ")) <= 80
+
+
+@pytest.mark.parametrize("stage", [*STAGES, "run"])
+def test_config_fits_a_terminal(
+    stage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """80 columns; no mark-up; no range, setting or command is broken at a hyphen."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for domain in ("doorkey", "montezuma", "which-feature"):
+        assert main(["config", stage, "--domain", domain]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80 and not any("`" in line for line in lines)
+    assert not any(re.search(r"\w-$", line) for line in lines)
 
 
 def test_config_says_where_a_value_is_from(capsys: pytest.CaptureFixture[str]) -> None:
