@@ -25,6 +25,7 @@ from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
+from hypogoal.core.terminal import amount
 
 if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # it promotes integers differently, which fails late
     raise UserError("hypogoal needs NumPy 2", f"found {np.__version__}", "pip install 'numpy>=2,<3'")
@@ -129,8 +130,8 @@ def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
         positives = int(column.sum())
         fewest = min(positives, len(labels) - positives)
         if fewest < max(FEW, RARE * len(labels)):
-            which = "positives" if fewest == positives else "negatives"
-            lines.append(f"{goal} has {fewest} {which} among {len(labels)} labelled states: classes are unbalanced")
+            few = amount(fewest, "positive" if fewest == positives else "negative")
+            lines.append(f"{goal} has {few} among {len(labels)} labelled states: classes are unbalanced")
     return lines
 
 
@@ -302,11 +303,19 @@ class Dataset:
     def sample(self, part: str, count: int) -> Observations:
         """About ``count`` states spread over ``unlabelled`` or ``labelled/<sub-goal>``; reads no others."""
         with self._file() as file:
-            length = self._count(file, part)
-            blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # blocks do not overlap
-            starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
-            rows = [slice(start, start + min(count, BLOCK)) for start in starts]
+            rows = _spread(self._count(file, part), count)
             return np.concatenate([self._observations(file, part, block) for block in rows])
+
+    def some_heldout(self, sub_goal: str, count: int) -> States:
+        """About ``count`` held-out states of each class of a sub-goal, spread over the file; reads no others."""
+        base = f"heldout/{sub_goal}"
+        with self._file() as file:
+            labels = self._labels(file, base)
+            classes = (np.flatnonzero(labels), np.flatnonzero(~labels))
+            chosen = [rows[part] for rows in classes if len(rows) > count for part in _spread(len(rows), count)]
+            rows = np.sort(np.concatenate([*chosen, *(rows for rows in classes if len(rows) <= count)]))
+            origins = {name: values[rows] for name, values in self._origins(file, base, len(labels)).items()}
+            return States(self._observations(file, base, rows), labels[rows], origins)
 
     def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
         """The unlabelled states' origins, int64 (M,) by name; empty if the file has none."""
@@ -331,18 +340,15 @@ class Dataset:
         with self._file() as file:
             observations = self._observations(file, base)
             labels = self._labels(file, base)
-            if labels.shape != (len(observations),):
-                raise hdf5.Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
             return States(observations, labels, self._origins(file, base, len(observations)))
 
-    @staticmethod
-    def _labels(file: Any, base: str) -> NDArray[np.bool_]:
-        labels = hdf5.read_array(file, f"{base}/labels", "bui")
-        if labels.ndim != 1:
-            raise hdf5.Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
+    def _labels(self, file: Any, base: str) -> NDArray[np.bool_]:
+        labels, states = hdf5.read_array(file, f"{base}/labels", "bui"), self._count(file, base)
+        if labels.shape != (states,):
+            raise hdf5.Foreign(f"{base}: labels of shape {labels.shape} for {states} states")
         return labels.astype(np.bool_)
 
-    def _observations(self, file: Any, base: str, rows: slice | None = None) -> Observations:
+    def _observations(self, file: Any, base: str, rows: slice | NDArray[np.int64] | None = None) -> Observations:
         name, dtype = f"{base}/observations", self.observation_dtype
         data = hdf5.checked(file, name, "uf")
         if data.shape[1:] != self.observation_shape or data.dtype != dtype:
@@ -380,6 +386,13 @@ class Dataset:
 
     def _file(self) -> contextlib.AbstractContextManager[Any]:
         return hdf5.open_hdf5(self.path, "the data file", RECOLLECT)
+
+
+def _spread(length: int, count: int) -> list[slice]:
+    """Blocks of about ``count`` of ``length`` rows."""
+    blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # blocks do not overlap
+    starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
+    return [slice(start, start + min(count, BLOCK)) for start in starts]
 
 
 def open_dataset(path: Path) -> Dataset:

@@ -5,6 +5,7 @@ outside the requested folder is read.
 """
 
 import contextlib
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -40,9 +41,8 @@ EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
 def describe_path(path: Path) -> dict[str, Any]:
     """Kind, configuration, inputs and numbers of a data file, an artefact, or every artefact of a run."""
-    if path.is_file() or (path / MANIFEST).is_file():
-        return _describe_part(path)
-    return {"kind": "run", "path": str(path), "artefacts": [_describe_part(part) for part in parts_of(path)]}
+    parts = [_describe_part(part) for part in _parts(path)]
+    return parts[0] if parts[0]["path"] == str(path) else {"kind": "run", "path": str(path), "artefacts": parts}
 
 
 def _describe_part(path: Path) -> dict[str, Any]:
@@ -129,16 +129,26 @@ def lines(details: dict[str, Any]) -> list[str]:
     """A description as text, one fact per line, the result first."""
     if details["kind"] == "run":
         return [line for part in details["artefacts"] for line in lines(part)[:1]]
-    result = ", ".join(f"{name} {value:.4g}" for name, value in (details.get("result") or {}).items())
+    numbers = (details.get("result") or {}).items()
+    result = ", ".join(f"{name} {value:.0f}" if value >= 1_000 else f"{name} {value:.4g}" for name, value in numbers)
     text = [f"{details['path']}: {details['kind']}" + (f"; {result}" if result else "")]
     for key, value in details.items():
         if isinstance(value, dict) and key != "result":
-            text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
+            text += [f"{key}:", *(f"  {name}: {_typed(item)}" for name, item in value.items())]
+        elif key == "command" and value:
+            text.append(f"{key}: {shlex.join(value)}")
         elif key == "inputs" and value:
             text += [f"{key}:", *(f"  {item['kind']} {item['path']}" for item in value)]
         elif key not in ("path", "kind", "result") and value is not None:
             text.append(f"{key}: {value}")
     return text
+
+
+def _typed(value: Any) -> str:
+    """A setting as one would type it: lists with commas."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name}={_typed(item)}" for name, item in value.items())
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
@@ -210,8 +220,13 @@ def notes_of(path: Path) -> list[str]:
     return notes
 
 
+def is_made(path: Path) -> bool:
+    """Whether there is a data file or a complete artefact at or below a path."""
+    return path.is_file() or bool([*visible(path, MANIFEST), *visible(path, "*.h5")])
+
+
 def _parts(path: Path) -> list[Path]:
-    return parts_of(path) if path.is_dir() and not (path / MANIFEST).is_file() else [path]
+    return [path] if path.is_file() or (path / MANIFEST).is_file() else parts_of(path)
 
 
 def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:

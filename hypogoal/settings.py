@@ -68,10 +68,12 @@ def configuration(
     options: Mapping[str, Any] | None = None,
     *,
     by_user: bool = False,
+    inherited: Mapping[str, Any] | None = None,
 ) -> Any:
     """A stage's settings with the presets and defaults of its domain; see :func:`hypogoal.core.config.resolve`.
 
-    ``by_user``: the user typed the domain's name; it is not from a file. An unknown domain is a ``UserError``.
+    ``by_user``: the user typed the domain's name; it is not from a file. ``inherited`` ones, of the options that the
+    stage continues, replace defaults. An unknown domain is a ``UserError``.
     """
     from hypogoal.domains.base import defaults_of, load_domain  # loads Gymnasium, not needed to list stages
 
@@ -82,6 +84,6 @@ def configuration(
         options=options,
         assignments=assignments or (),
         domain=domain,
-        defaults=defaults_of(domain, stage, given=by_user),
+        defaults={**defaults_of(domain, stage, given=by_user), **(inherited or {})},
         tables=TABLES,
     )

@@ -55,7 +55,7 @@ def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    yield f"Share of the last {WINDOW} episodes solved, by episodes so far: mean and Student's 95 % interval."
+    yield f"Share of the last {WINDOW} episodes solved, by episodes so far: mean with a 95 % interval."
     yield ""
     lines = []
     for method, title in METHODS.items():

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.evaluation.numbers import student_interval
+from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, RESAMPLES, student_interval
 
 Row = dict[str, Any]
 Cell = tuple[str, ...]
@@ -72,7 +72,21 @@ def _short(row: Row) -> dict[str, str]:
 
 
 def interval(values: NDArray[np.float64], digits: int = 3) -> str:
-    """A mean with Student's 95 % interval over seeds."""
+    """A mean with a bootstrap's 95 % interval over seeds or layouts; of fewer than eight with the lowest and highest.
+
+    A percentile bootstrap of the mean stays within what the values can be, a share's within 0 and 1.
+    """
+    if len(values) < 2:
+        return f"{values.mean():.{digits}f}" if len(values) else "-"
+    if len(values) < BOOTSTRAP_FROM:
+        return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+    drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
+    low, high = np.percentile(values[drawn].mean(axis=1), (2.5, 97.5))
+    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def difference(values: NDArray[np.float64], digits: int = 3) -> str:
+    """A mean difference, which may have any sign, with Student's 95 % interval over seeds or layouts."""
     if len(values) < 2:
         return f"{values.mean():.{digits}f}" if len(values) else "-"
     low, high = student_interval(values)

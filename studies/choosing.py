@@ -146,7 +146,7 @@ def tables(path: Path) -> Iterator[str]:
         ):
             yield "-" if np.isnan(steps) else f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
 
-    yield f"Mean over {len(layouts)} layouts and Student's 95 % interval; of choices, where they are defined."
+    yield f"Mean over {len(layouts)} layouts with a 95 % interval; of choices, where they are defined."
     yield ""
     yield from table(
         ["", "solved by uniform-random choice", *SHOWN.values(), "95 % solved on"],

@@ -157,7 +157,7 @@ def tables(path: Path) -> Iterator[str]:
             f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
         ]
 
-    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts, Student's 95 % interval."
+    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts with a 95 % interval."
     yield ""
     titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest"]
     yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))

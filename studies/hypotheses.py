@@ -39,7 +39,7 @@ from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.scores import cross_fitted
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.stages.train_ensemble import score_rows
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -218,7 +218,7 @@ def tables(path: Path) -> Iterator[str]:
     tested = [method for method in chosen if any(name == method for name, _, _ in test)]
     if not tested:
         return
-    yield f"Test layouts, {_seeds(test)}, mean over the five sub-goals and Student's 95 % interval over seeds."
+    yield f"Test layouts, {_seeds(test)}, mean over the five sub-goals with a 95 % interval over seeds."
     yield ""
     every = DOMAIN.sub_goals
     yield from table(
@@ -270,7 +270,7 @@ def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -
         cells = []
         for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
             dbat, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
-            cells.append(f"{interval(dbat - other)} ({above(dbat, other).sum()})" if len(dbat) == len(other) else "-")
+            cells.append(f"{difference(dbat - other)} ({above(dbat, other).sum()})" if len(dbat) == len(other) else "-")
         if method != "dbat":
             yield [method, *cells]
 

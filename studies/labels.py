@@ -25,7 +25,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import Watcher, fit
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 from studies.hypotheses import Looked, settings_of, states_of
 
 LABELS = (5, 10, 20, 50, 200, 0)  # 0: all of them
@@ -85,7 +85,7 @@ def tables(path: Path) -> Iterator[str]:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     for name, title in (("ranking", "Ranking"), ("balanced_accuracy", "Balanced accuracy at 0.5")):
-        yield f"{title} of the cross-fitted best member, mean over sub-goals, Student's 95 % interval over seeds."
+        yield f"{title} of the cross-fitted best member, mean over sub-goals with a 95 % interval over seeds."
         yield ""
         counts = [count for count in LABELS if any(int(row["labels"]) == count for row in rows)]
         yield from table(
@@ -94,7 +94,7 @@ def tables(path: Path) -> Iterator[str]:
                 [
                     str(count or "all 1,640"),
                     *(interval(by_seed(rows, name, count, method)) for method in TRAINED),
-                    interval(by_seed(rows, name, count, "dbat") - by_seed(rows, name, count, "none")),
+                    difference(by_seed(rows, name, count, "dbat") - by_seed(rows, name, count, "none")),
                 ]
                 for count in counts
             ),

@@ -31,7 +31,7 @@ from hypogoal.options.tables import Executions
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 from studies.ladders import read as read_lengths
 
 Settings = dict[str, Any]
@@ -182,7 +182,7 @@ def _tables(groups: int, distances: Distances, reached: Distances, inside: Dista
     if len(whole) < FEWEST:
         return
     seeds = sorted(set.intersection(*(set(distances[method, ladder]) for method in learned for ladder in whole)))
-    yield f"Mean over {len(whole)} ladders, Student's 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
+    yield f"Mean over {len(whole)} ladders with a 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
     yield ""
     yield from table(
         ["", "best member", "mean member", f"best within {NEAR} of a base", "mean member minus D-BAT's"],
@@ -221,7 +221,7 @@ def tables_that_hold(path: Path) -> Iterator[str]:
         f"of these without {', '.join(missed)}": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *missed)],
         "three whose base runs on": list(RUN_ON),
     }
-    yield "Mean member, mean over ladders; Student's 95 % interval over the seeds that have all of these ladders."
+    yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders."
     yield ""
     yield from table(
         ["", *groups],
@@ -294,7 +294,8 @@ def _of_group(distances: Distances, methods: list[str], ladders: list[str]) -> s
         [np.mean([distances[method, ladder][seed].mean() for ladder in ladders]) for method in methods]
         for seed in seeds
     ]
-    return interval(np.array([each[0] - sum(each[1:]) for each in means]), 1) if means else "-"
+    shown = interval if len(methods) == 1 else difference
+    return shown(np.array([each[0] - sum(each[1:]) for each in means]), 1) if means else "-"
 
 
 def _share(reached: Distances, stops: Distances, method: str, ladder: str) -> str:
@@ -326,7 +327,7 @@ def _against(distances: Distances, method: str, ladders: list[str], seeds: list[
     if method == "dbat":
         return "-"
     apart = [over(distances, name, ladders, seeds, np.mean) for name in (method, "dbat")]
-    return interval(apart[0] - apart[1], 1)
+    return difference(apart[0] - apart[1], 1)
 
 
 def _steps(cell: tuple[str, ...]) -> tuple[int, ...]:

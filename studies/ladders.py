@@ -31,7 +31,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
 from hypogoal.hypotheses.training import Watcher, fit
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -239,7 +239,7 @@ def _cross_fitted(numbers: Numbers, method: str) -> list[str]:
     versus = (
         ["-", "-"]
         if method == "dbat"
-        else [interval(dbat - rankings), f"{above(dbat, rankings).sum()} of {len(rankings)}"]
+        else [difference(dbat - rankings), f"{above(dbat, rankings).sum()} of {len(rankings)}"]
     )
     return [method, steps, interval(rankings), interval(crossed(seeds, "balanced_accuracy")), *versus]
 

@@ -167,7 +167,7 @@ def tables(path: Path) -> Iterator[str]:
     steps = {method: sorted({step for name, step, _ in within if name == method}) for method in METHODS}
     methods = [method for method in METHODS if steps[method]]
     yield f"Zero-shot success within twice the shortest path (wanted: {GOAL}), mean member, mean over five sub-goals;"
-    yield "Student's 95 % interval over seeds. Picked: the member that is best on layouts trained on."
+    yield "with a 95 % interval over seeds. Picked: the member that is best on layouts trained on."
     yield ""
     yield from table(
         ["options", "steps", "trained layouts", "**new layouts**", "picked", "false positives", "seeds"],

@@ -29,7 +29,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, member_scores
 from hypogoal.hypotheses.thresholds import unlabelled_split
 from hypogoal.hypotheses.training import Watcher, fit
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 from studies.hypotheses import METHODS, states_of
 
 Probabilities = NDArray[np.float64]  # of one member
@@ -122,7 +122,7 @@ def tables(path: Path) -> Iterator[str]:
     rules = {"the best there is" if rule == "best" else rule: rule for rule in COLUMNS[len(KEYS) :]}
 
     def gain(method: str = "", step: int = 0) -> str:
-        return interval(by_seed(test, "split", method, step) - by_seed(test, "0.5", method, step))
+        return difference(by_seed(test, "split", method, step) - by_seed(test, "0.5", method, step))
 
     yield from table(
         ["", "choosing, mean", "test, mean", *cells],

@@ -139,3 +139,26 @@ def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> Non
     code = f"{first}; import gymnasium; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "(64, 64, 3)", done.stderr
+
+
+def test_some_heldout_states_are_of_both_classes_and_as_in_the_file(tmp_path: Path) -> None:
+    """So many of each class, or all there are, of every part of the file."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, size=(3_000, 4, 5, 3), dtype=np.uint8)
+    labels = np.stack([rng.random(3_000) < 0.02, np.zeros(3_000, np.bool_)], axis=1)
+    states = States(images, labels, {"layout_seed": np.arange(3_000)})
+    write_dataset(
+        tmp_path / "data.h5",
+        Collected((4, 5, 3), ("rare", "never"), states, states, states),
+        domain="",
+        config={},
+        seed=0,
+    )
+    dataset = open_dataset(tmp_path / "data.h5")
+    some = dataset.some_heldout("rare", 40)
+    rows = some.origins["layout_seed"]
+    np.testing.assert_array_equal(some.observations, images[rows])
+    np.testing.assert_array_equal(some.labels, labels[rows, 0])
+    assert some.labels.sum() == (~some.labels).sum() == 40 and rows[0] < 300 and rows[-1] > 2_700
+    assert len(dataset.some_heldout("never", 40).labels) == 40
+    assert dataset.some_heldout("rare", 10_000).labels.sum() == labels[:, 0].sum()

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
@@ -23,7 +24,7 @@ from studies import (
     tuning,
     which_feature,
 )
-from studies.cells import run_cells
+from studies.cells import difference, interval, run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
@@ -104,6 +105,28 @@ def test_learned_options_stand_beside_planned_ones(tmp_path: Path) -> None:
     assert lines.count("| D-BAT, K = 6, learned options | 120 | 400 (limit) |") == 1
     (tmp_path / "one.csv").write_text("\n".join(row for row in rows if ",learned," not in row) + "\n")
     assert not any("options" in line.split("|")[1] for line in choosing.tables(tmp_path / "one.csv") if "|" in line)
+
+
+def test_intervals_of_shares_stay_within_0_and_1() -> None:
+    """From eight on a seeded bootstrap, below that the lowest and highest; a difference may be anything."""
+    shares = np.array([1.0] * 7 + [0.3, 0.5, 1.0])
+    assert interval(shares, 2) == interval(shares, 2)
+    mean, low, high = map(float, re.findall(r"[\d.]+", interval(shares)))
+    assert mean == 0.88 and 0.7 < low < mean < high <= 1
+    assert interval(shares[:7], 2) == "1.00 (1.00 to 1.00)"
+    assert interval(shares[5:9], 2) == "0.70 (0.30 to 1.00)"
+    assert interval(shares[:1], 1) == "1.0" and interval(shares[:0]) == "-"
+    assert difference(np.array([0.0, 0.5, 1.0]), 2) == "0.50 [-0.74, 1.74]"
+
+
+def test_a_bootstrap_of_ten_holds_in_nine_of_ten_cases() -> None:
+    """Of shares drawn from a known mean, as skewed as those of the pages."""
+    rng = np.random.default_rng(1)
+    held = 0
+    for _ in range(300):
+        low, high = map(float, re.findall(r"[\d.]+", interval(rng.beta(2, 1, 10), 4))[1:])
+        held += low <= 2 / 3 <= high
+    assert held / 300 >= 0.85
 
 
 def test_agents_of_figure_6_are_told_apart() -> None:

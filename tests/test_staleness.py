@@ -8,7 +8,7 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.drafts import COMMAND
+from hypogoal.core.drafts import BEGUN, COMMAND, draft_folder, sole_writer
 from hypogoal.staleness import lines, states_of
 
 
@@ -94,3 +94,34 @@ def test_the_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     states = json.loads(capsys.readouterr().out)
     assert [state["path"] for state in states if state["reasons"]] == ["run/evaluation"]
     assert main(["status", "nowhere"]) == 2
+
+
+def test_what_is_in_progress_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec A8: by ``verify`` and ``status``, of a run that is whole so far and of one with nothing complete yet."""
+    monkeypatch.chdir(tmp_path)
+    run = Path("run")
+    make(run, "dqn", "baseline")
+    with sole_writer(run / "ppo"):
+        (draft_folder(run / "ppo") / BEGUN).write_text("{}")
+        assert main(["verify", "run"]) == 0
+        assert capsys.readouterr().out.splitlines()[:2] == ["run: whole so far", "run/ppo: in progress"]
+        assert main(["status", "run"]) == 0
+        assert capsys.readouterr().out.splitlines()[0] == "run/ppo: in progress"
+        assert main(["verify", "run", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["notes"][0] == "run/ppo: in progress"
+        assert main(["verify", "run/ppo"]) == 0
+        assert capsys.readouterr().out.splitlines() == ["run/ppo: nothing is complete yet", "run/ppo: in progress"]
+    assert main(["verify", "run"]) == 0
+    assert "run/ppo: interrupted; its command with --resume continues it" in capsys.readouterr().out
+    (run / "dqn" / "file.txt").write_text("mine")
+    assert main(["verify", "run"]) == 2
+    assert "file.txt: changed since it was written" in capsys.readouterr().out
+
+
+def test_what_is_nowhere_is_not_in_progress(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("verify", "status", "show"):
+        assert main([name, "run/nowhere"]) == 2
+        told = capsys.readouterr()
+        assert "no such file or folder" in told.out + told.err

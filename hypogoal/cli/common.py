@@ -78,7 +78,7 @@ app = typer.Typer(
 
 def command(panel: str, example: str, name: str | None = None, parent: typer.Typer = app) -> Any:
     """Make a function a command of a group; its ``--help`` ends with an example."""
-    return parent.command(name, rich_help_panel=panel, epilog=f"Example: [bold]hypogoal {example}[/bold]")
+    return parent.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
 
 
 def offer(kind: str) -> Any:
@@ -209,7 +209,7 @@ def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
     """Print the results of training. NaN (no episode has ended) is left out: the number of episodes says it too."""
     if numbers and not quiet:
         texts = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in numbers.items()}
-        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"))
+        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"), wrap=True)
 
 
 def print_next(quiet: bool, *words: object) -> None:

@@ -26,7 +26,7 @@ def show(
     as_json: cli.AsJson = False,
     pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
-    """Show its kind, result, configuration and inputs."""
+    """Describe a file or folder: kind, result, settings, inputs."""
     from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
 
     details, numbers = describe_path(path), None
@@ -46,14 +46,18 @@ def show(
 
 @cli.command(cli.LOOK, "verify runs/mine")
 def verify(path: Made, as_json: cli.AsJson = False) -> None:
-    """Check that it is whole. Exit code 2 if something is wrong.
+    """Check for missing or changed files; exit code 2 if there are any.
 
-    Checks schema, hashes, numbers, and the inputs within PATH.
+    Checks schema, hashes, numbers, and the inputs within PATH. What is still being made is named, not checked.
     """
-    from hypogoal.inspection import faults_of, notes_of
+    from hypogoal.experiments.status import in_the_making
+    from hypogoal.inspection import faults_of, is_made, notes_of
 
-    faults, notes = faults_of(path), notes_of(path)
-    cli.echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [f"{path}: whole"]), *notes])
+    making = in_the_making(path)
+    checked = not making or is_made(path)
+    faults, notes = faults_of(path) if checked else [], [*making, *notes_of(path)]
+    whole = f"{path}: whole{' so far' if making else ''}" if checked else f"{path}: nothing is complete yet"
+    cli.echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [whole]), *notes])
     if faults:
         raise typer.Exit(2)
 
@@ -61,11 +65,14 @@ def verify(path: Made, as_json: cli.AsJson = False) -> None:
 @cli.command(cli.LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: cli.AsJson = False) -> None:
     """Say which artefacts are stale, why, and which commands renew them."""
+    from hypogoal.experiments.status import in_the_making
+    from hypogoal.inspection import is_made
     from hypogoal.staleness import lines, states_of
 
-    states = states_of(path)
+    making = in_the_making(path)
+    states = states_of(path) if not making or is_made(path) else []
     details = [{"path": str(each.path), "reasons": each.reasons, "command": each.command} for each in states]
-    cli.echo(details, as_json, lines(states))
+    cli.echo(details, as_json, [*making, *(lines(states) if states else [])])
 
 
 @cli.command(cli.LOOK, "watch runs/mine")
@@ -115,13 +122,17 @@ def config(
         return
     width, often = min(shutil.get_terminal_size().columns, 100), OFTEN.get(stage, ())
     parts = [(part.__doc__ or "").partition(".")[0] for part in config_class.__mro__]
+    # A range such as 0-9 or a command such as train-meta stays in one piece.
+    wrapped = textwrap.TextWrapper(width, " " * 6, " " * 6, break_on_hyphens=False, break_long_words=False)
     rows.sort(key=lambda row: -1 if row["name"] in often else parts.index(row["part"]))
     for title, settings in itertools.groupby(rows, lambda row: "Most changed" if row["name"] in often else row["part"]):
-        say(f"{title}:")
+        say(f"{title.replace('`', '')}:")
         for row in settings:
             default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple | list) else row["default"]
             allowed = f"   ({row['allowed']})" if row["allowed"] else ""
-            say(f"  {row['name']} = {default} {row['unit']}".rstrip() + allowed)
+            head = f"  {row['name']} = {default} {row['unit']}".rstrip()
+            for line in [head + allowed] if len(head + allowed) <= width else [head, " " * 6 + allowed.strip()]:
+                say(line)
             text = row["meaning"] + (f" [{row['source']}]" if row["source"] else "")
-            for line in textwrap.wrap(text, width, initial_indent=" " * 6, subsequent_indent=" " * 6):
+            for line in wrapped.wrap(text):
                 say(line)

@@ -14,7 +14,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.progress import Progress
-from hypogoal.core.terminal import give, say
+from hypogoal.core.terminal import amount, give, say
 from hypogoal.settings import configuration
 
 PLAYED = "a domain, a Gymnasium environment's id, or module:object."
@@ -93,7 +93,7 @@ def export(
 
         steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
         if not quiet:
-            say(f"{episodes} episodes, {steps} steps")
+            say(f"{amount(episodes, 'episode')}, {amount(steps, 'step')}")
     else:
         from hypogoal.stages.import_data import export_data as stage
 

@@ -1,6 +1,7 @@
 """The commands that make something, one stage each."""
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 from hypogoal.settings import configuration
-from hypogoal.stages import domain_of
+from hypogoal.stages import domain_of, inherited_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
@@ -35,13 +36,20 @@ def train_ensemble(
     from hypogoal.domains.base import installed_domain
     from hypogoal.inspection import result_of
 
-    call.make(data, unlabelled=tuple(unlabelled or ()))
+    accuracies = [trained["heldout"] for trained in call.make(data, unlabelled=tuple(unlabelled or ()))]
     installed = installed_domain(domain_of(data, "train-ensemble"))
     defaults = installed.defaults if installed else {}
     run, practised = call.out.parent, "train-options" in defaults or "train-meta" not in defaults
     then = ("train-options", call.out, "--out", run / "options")
     then = then if practised else ("train-meta", call.out, "--out", run / "meta")
-    call.end(result_of(call.out), *(then if installed else ("evaluate", run)))
+    call.end(_mean_accuracy(accuracies) or result_of(call.out), *(then if installed else ("evaluate", run)))
+
+
+def _mean_accuracy(accuracies: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Best, mean and worst member, means over sub-goals, with titles; empty if no sub-goal can be judged."""
+    judged = [each for each in accuracies if each["best"] == each["best"]]
+    titles = {"best": "held-out balanced accuracy: best member", "mean": "mean", "worst": "worst"}
+    return {title: sum(each[key] for each in judged) / len(judged) for key, title in titles.items() if judged}
 
 
 @cli.stage(cli.MAKE, "train-options", "train-options runs/mine/ensemble --out runs/mine/options")
@@ -56,7 +64,8 @@ def train_options(
     numbers = call.make(ensemble, options=options)
     domain = domain_of(ensemble, "train-options")
     config = call.config(domain)
-    plain = configuration("train-meta", domain, call.preset, ())
+    inherited = inherited_of("train-meta", call.out)
+    plain = configuration("train-meta", domain, call.preset, (), inherited=inherited)  # a preset may say otherwise
     fixed = [f"--set={name}={getattr(config, name)}" for name in FIXED if getattr(config, name) != getattr(plain, name)]
     preset, run = ["--preset", call.preset] if call.preset else [], call.out.parent
     then = ("train-meta", ensemble, "--options", call.out, *preset, *fixed, "--out", run / "meta")
@@ -64,7 +73,7 @@ def train_options(
     call.end(numbers, *(("evaluate", run) if config.restart_options else then))
 
 
-@cli.stage(cli.MAKE, "train-meta", "train-meta runs/mine/ensemble --options runs/mine/options --out runs/mine/meta")
+@cli.stage(cli.MAKE, "train-meta", "train-meta runs/mine/ensemble --out runs/mine/meta")
 def train_meta(
     call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
@@ -87,7 +96,7 @@ def train_baseline(
     call.end(call.make(domain, data=data, ensemble=ensemble), "evaluate", call.out.parent)
 
 
-@cli.stage(cli.OWN, "audit", "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out audit")
+@cli.stage(cli.OWN, "audit", "audit ensemble --domain doorkey --sub-goal go-to-goal --out audit")
 def audit(
     call: cli.StageCall,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
@@ -166,7 +175,7 @@ def report(
 
 @cli.command(cli.LOOK, "compare runs/mine runs/other --out runs/both")
 def compare(
-    runs: Annotated[list[Path], Argument(metavar="RUN RUN ...", help="Evaluated; each is compared with the first.")],
+    runs: Annotated[list[Path], Argument(metavar="RUN", help="Evaluated; each is compared with the first.")],
     out: Annotated[Path | None, Option("--out", help="Where to write a page; else who wins is printed.")] = None,
     force: cli.Force = False,
 ) -> None:
@@ -178,6 +187,6 @@ def compare(
         place = out or Path(folder, "comparison")
         page = compared(runs, place, force=force)
         for line in outcome("comparison", place):
-            say(line)
+            say(line, wrap=True)
     if out is not None:
         give(page)

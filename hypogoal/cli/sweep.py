@@ -1,6 +1,7 @@
 """Many cells with one command: ``run`` chains the stages, ``sweep`` runs experiments here or by Slurm (Spec A6, G4)."""
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,12 +10,16 @@ import typer
 from typer import Argument, Option
 
 from hypogoal.cli import common as cli
-from hypogoal.core.terminal import draw, give, say
+from hypogoal.core.terminal import amount, draw, give, say
 
 KNOWN = (
     "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or one of your own: "
     "a .toml file or module:function."
 )
+From = Annotated[
+    str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it; keep the rest.")
+]
+Only = Annotated[str | None, Option("--only", metavar="STAGE", help="Make this stage again and run no other.")]
 DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost; run none.")]
 _slurm = partial(Option, rich_help_panel="Slurm (with --engine slurm)")
 
@@ -29,6 +34,8 @@ def run(
     device: cli.Device = "auto",
     force: cli.Force = False,
     resume: Annotated[bool, Option("--resume", help="Keep what is complete, continue with the rest.")] = False,
+    from_: From = None,
+    only: Only = None,
     quiet: cli.Quiet = False,
     dry_run: DryRun = False,
 ) -> None:
@@ -44,21 +51,22 @@ def run(
     seeds = None if seed is None else str(seed)
     with own_code.given(experiment):
         planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
+    planned, chosen = _in_part(planned, from_, only)
     if dry_run:
-        _list(planned)
+        _list(planned, out, chosen)
         return
     prepare(device)
     with own_code.given(*cli.values_of(set_)):
-        stage(planned, out, force=force, resume=resume, quiet=quiet)
+        stage(planned, out, force=force, resume=resume, quiet=quiet, only=chosen)
     metrics = out / "evaluation" / "metrics.json"
-    if not metrics.is_file():
+    if chosen or not metrics.is_file():
         give(out / "results.csv")
         return
     draw(summary_of(numbers_of(out) or {}, metrics), 100)
     give(out / "report" / "index.html")
 
 
-@cli.command(cli.MANY, "sweep figure6 --out runs/figure6 --seeds 0-2 --dry-run")
+@cli.command(cli.MANY, "sweep figure3 --out runs/figure3 --seeds 0-2 --dry-run")
 def sweep(
     experiment: Annotated[str | None, Argument(help=KNOWN, autocompletion=cli.offer("experiment"))] = None,
     out: Annotated[
@@ -69,6 +77,8 @@ def sweep(
     set_: cli.Set = None,
     seeds: Annotated[str | None, Option(help="The run seeds: 0-9, or 0,3,7.")] = None,
     device: cli.Device = "auto",
+    from_: From = None,
+    only: Only = None,
     engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
     assume_yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
@@ -115,7 +125,7 @@ def sweep(
     if cancel:
         from hypogoal.experiments.runners.slurm import cancel as end
 
-        say(f"{end(out)} jobs ended; give the same command as before to continue", err=True)
+        say(f"{amount(end(out), 'job')} ended; give the same command as before to continue", err=True)
         return
 
     from hypogoal.core import own_code
@@ -132,20 +142,22 @@ def sweep(
         raise UserError("unknown engine", engine, "Choose local or slurm.")
     with own_code.given(experiment):
         planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)
+    planned, chosen = _in_part(planned, from_, only)
     if dry_run:
-        _list(planned)
+        _list(planned, out, chosen)
         return
     ask = None if assume_yes or not sys.stdin.isatty() else _confirm
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
         with own_code.given(*cli.values_of(set_)):
-            give(stage.sweep(planned, out, quiet=quiet, confirm=ask))
+            go_on = stage.AGAIN if not planned.anew else "give it without --from and --only to go on"
+            give(stage.sweep(planned, out, quiet=quiet, confirm=ask, go_on=go_on, only=chosen))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
     with own_code.given(*cli.values_of(set_)):
-        jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask)
+        jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask, only=chosen)
     for job in jobs:
-        say(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
+        say(f"job {job['id']}: {job['name']}, {amount(max(1, len(job['cells'])), 'cell')}", err=True)
     give(out)
 
 
@@ -154,12 +166,26 @@ def _folder_of(experiment: str) -> Path:
     return Path("runs", Path(experiment.rpartition(":")[2]).stem)
 
 
-def _list(planned: Any) -> None:
-    from hypogoal.experiments.costs import cost_lines
+def _in_part(planned: Any, from_: str | None, only: str | None) -> tuple[Any, frozenset[str]]:
+    """The plan with the cells to be made anew, and the names of the only ones to run; empty: all."""
+    from hypogoal.core.errors import UserError
 
-    for cell in planned.cells:
+    if from_ and only:
+        raise UserError("--from and --only cannot both be given", f"{from_}, {only}", "Give one of them.")
+    stage = from_ or only
+    anew = planned.from_stage(stage) if stage else frozenset()
+    return replace(planned, anew=anew), planned.of_stage(only) if only else frozenset()
+
+
+def _list(planned: Any, out: Path, chosen: frozenset[str]) -> None:
+    """The commands of all cells or, with ``--from`` and ``--only``, of those that would run; and their cost."""
+    from hypogoal.experiments.costs import cost_lines
+    from hypogoal.stages.sweep import to_run
+
+    cells = to_run(planned, out, chosen) if planned.anew else planned.cells
+    for cell in cells:
         say(cell.text)
-    for line in cost_lines(planned.cells, planned.workers):
+    for line in cost_lines(cells, planned.workers):
         say(line, err=True)
 
 

@@ -70,6 +70,16 @@ def unfinished(out: Path) -> bool:
     return (folder / BEGUN).is_file() and (folder / FILES).is_dir() and any(checkpoints)
 
 
+def drafts_in(path: Path) -> dict[Path, bool]:
+    """The outputs at or below a path that have a draft, and whether, as its lock says, a process works on it."""
+    found = {}
+    for folder in (draft_folder(path), *sorted(path.rglob(f".*{PARTIAL}"))):
+        with contextlib.suppress(OSError), (folder / LOCK).open("rb") as file:
+            if (folder / BEGUN).is_file():
+                found[folder.with_name(folder.name[1 : -len(PARTIAL)])] = try_lock(file, shared=True) is False
+    return found
+
+
 @contextlib.contextmanager
 def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: bool = False) -> Iterator[Draft]:
     """Work on ``out`` in a fresh draft or, with ``resume``, in one that has a checkpoint, even if ``force`` is given.

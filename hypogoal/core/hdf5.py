@@ -179,7 +179,7 @@ def size_of(dataset: Any) -> int:
     return prod(map(int, dataset.shape)) * int(dataset.dtype.itemsize)
 
 
-def read_array(file: Any, name: str, kinds: str, rows: slice | None = None) -> NDArray[Any]:
+def read_array(file: Any, name: str, kinds: str, rows: slice | NDArray[np.int64] | None = None) -> NDArray[Any]:
     """A dataset's values, or ``rows`` of them; ``Foreign`` if damaged, or read whole and larger than free memory."""
     dataset, free = checked(file, name, kinds), free_memory()
     if rows is None and free is not None and size_of(dataset) > free:

@@ -42,7 +42,7 @@ def preflight(stage: str, out: Path, needs: Needs, *, resume: bool = False, quie
         needed = (
             f"needs about {human(memory)} of memory ({free_text} free), {human(disk)} of disk ({human(space)} free)"
         )
-        say(f"{stage}: {needed}{f', {duration(seconds)}' if seconds else ''}", err=True)
+        say(f"{stage}: {needed}{f', {duration(seconds)}' if seconds else ''}", err=True, wrap=True)
 
 
 def available() -> int | None:

@@ -26,18 +26,25 @@ class Progress:
         self.title, self.total, self.quiet = title, total, quiet
         self.done = self._before = 0
         self._begin()
+        self._numbers: dict[str, float] = {}
         self._bar: Any = None
         self._task: Any = None
 
     def __enter__(self) -> Self:
         if not self.quiet and sys.stderr.isatty():
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bar
+            from rich.text import Text
+
+            class Pace(ProgressColumn):
+                def render(column, task: Any) -> Text:
+                    return Text(self.pace(), "progress.data.speed")
 
             columns = (
                 TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=16),
+                BarColumn(bar_width=10),
                 MofNCompleteColumn(),
+                Pace(),
                 TextColumn("{task.fields[numbers]}", markup=False),
                 TimeRemainingColumn(),
             )
@@ -82,6 +89,7 @@ class Progress:
         self.done = done
         if self.quiet:
             return
+        numbers = self._numbers = numbers or self._numbers
         text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value))
         if self._bar is not None:
             self._bar.update(self._task, completed=done, numbers=text)
@@ -108,6 +116,12 @@ class Progress:
             thread.join()
         self.update(count())
 
+    def pace(self) -> str:
+        """The rate, ``12/s`` or ``3 s each``; before anything is done, the time spent."""
+        seconds = max(time.monotonic() - self._start, 1e-9)
+        rate = max(self.done - self._before, 0) / seconds
+        return f"{rate:,.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else f"{duration(seconds)} so far"
+
     def _begin(self) -> None:
         self._start = self._last = time.monotonic()
         self._said = False
@@ -116,9 +130,8 @@ class Progress:
         self._last, self._said = time.monotonic(), True
         seconds = max(self._last - self._start, 1e-9)
         rate = max(self.done - self._before, 0) / seconds
-        speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""
         left = self.total - self.done
-        estimate = f" ({speed}, {duration(left / rate)} left)" if rate and left > 0 else ""
+        estimate = f" ({self.pace()}, {duration(left / rate)} left)" if rate and left > 0 else ""
         say(f"{self.title}: {self.done}/{self.total}{estimate}{f', {text}' if text else ''}", err=True)
 
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shutil
 import sys
+import textwrap
 import unicodedata
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -26,9 +28,19 @@ def printable(text: str) -> str:
     return "".join(sign if sign.isprintable() or unicodedata.category(sign) == "Zs" else "?" for sign in text)
 
 
-def say(text: object, *, err: bool = False) -> None:
-    """A line for people, on standard output or error."""
-    give(printable(str(text)), err=err)
+def amount(count: int, noun: str) -> str:
+    """``1 cell``, ``2 cells``."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def say(text: object, *, err: bool = False, wrap: bool = False) -> None:
+    """A line for people, on standard output or error; ``wrap``: on a terminal as several that end after words."""
+    lines, stream = [printable(str(text))], sys.stderr if err else sys.stdout
+    if wrap and stream is not None and stream.isatty():
+        width = shutil.get_terminal_size().columns
+        lines = textwrap.wrap(lines[0], width, break_on_hyphens=False, break_long_words=False) or lines
+    for line in lines:
+        give(line, err=err)
 
 
 def give(text: object, *, err: bool = False) -> None:

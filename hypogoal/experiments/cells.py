@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from hypogoal.core.errors import UserError
 from hypogoal.settings import CONFIGS, options_of
 
 DERIVED = ("evaluate", "report")  # stages that only read a run: made again in minutes
@@ -68,6 +69,22 @@ class Plan:
     anew: frozenset[str] = frozenset()  # names of cells to be made again, even if they were complete before
     # The preset files that its commands name, each with its digest at the last start of the sweep.
     presets: Mapping[str, str] = field(default_factory=dict)
+
+    def of_stage(self, stage: str) -> frozenset[str]:
+        """The names of a stage's cells; none is a ``UserError``."""
+        stages = dict.fromkeys(cell.stage for cell in self.cells)
+        if stage not in stages:
+            raise UserError("this run has no such stage", stage, f"Choose one of {', '.join(stages)}.")
+        return frozenset(cell.name for cell in self.cells if cell.stage == stage)
+
+    def from_stage(self, stage: str) -> frozenset[str]:
+        """The names of a stage's cells and of those that need them; none is a ``UserError``."""
+        names, made = {*self.of_stage(stage)}, set[Path]()
+        for cell in self.cells:  # those that a cell needs are before it
+            if cell.name in names or not made.isdisjoint(cell.needs):
+                names.add(cell.name)
+                made.add(cell.out)
+        return frozenset(names)
 
 
 def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> list[Cell]:

@@ -9,6 +9,7 @@ from typing import Any
 from hypogoal.core.config import as_dict
 from hypogoal.core.preflight import human
 from hypogoal.core.progress import duration
+from hypogoal.core.terminal import amount
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
@@ -113,4 +114,4 @@ def cost_lines(cells: Sequence[Cell], workers: int) -> list[str]:
     seconds, wall = sum(cell.cost.seconds for cell in cells), duration(wall_seconds(cells, workers))
     total = f"about {duration(seconds)} of one core, {wall} with {workers} at once" if seconds else "time not known"
     memory = sum(sorted((cell.cost.memory for cell in cells), reverse=True)[:workers])
-    return [*lines, f"{len(cells)} commands: {total}; at once at most {human(memory)} of memory"]
+    return [*lines, f"{amount(len(cells), 'command')}: {total}; at once at most {human(memory)} of memory"]

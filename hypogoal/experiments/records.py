@@ -8,7 +8,7 @@ cell. The cell's processes inherit the lock, so it ends with the last of them. `
 import json
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -197,19 +197,22 @@ PLAN_KEYS: Schema = {
 PLAN_MAY: Schema = {"anew": is_list(is_text), "presets": is_table(is_text)}
 
 
-def check_same(run: Path, cells: Sequence[Cell]) -> None:
-    """Refuse (``UserError``) cells that lack any of the folder's plan, or have other commands or presets."""
-    do = "Give the settings it was begun with, or choose another --out."
+def check_same(run: Path, cells: Sequence[Cell], anew: Set[str] = frozenset()) -> None:
+    """Refuse (``UserError``) cells that lack any of the folder's plan, or have other commands or presets.
+
+    The commands of those called ``anew`` may be others; with any of these a preset, too.
+    """
+    do = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
     before, digests = read_plan(run), preset_digests(cells)
     for path, digest in before.presets.items():
-        if digests.get(path, digest) != digest:
+        if digests.get(path, digest) != digest and not anew:
             raise UserError("this preset was changed since the sweep here was begun", path, do)
     by_place = {cell.out: cell for cell in cells}
     for cell in before.cells:
         if cell.out not in by_place:
             raise UserError(f"the sweep here has a cell that this one lacks: {cell.name}", run, do)
         old, new = _meaning(cell), _meaning(by_place[cell.out])
-        if old != new:
+        if old != new and cell.name not in anew:
             first, second = (
                 next((part for key, part in a.items() if b.get(key) != part), "") for a, b in ((old, new), (new, old))
             )

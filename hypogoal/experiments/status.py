@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST, check_files, find_input, open_artefact, sha256_of
+from hypogoal.core.drafts import drafts_in
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import duration
+from hypogoal.core.terminal import amount
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.run import find
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
@@ -22,6 +24,7 @@ from hypogoal.experiments.records import Record, is_running, last_line, log_of, 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
 STOPS = (None, 0, 130, 143, -2, -15)  # exit codes of cells that were stopped, or died with their runner
 MOST_SHOWN = 20
+INTERRUPTED = "interrupted; its command with --resume continues it"
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def lines(status: Status) -> list[str]:
     numbers = [f"{status.count(state)} {state}" for state in (DONE, RUNNING, FAILED)]
     left, held = status.count(STOPPED, WAITING, HELD), status.count(HELD)
     numbers.append(f"{left} left{f' ({held} wait for failed ones)' if held else ''}")
-    text = [f"{status.run}: {status.experiment}, {len(status.states)} cells: {', '.join(numbers)}"]
+    text = [f"{status.run}: {status.experiment}, {amount(len(status.states), 'cell')}: {', '.join(numbers)}"]
     if status.count(RUNNING, STOPPED, WAITING):
         seconds = status.seconds_left
         text.append(f"time left: {'not known yet' if seconds is None else f'about {duration(seconds)}'}")
@@ -127,6 +130,17 @@ def lines(status: Status) -> list[str]:
         if len(shown) > MOST_SHOWN:
             text.append(f"  and {len(shown) - MOST_SHOWN} more {state}")
     return text
+
+
+def in_the_making(path: Path) -> list[str]:
+    """A line for each output below a path that is not complete, and for its sweep how many cells are done."""
+    text = [f"{place}: {'in progress' if active else INTERRUPTED}" for place, active in drafts_in(path).items()]
+    try:
+        status = read_status(path)
+    except UserError:  # no sweep
+        return text
+    left = len(status.states) - status.count(DONE)
+    return [*text, f"{path}: {status.count(DONE)} of {amount(len(status.states), 'cell')} done"] if left else text
 
 
 def as_json(status: Status) -> dict[str, Any]:
@@ -161,7 +175,8 @@ def is_finished(cell: Cell) -> bool:
     if cell.stage in DERIVED:
         return not faults and is_current(cell)
     if faults:
-        raise UserError(faults[0], cell.out, "Move it out of the run to have it made again.")
+        do = f"Give --from {cell.stage}, or move it out of the run, to have it made again."
+        raise UserError(faults[0], cell.out, do)
     return True
 
 

@@ -235,6 +235,8 @@ def train(
                     **({"until_reached": solved} if until else {}),
                 )
                 progress.update(min(recorder.steps - begin, steps), **shown)
+            else:
+                progress.update(recorder.steps - begin)
             checkpoints.offer(state)
     if solved:
         progress.expect(recorder.steps - begin)
@@ -255,7 +257,7 @@ def check_fit(
             continue
         if before[key] != getattr(config, key):
             what = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
-            raise UserError(what, trained.path, f"Give --set {key}={before[key]}.")
+            raise UserError(what, trained.path, f"Give --set {key}={before[key]}, or leave it out.")
 
 
 def options_of(ensemble_config: Mapping[str, Any], config: PlayConfig) -> int:

@@ -8,6 +8,8 @@ from typing import Any
 from hypogoal.core import own_code
 from hypogoal.settings import configuration
 
+PLACE = "layout_seed"  # options of many layouts may be played in any
+
 
 def make(
     stage: str, source: str | Path, out: Path, settings: Mapping[str, Any], preset: str | None = None, **rest: Any
@@ -21,7 +23,8 @@ def make(
 
     by_user = isinstance(source, str)
     domain = source if isinstance(source, str) else domain_of(source, stage)
-    config = configuration(stage, domain, preset, (), settings, by_user=by_user)
+    inherited = inherited_of(stage, rest["options"]) if rest.get("options") else {}
+    config = configuration(stage, domain, preset, (), settings, by_user=by_user, inherited=inherited)
     values = [part for value in settings.values() for part in (value.split(",") if isinstance(value, str) else ())]
     trusted = [value for value in defaults_of(domain, stage, given=by_user).values() if isinstance(value, str)]
     first: Any = source
@@ -29,6 +32,15 @@ def make(
         first, rest["name"] = load_domain(domain, given=True), domain
     with own_code.given(*map(str.strip, values)), own_code.vouched(*trusted):
         return named(stage)(first, config, out, **rest)
+
+
+def inherited_of(stage: str, options: Path) -> dict[str, Any]:
+    """The settings of trained options that hold for a stage which continues them, unless others are given."""
+    from hypogoal.core.artefacts import open_artefact
+
+    trained = open_artefact(options, "options").config
+    fixed = import_module(named(stage).__module__).FIXED
+    return {name: trained[name] for name in fixed if name in trained and not (name == PLACE and trained.get("layouts"))}
 
 
 def named(stage: str) -> Any:

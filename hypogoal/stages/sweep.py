@@ -5,7 +5,7 @@
 
 import contextlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from hypogoal.core.compute import check_name
 from hypogoal.core.drafts import GO_ON, sole_writer, sweep_up
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.core.terminal import say
+from hypogoal.core.terminal import amount, say
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments import records
@@ -27,7 +27,7 @@ from hypogoal.experiments.named import CELLS, EXPERIMENTS, FIGURES, NAMES
 from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.runners import slurm
 from hypogoal.experiments.runners.local import run_cells
-from hypogoal.experiments.status import done_of, is_finished, stamp_of
+from hypogoal.experiments.status import done_of, is_finished, stamp_of, to_remake
 from hypogoal.experiments.toml_file import read_toml
 from hypogoal.settings import CONFIGS, TABLES
 
@@ -98,15 +98,29 @@ def _has_short_names(out: Path, *, otherwise: bool) -> bool:
         return otherwise
 
 
-def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
-    """Spec A6: :func:`sweep`, but an existing run is refused (``UserError``) unless resumed or forced."""
-    if out.exists() and not (force or resume):
-        raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
-    sweep(planned, out, force=force and not (resume and _is_begun(out, planned)), quiet=quiet, go_on=GO_ON)
+def run(
+    planned: Plan,
+    out: Path,
+    *,
+    force: bool = False,
+    resume: bool = False,
+    quiet: bool = False,
+    only: Set[str] = frozenset(),
+) -> None:
+    """Spec A6: :func:`sweep`, but an existing run is refused (``UserError``) unless resumed, forced or made in part."""
+    if out.exists() and not (force or resume or planned.anew):
+        do = "Give --resume to finish it, --from STAGE to make a part anew, --force to make all anew."
+        raise UserError("the run exists already", out, do)
+    if resume and (force or planned.anew) and _is_begun(out, planned, only):
+        planned, force = replace(planned, anew=frozenset()), False
+    sweep(planned, out, force=force and not planned.anew, quiet=quiet, go_on=GO_ON, only=only)
 
 
-def _is_begun(out: Path, planned: Plan) -> bool:
-    """Whether some of these cells are done and others are not: then ``--force --resume`` continues."""
+def _is_begun(out: Path, planned: Plan, only: Set[str]) -> bool:
+    """Whether what is to be made anew was begun and is not done: then ``--resume`` continues, whatever else is given.
+
+    Without ``--from`` and ``--only`` all cells are meant.
+    """
     try:
         before = records.read_plan(out)
         records.check_same(out, planned.cells)
@@ -114,7 +128,21 @@ def _is_begun(out: Path, planned: Plan) -> bool:
         raise
     except UserError:
         return False
+    if planned.anew:
+        return any(to_remake(before, out, cell) for cell in before.cells if cell.name in (only or planned.anew))
     return len(done_of(replace(planned, anew=before.anew), out)) < len(planned.cells)
+
+
+def to_run(planned: Plan, out: Path, only: Set[str] = frozenset()) -> list[Cell]:
+    """The cells that :func:`sweep` would run now; another sweep's folder is a ``UserError``."""
+    before, _ = _before(planned, out)
+    done = done_of(replace(planned, anew=planned.anew | before.anew), out)
+    todo = [cell for cell in planned.cells if cell.name in planned.anew or cell.out not in done]
+    chosen = [cell for cell in todo if not only or cell.name in only]
+    for cell in chosen if only else ():
+        if missing := {*cell.needs} - done - {other.out for other in chosen}:
+            raise UserError(f"{cell.name} needs what is not made yet", min(missing), "Leave out --only to make it.")
+    return chosen
 
 
 def sweep(
@@ -125,18 +153,20 @@ def sweep(
     quiet: bool = False,
     confirm: Callable[[str], None] | None = None,
     go_on: str = AGAIN,
+    only: Set[str] = frozenset(),
 ) -> Path:
     """Run unfinished cells on this machine and gather all numbers; returns ``results.csv``.
 
     It may be killed and started again at any time: finished cells are recognised and never run again, others continue
-    at their checkpoints. ``force``: make finished ones anew. ``confirm`` is called before something long begins and
-    raises if the answer is no. A user who interrupts the sweep reads ``go_on``. Another process that runs it, another
-    sweep's folder, or a cell that failed is a ``UserError``.
+    at their checkpoints. ``force``: make finished ones anew; without it those that the plan names. ``only``: run none
+    but these. ``confirm`` is called before something long begins and raises if the answer is no. A user who interrupts
+    the sweep reads ``go_on``. Another process that runs it, another sweep's folder, or a cell that failed is a
+    ``UserError``.
     """
     say = _speaker(quiet)
-    with _begun(planned, out, force, say, confirm) as planned:
+    with _begun(planned, out, force, say, confirm, only) as (planned, todo):
         try:
-            outcome = run_cells(planned, out, say=say)
+            outcome = run_cells(_alone(planned, todo) if only else planned, out, say=say)
         except KeyboardInterrupt as error:
             error.add_note(f"what is done is kept: {go_on}")
             raise
@@ -145,9 +175,14 @@ def sweep(
     if outcome.failed:
         name, reason = next(iter(outcome.failed.items()))
         rest = f", {len(outcome.waiting)} wait for them" if outcome.waiting else ""
-        problem = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {reason}"
-        raise UserError(problem, None, "Fix it, then start again: what is done is kept.")
-    say(f"all {len(planned.cells)} cells done")
+        problem = (
+            f"{len(outcome.failed)} of {amount(len(planned.cells), 'cell')} failed{rest}; the first is {name}: {reason}"
+        )
+        raise UserError(problem, None, f"Fix it, then {go_on}: what is done is kept.")
+    if only and (left := len(planned.cells) - len(done_of(planned, out))):
+        say(f"{amount(len(todo), 'cell')} made anew; {left} out of date, which are made without --only")
+    else:
+        say(f"{amount(len(planned.cells), 'cell')} done")
     return out / records.RESULTS
 
 
@@ -158,13 +193,15 @@ def submit(
     *,
     quiet: bool = False,
     confirm: Callable[[str], None] | None = None,
+    only: Set[str] = frozenset(),
 ) -> list[dict[str, Any]]:
     """Submit unfinished cells to Slurm; arguments and errors as of :func:`sweep`, returns the jobs."""
     slurm.check(out, options)
     at_once = options.cap or len(planned.cells)  # an upper bound: who else is in the queue is not known
-    with _begun(replace(planned, workers=at_once), out, False, _speaker(quiet), confirm) as planned:
-        done = done_of(planned, out)
-        todo = [cell for cell in planned.cells if cell.out not in done or not is_finished(cell)]
+    with _begun(replace(planned, workers=at_once), out, False, _speaker(quiet), confirm, only) as (planned, todo):
+        if not only:
+            done = done_of(planned, out)
+            todo = [cell for cell in planned.cells if cell.out not in done or not is_finished(cell)]
         return slurm.submit(planned, out, todo, options) if todo else []
 
 
@@ -172,11 +209,23 @@ def _speaker(quiet: bool) -> Callable[[str], None]:
     return (lambda text: None) if quiet else partial(say, err=True)
 
 
+def _alone(planned: Plan, cells: Sequence[Cell]) -> Plan:
+    """These cells, which wait for none but each other."""
+    made = {cell.out for cell in cells}
+    alone = [replace(cell, needs=tuple(need for need in cell.needs if need in made)) for cell in cells]
+    return replace(planned, cells=alone)
+
+
 @contextlib.contextmanager
 def _begun(
-    planned: Plan, out: Path, force: bool, say: Callable[[str], None], confirm: Callable[[str], None] | None
-) -> Iterator[Plan]:
-    """Before the first cell: check the folder, forecast the cost, ask, write the plan; gives the plan as written."""
+    planned: Plan,
+    out: Path,
+    force: bool,
+    say: Callable[[str], None],
+    confirm: Callable[[str], None] | None,
+    only: Set[str],
+) -> Iterator[tuple[Plan, list[Cell]]]:
+    """Before the first cell: check the folder, forecast the cost, ask, write the plan; it and the cells to run."""
     if out.exists() and not out.is_dir():
         raise UserError("a run needs a folder, this is a file", out, "Choose another --out.")
     check_parent(out)
@@ -186,29 +235,39 @@ def _begun(
         unplanned, lost = [], ""
         if force:
             planned = replace(planned, anew=frozenset(cell.name for cell in planned.cells))
-            todo = planned.cells
+            anew, todo = planned.anew, planned.cells
         else:
             before, lost = _before(planned, out)
-            names = {cell.name for cell in before.cells}
-            unplanned = [cell for cell in planned.cells if cell.name not in names and stamp_of(cell)]
-            planned = replace(planned, anew=before.anew)
-            done = done_of(planned, out)
-            todo = [cell for cell in planned.cells if cell.out not in done]
-        _forecast(planned, todo, say, confirm)
+            anew, todo = planned.anew, to_run(planned, out, only)
+            unplanned = [cell for cell in _doubted(before, planned) if cell.name not in anew and stamp_of(cell)]
+            planned = replace(planned, anew=before.anew | anew)
+        _forecast(replace(planned, cells=todo) if only else planned, todo, say, confirm)
         (out / records.LOGS).mkdir(parents=True, exist_ok=True)
         for folder in (out, out / records.LOGS):
             sweep_up(folder)
         _check_unplanned([cell for cell in unplanned if cell.stage not in DERIVED], lost, planned, out, say)
-        for cell in todo:  # before the plan is written: from now on a record means an attempt of this start
+        # Before the plan is written: from now on a record means an attempt of this start.
+        for cell in (cell for cell in planned.cells if cell in todo or cell.name in anew):
             record = records.read_record(out, cell)
-            if force:
+            if cell.name in anew:
                 (out / records.LOGS / f"{cell.name}.json").unlink(missing_ok=True)
             elif record.code:  # it is tried again
                 records.write_record(out, cell, replace(record, code=None))
             (out / records.FINISHED).unlink(missing_ok=True)
         planned = replace(planned, presets=records.preset_digests(planned.cells))
         records.write_plan(out, planned)
-        yield planned
+        yield planned, todo
+
+
+def _doubted(before: Plan, planned: Plan) -> list[Cell]:
+    """The cells that the folder's plan lacks, and those whose preset was changed since."""
+    names, digests = {cell.name for cell in before.cells}, records.preset_digests(planned.cells)
+    changed = {path for path, digest in before.presets.items() if digests.get(path) != digest}
+    return [
+        cell
+        for cell in planned.cells
+        if cell.name not in names or (changed and not changed.isdisjoint(records.preset_digests([cell])))
+    ]
 
 
 def _before(planned: Plan, out: Path) -> tuple[Plan, str]:
@@ -217,7 +276,7 @@ def _before(planned: Plan, out: Path) -> tuple[Plan, str]:
     if not (out / records.PLAN).exists():
         return empty, "the sweep's plan is gone" if (out / records.LOGS).is_dir() else ""
     try:
-        records.check_same(out, planned.cells)
+        records.check_same(out, planned.cells, planned.anew)
         return records.read_plan(out), ""
     except records.LostPlan as error:
         return empty, error.what

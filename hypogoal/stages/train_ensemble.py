@@ -26,13 +26,14 @@ from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, network_for
-from hypogoal.hypotheses.scores import best_threshold, halves, member_scores, ranking
+from hypogoal.hypotheses.scores import best_mean_worst, best_threshold, halves, member_scores, ranking
 from hypogoal.hypotheses.thresholds import thresholds
 from hypogoal.hypotheses.training import Look, Watcher, fit
 from hypogoal.hypotheses.views import StateOrigins, positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
+HELDOUT, LOOKED_AT = "heldout", 100  # in what the stage returns; states of each class, cheap beside training
 SUFFIXES = {LOG: ".jsonl", SCORES: ".scores"}  # of one sub-goal's part of these, beside its checkpoint
 
 
@@ -51,8 +52,8 @@ def train_ensemble(
     """Train the ensembles of every sub-goal of a data file and write the artefact ``out``.
 
     Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
-    of those of ``data``. Returns the last losses per sub-goal. An unknown sub-goal, unusable data, or an ``out`` that
-    exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
+    of those of ``data``. Returns per sub-goal the last losses and :func:`heldout_accuracy`. An unknown sub-goal,
+    unusable data, or an ``out`` that exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
     """
     device = prepare(device)
     load_objective(config.diversity)
@@ -217,4 +218,14 @@ def _train_one(
         checkpoints=checkpoints,
     )
     write_ensemble(folder, sub_goal, ensemble)
-    return {"sub_goal": sub_goal, **report.numbers}
+    return {"sub_goal": sub_goal, **report.numbers, HELDOUT: heldout_accuracy(ensemble, dataset, sub_goal)}
+
+
+def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dict[str, float]:
+    """Best, mean and worst member's balanced accuracy on some held-out states; NaN without states of both classes."""
+    try:
+        states = dataset.some_heldout(sub_goal, LOOKED_AT)
+        verdicts = ensemble.verdicts(states.observations, positions_of(states.origins))
+    except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
+        return best_mean_worst(np.full(len(ensemble), np.nan))
+    return best_mean_worst(member_scores(verdicts, states.labels)["balanced_accuracy"])

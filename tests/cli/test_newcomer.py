@@ -47,6 +47,7 @@ def test_help_ends_with_an_example_that_can_be_typed(name: str) -> None:
     text = "\n".join(lines)
     example = " ".join(text[text.index(" Example: ") :].split())
     assert example.startswith(f"Example: hypogoal {name} ")
+    assert [line.strip() for line in lines if line.strip()][-1] == example.removeprefix("Example: "), "a line to copy"
     options = {option for param in COMMANDS[name].params for option in param.opts}
     given = {word for word in example.split() if word.startswith("--")}
     assert given <= options | {"--out"}
@@ -126,6 +127,19 @@ def test_config_lists_stages_and_the_most_changed_first(capsys: pytest.CaptureFi
     assert max(len(line) for line in lines if line.startswith("      ")) <= 80
 
 
+@pytest.mark.parametrize("stage", [*STAGES, "run"])
+def test_config_fits_a_terminal(
+    stage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """80 columns; no mark-up; no range, setting or command is broken at a hyphen."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for domain in ("doorkey", "montezuma", "which-feature"):
+        assert main(["config", stage, "--domain", domain]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80 and not any("`" in line for line in lines)
+    assert not any(re.search(r"\w-$", line) for line in lines)
+
+
 def test_config_says_where_a_value_is_from(capsys: pytest.CaptureFixture[str]) -> None:
     """A domain's own defaults are not from DoorKey's table, a preset's are the preset's."""
 
@@ -192,23 +206,28 @@ def test_show_and_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     train = ["train-ensemble", str(data), "--out", str(run / "ensemble"), "--steps", "2", "--set", "workers=1"]
     assert main([*train, "--set", "sub_goals=collect-blue-key", "--set", "score_every=2"]) == 0
     result, then, path = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"best member's balanced accuracy 0?\.?[\d.]+, labelled loss [\d.]+", result)
+    assert re.fullmatch(r"held-out balanced accuracy: best member [\d.]+, mean [\d.]+, worst [\d.]+", result)
     assert then == f"next: hypogoal train-options {run}/ensemble --out {run}/options"
     assert path == str(run / "ensemble")
     quick = "--steps 60 --option-timeout 5 --set warm_up=100 --set max_episode_steps=20 --set random_episodes=1"
     options = ["train-options", path, "--out", str(run / "options"), "--layout-seed", "101", *quick.split()]
     assert main(options) == 0
     then = capsys.readouterr().out.splitlines()[-2]
-    assert then.startswith(f"next: hypogoal train-meta {path} --options {run}/options ")
-    following = then.removeprefix("next: hypogoal ").split()
-    assert main([*following, "--steps", "60", "--set", "max_episode_steps=20", "--set", "random_episodes=1"]) == 0
+    assert then == f"next: hypogoal train-meta {path} --options {run}/options --out {run}/meta"
+    following = [*then.removeprefix("next: hypogoal ").split(), "--steps", "60", "--set", "max_episode_steps=20"]
+    assert main([*following, "--set", "option_timeout=6"]) == 2
+    assert "trained with option_timeout=5, not 6" in capsys.readouterr().err
+    assert main([*following, "--set", "random_episodes=1"]) == 0
+    config = json.loads((run / "meta" / "manifest.json").read_text())["config"]
+    assert (config["option_timeout"], config["layout_seed"]) == (5, 101)  # as of the options
     assert capsys.readouterr().out.splitlines()[-2] == f"next: hypogoal evaluate {run}"
     assert main(["show", path]) == 0
     shown = capsys.readouterr().out.splitlines()
-    assert shown[0] == f"{path}: ensemble; {result}"
+    logged = shown[0].removeprefix(f"{path}: ensemble; ")
+    assert re.fullmatch(r"best member's balanced accuracy [\d.]+, labelled loss [\d.]+", logged)
     assert shown.index("config:") < shown.index("files:")
     assert main(["show", str(run)]) == 0
-    assert f"{path}: ensemble; {result}" in capsys.readouterr().out.splitlines()
+    assert f"{path}: ensemble; {logged}" in capsys.readouterr().out.splitlines()
     assert main([*options, "-q", "--force"]) == 0
     assert capsys.readouterr().out.splitlines() == [str(run / "options")]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import threading
@@ -12,6 +13,7 @@ import pytest
 from hypogoal.cli.common import print_outcome
 from hypogoal.core import progress
 from hypogoal.core.progress import Progress
+from hypogoal.core.terminal import screen
 
 
 def test_what_is_not_known_yet_is_not_said(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,3 +75,21 @@ def test_the_time_left_is_read_as_it_is_said(seconds: int) -> None:
     line = f"train-meta: 5/10 (2 s each, {progress.duration(seconds)} left), success 0.5"
     assert progress.said_left(line) == pytest.approx(seconds, rel=0.03)
     assert progress.said_left("train-meta: 10/10, success 0.5") is None
+
+
+def test_a_bar_has_a_pace_from_its_first_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within 80 columns: the time spent until something is done, then the rate."""
+    now, drawn = 0.0, io.StringIO()
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "screen", lambda **_: screen(width=80, file=drawn, force_terminal=True))
+    with Progress("train-meta", total=1_500_000) as bar:
+        now = 2.0
+        assert bar.pace() == "2 s so far"
+        bar.update(1_234_567, success=0.123, length=123.0)
+        assert bar.pace() == "617,284/s"
+        bar.update(1_234_568)
+        bar._bar.refresh()
+    lines = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line).strip() for line in re.split(r"[\r\n]", drawn.getvalue())]
+    last = next(line for line in reversed(lines) if line)
+    assert len(last) <= 80 and "1234568/1500000" in last and "617,284/s" in last and "success 0.123" in last, last

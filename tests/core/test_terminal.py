@@ -11,7 +11,7 @@ from toy_data import fill, write
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.terminal import draw, drawn, printable
+from hypogoal.core.terminal import amount, draw, drawn, printable, say
 from hypogoal.experiments.records import LOGS, PLAN
 
 TESTS = Path(__file__).parents[1]
@@ -55,6 +55,26 @@ def clean(text: str) -> bool:
 
 def shown(payload: str) -> str:
     return printable(payload)[-12:]
+
+
+def test_prose_wraps_at_words_on_a_terminal_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither a number nor a command is broken; a pipe gets one line, and what is to be copied is one everywhere."""
+    text = "train-ensemble: needs about 914 MB of memory, then train-options --option-timeout 118 or 0-9"
+    say(text, wrap=True)
+    assert capsys.readouterr().out == f"{text}\n"
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "30")
+    say(text, wrap=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert " ".join(lines) == text and max(map(len, lines)) <= 30 and len(lines) > 3
+    say(text)
+    assert capsys.readouterr().out == f"{text}\n"
+
+
+def test_amounts_have_a_singular() -> None:
+    assert [amount(count, "cell") for count in (0, 1, 2, 1_000)] == ["0 cells", "1 cell", "2 cells", "1,000 cells"]
 
 
 @pytest.mark.parametrize("name", PAYLOADS)

@@ -131,7 +131,7 @@ def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.Ca
     collect(ODD, config, tmp_path / "odd.h5", quiet=True)
     assert capsys.readouterr().err == ""
     collect(DOMAIN, SMALL, tmp_path / "corridor.h5", quiet=True)
-    told = "has 1 positives among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
+    told = "has 1 positive among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
     ends = "hypogoal: {} " + told + "bring recorded play (--play FILE) or a policy that gets there."
     assert capsys.readouterr().err.splitlines() == [ends.format("left-end"), ends.format("right-end")]
     one = replace(SMALL, heldout_seeds=(4,), steps=60, max_episode_steps=2)  # the right end is three steps away

@@ -4,8 +4,13 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import pytest
+from works import work_of
 
+from hypogoal.evaluation.choosing import FROZEN, UNIFORM
+from hypogoal.evaluation.curves import Run
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import ONE, ensemble_title, plain
 from hypogoal.evaluation.table import Row
 from hypogoal.evaluation.verdict import (
@@ -18,10 +23,12 @@ from hypogoal.evaluation.verdict import (
     WORSE,
     baselines,
     compare,
+    findings,
     outcome_of,
     sentence,
     verdict,
 )
+from hypogoal.options.tables import Episodes
 
 
 def pairs_of(*shares: tuple[float, float], layouts: bool = True) -> list[tuple[Row, Row]]:
@@ -164,3 +171,80 @@ def test_names_of_ensembles_for_people(name: str, title: str) -> None:
 
 def test_nan_bounds_are_those_of_one_unit() -> None:
     assert outcome_of(0.5, math.nan, math.nan) == BETTER
+
+
+def agent(chooser: str, members: int) -> Run:
+    """A trained agent of D-BAT's members, whose episodes do not matter here."""
+    ensemble = f"dbat, K={members}"
+    config = {"chooser": chooser, "members": members, "termination": "learned", "ensemble": ensemble}
+    none = np.zeros(0, np.bool_)
+    return Run("meta", chooser, 7, config, Episodes(none, none, none, none), {})
+
+
+def run_of(shares: dict[str, list[float]], played: dict[str, list[float]] | None = None, **agents: Run) -> Work:
+    """The work on a run: by agent the shares solved at the end of training, and those ``played`` frozen, by layout."""
+    work = work_of()
+    work.agents = {name: [one] for name, one in agents.items()}
+    for scope, table in (("", shares), (FROZEN, played or {})):
+        for method, values in table.items():
+            owner = "several" if method == UNIFORM else method
+            work.rows += [
+                Row("success", value, method, layout=layout, seed=7, artefact=f"{owner}-{layout}", scope=scope)
+                for layout, value in enumerate(values)
+            ]
+    return work
+
+
+SEVERAL, SINGLE, RANDOMLY = agent("ppo", 3), agent("ppo", 1), agent("random", 3)
+
+
+def test_an_agent_is_compared_with_uniform_choice_among_its_own_options() -> None:
+    """Frozen play, even where an agent that chose at random is there too, and training says the contrary."""
+    work = run_of(
+        {"several": [0.0, 0.0, 0.0], "randomly": [1.0, 1.0, 1.0]},
+        {"several": [1.0, 0.9, 1.0], UNIFORM: [0.2, 0.1, 0.3]},
+        several=SEVERAL,
+        randomly=RANDOMLY,
+    )
+    (finding,) = findings(work)
+    assert finding.second == "uniform-random choice among its own options"
+    assert (finding.subject, finding.outcome, finding.units) == (CHOOSING, BETTER, 3)
+    assert (finding.success, finding.other) == pytest.approx((2.9 / 3, 0.2))
+
+
+def test_without_frozen_play_an_agent_is_compared_with_one_that_chose_at_random() -> None:
+    """At the end of training, run by run; that one has learned options of its own, and the finding says so."""
+    work = run_of({"several": [0.2, 0.1, 0.3], "randomly": [1.0, 0.9, 1.0]}, several=SEVERAL, randomly=RANDOMLY)
+    (finding,) = findings(work)
+    assert finding.second == "an agent whose choice is uniform-random"
+    assert (finding.outcome, finding.success, finding.other) == (WORSE, pytest.approx(0.2), pytest.approx(2.9 / 3))
+
+
+def test_frozen_play_of_the_agent_alone_does_not_replace_the_fallback() -> None:
+    """Without uniform-random choice among the same options there is nothing frozen to compare with."""
+    work = run_of(
+        {"several": [0.9, 0.9, 0.9], "randomly": [0.9, 0.9, 0.9]},
+        {"several": [1.0, 1.0, 1.0]},
+        several=SEVERAL,
+        randomly=RANDOMLY,
+    )
+    (finding,) = findings(work)
+    assert (finding.outcome, finding.success) == (ALIKE, pytest.approx(0.9))
+
+
+def test_only_runs_of_the_same_layout_and_seed_are_compared() -> None:
+    work = run_of({"several": [0.9, 0.2]}, several=SEVERAL, randomly=RANDOMLY)
+    work.rows += [Row("success", 0.4, "randomly", layout=1, seed=7), Row("success", 0.9, "randomly", layout=0, seed=8)]
+    (finding,) = findings(work)
+    assert (finding.units, finding.success, finding.other) == (1, 0.2, 0.4)
+
+
+def test_several_members_are_compared_with_one_classifier() -> None:
+    """Both frozen where both have played so, else both in training; one classifier alone has no finding."""
+    trained = {"several": [0.5, 0.5, 0.5], "single": [0.5, 0.5, 0.5]}
+    both = run_of(trained, {"several": [1.0, 0.9, 1.0], "single": [0.3, 0.2, 0.3]}, several=SEVERAL, single=SINGLE)
+    one = run_of(trained, {"several": [1.0, 0.9, 1.0]}, several=SEVERAL, single=SINGLE)
+    assert [(each.subject, each.outcome, each.second) for each in findings(both)] == [(HYPOTHESES, BETTER, ONE)]
+    assert [(each.subject, each.outcome) for each in findings(one)] == [(HYPOTHESES, ALIKE)]
+    assert list(findings(run_of({"single": [0.5]}, single=SINGLE))) == []
+    assert list(findings(run_of({"randomly": [0.5]}, randomly=RANDOMLY))) == []

@@ -226,7 +226,7 @@ def test_the_cost_is_that_of_the_cells_given_shared_among_the_workers() -> None:
     assert "at once at most 4.0 GB of memory" in cost_lines(cells, 2)[-1]
     assert cost_lines(cells, 4)[0].split()[:5] == ["collect", "3", "x", "80", "min,"]
     unknown = [Cell("x", ("collect",), OUT / "x")]
-    assert cost_lines(unknown, 2)[-1].startswith("1 commands: time not known")
+    assert cost_lines(unknown, 2)[-1].startswith("1 command: time not known")
 
 
 def test_every_cell_of_a_named_experiment_has_a_cost_and_a_place() -> None:

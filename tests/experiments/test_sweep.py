@@ -210,7 +210,7 @@ def test_a_cell_is_done_when_its_output_is_there(
     words = ["sweep", str(toml), "--out", str(out), "-q"]
     assert main(words) == 2
     err = capsys.readouterr().err
-    assert "1 of 1 cells failed" in err and "own code has left the process" in err and err.count("\n") == 1
+    assert "1 of 1 cell failed" in err and "own code has left the process" in err and err.count("\n") == 1
     assert [one.state for one in read_status(out).states] == ["failed"]
     job = [sys.executable, "-m", "hypogoal", "sweep", "--out", str(out), "--cell", "data"]
     done = subprocess.run(job, cwd=ROOT, capture_output=True, text=True)

@@ -50,7 +50,7 @@ def test_doctests(in_demo: None, name: str) -> None:
 
 def test_the_page_of_the_library(in_demo: None) -> None:
     """docs/library.md: its blocks one after the other, as one program."""
-    space: dict[str, object] = {}
+    space: dict[str, object] = {"__name__": "__main__"}
     code = blocks(ROOT / "docs" / "library.md", "python")
     assert len(code) >= 5
     for block in code:

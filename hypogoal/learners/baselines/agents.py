@@ -95,6 +95,8 @@ class _Watch(BaseCallback):
                 self.log.write(step=episodes.steps, episodes=len(episodes), **numbers)
             if self.progress:
                 self.progress.update(min(episodes.steps, self.progress.total), success=numbers["success"])
+        elif self.progress:
+            self.progress.update(episodes.steps)
         return True
 
 
