@@ -435,12 +435,15 @@ def _bars(material: Material) -> Drawn:
     seeds = sorted({row["seed"] for row in distance["options"]})
     ladders = distance["over_ladders"][0]["ladders"]
     caption = (
-        "Figure 4 of the paper: distance of the best member of each ladder, mean over the ladders "
-        f"{page.listed(ladders)}; bars: mean over seeds ({page.listed(seeds)}), whiskers: ± one standard deviation "
-        "over seeds, dots: each seed. Lower is better. The paper's error bars are the deviation over the last 100 "
-        "executions instead: in the table."
+        "Figure 4 of the paper: distance of the best member of each ladder, mean over ladders; bars: mean over seeds, "
+        "whiskers: ± one standard deviation over seeds, dots: each seed. Lower is better. The paper's error bars are "
+        "the deviation over the last 100 executions instead: in the table."
     )
-    return Drawn("figure4", name, drawn, caption, "No seed has executions on all ladders of the run.")
+    runs, nothing = (
+        f"Ladders: {page.listed(ladders)}; seeds: {page.spans(seeds)}.",
+        "No seed has executions on all ladders of the run.",
+    )
+    return Drawn("figure4", name, drawn, caption, runs, nothing)
 
 
 def _stops(material: Material) -> list[Drawn]:

@@ -238,12 +238,10 @@ def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int,
 
     pictures = [Image.fromarray(draw_frame(frame, sub_goals, members, timeout)) for frame in frames]
     pictures = [picture.quantize(64, dither=Image.Dither.NONE) for picture in pictures]
-    times, before = [], (-1, (False,))
-    for frame in frames:
-        now = (frame.option, frame.predictions)
-        differ = len(set(frame.predictions)) > 1 and now != before
+    times = []
+    for before, frame in zip([None, *frames], frames, strict=False):
+        differ = len(set(frame.predictions)) > 1 and (before is None or before.predictions != frame.predictions)
         times.append(END if frame.ended else PAUSE if differ else STEP)
-        before = now
     times[-1] = LAST
     buffer = io.BytesIO()
     pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=times, loop=0, optimize=False)

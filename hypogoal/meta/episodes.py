@@ -17,6 +17,7 @@ from hypogoal.meta.training import ONE_LAYOUT, assemble, continue_with
 from hypogoal.options.loop import OptionLoop, Transitions
 
 REPLAY = 1_000  # nothing is learned: a small one
+SOLVED = "solved"  # why the last option of an episode ended
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,8 @@ def play_episode(loop: OptionLoop, members: int) -> list[Frame]:
         frames.append(Frame(before[0], step, option, before[1], left + 1, ""))
         if moved.ended[0]:
             why = "its classifier is positive" if after[1][option - first] else "the episode is cut"
-            why = "the task is over" if moved.terminated[0] else "its time is up" if moved.timed_out[0] else why
+            over = SOLVED if moved.terminated[0] and loop.recorder.episodes[-1][4] else "the episode, unsolved"
+            why = over if moved.terminated[0] else "its time is up" if moved.timed_out[0] else why
             frames.append(Frame(after[0], step + 1, option, after[1], left, why))
     return frames
 

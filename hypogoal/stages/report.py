@@ -14,9 +14,12 @@ from hypogoal.core.files import replace_text, replacing
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
 
+if TYPE_CHECKING:
+    from hypogoal.meta.episodes import Frame
+
 KINDS = ("svg", "pdf", "png")
 MOST_BYTES = 2_000_000  # of a film on the page
-TRIES = 8  # episodes, for one in which members differ
+MOST_FRAMES = 200  # played for the page's film, till an episode has members that differ
 
 
 def report(run: Path, *, videos: int | None = None, force: bool = False, resume: bool = False) -> Path:
@@ -94,7 +97,7 @@ class NoAgent(UserError):
 def play_films(agents: Sequence[Artefact], run: Path, count: int | None) -> list[Film]:
     """Spec E1: ``count`` episodes of the agents in turn, played from their saved weights.
 
-    None: one of the first agent, the first in which members of the running sub-goal differ, of so many ``TRIES``.
+    None: one of the first agent, the first that :func:`_tells` within ``MOST_FRAMES``, else the first of all.
     """
     from hypogoal.meta.episodes import agent_of, play_episode
 
@@ -103,10 +106,10 @@ def play_films(agents: Sequence[Artefact], run: Path, count: int | None) -> list
         if loop.engine.observation_dtype != PICTURE:
             raise NoAgent("videos need an agent that sees pictures", artefact.path, "Leave --videos out.")
     if count is None:
-        played: list[list[Frame]] = []
-        while len(played) < TRIES and not (played and _differ(played[-1])):
-            played.append(play_episode(loops[0], agents[0].config["members"]))
-        number = len(played) - 1 if _differ(played[-1]) else 0
+        members, played = agents[0].config["members"], [play_episode(loops[0], agents[0].config["members"])]
+        while sum(map(len, played)) < MOST_FRAMES and not _tells(played[-1], members):
+            played.append(play_episode(loops[0], members))
+        number = len(played) - 1 if _tells(played[-1], members) else 0
         return [_film(agents[0], run, number, played[number])]
     films = []
     for index in range(count):
@@ -116,8 +119,13 @@ def play_films(agents: Sequence[Artefact], run: Path, count: int | None) -> list
     return films
 
 
-def _differ(frames: Sequence[Frame]) -> bool:
-    return any(len(set(frame.predictions)) > 1 for frame in frames)
+def _tells(frames: Sequence[Frame], members: int) -> bool:
+    """Whether the agent took the right one of members that differ: the last option's own ended a solved episode."""
+    from hypogoal.meta.episodes import SOLVED
+
+    last = frames[-1]
+    right = last.ended == SOLVED and last.predictions[last.option % members]
+    return right and any(len(set(frame.predictions)) > 1 for frame in frames)
 
 
 def _film(artefact: Artefact, run: Path, number: int, frames: Sequence[Frame]) -> Film:
@@ -128,9 +136,9 @@ def _film(artefact: Artefact, run: Path, number: int, frames: Sequence[Frame]) -
     gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
     steps, options = frames[-1].step, sum(bool(frame.ended) for frame in frames)
     caption = (
-        f"An episode of {path}, layout {config['layout_seed']}: {steps} step{'' if steps == 1 else 's'}, {options} "
-        f"option{'' if options == 1 else 's'}. Below each state: the option that runs, the steps left to it (the bar), "
-        f"and {_boxes(config['members'])}."
+        f"Episode {number} of {path}, layout {config['layout_seed']}: {steps} step{'' if steps == 1 else 's'}, "
+        f"{options} option{'' if options == 1 else 's'}. Below each state: the option that runs, the steps left to it "
+        f"(the bar), and {_boxes(config['members'])}."
     )
     return Film(artefact, f"{path.replace('/', '-')}-episode-{number}.gif", caption, gif)
 
@@ -168,7 +176,8 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
             if drawing.figure is not None:
                 with replacing(path) as fresh:
                     fresh.write_bytes(to_file(drawing.figure, drawing.stem, kind))
-        text = [f"## {path.name}\n\n{escape(drawing.caption, quote=False)}\n" for path, drawing in files.items()]
+        captions_of = {path: " ".join(filter(None, (drawing.caption, drawing.runs))) for path, drawing in files.items()}
+        text = [f"## {path.name}\n\n{escape(caption, quote=False)}\n" for path, caption in captions_of.items()]
         replace_text(captions, "\n".join([*text, *(f"{line}\n" for line in missing)]))
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None

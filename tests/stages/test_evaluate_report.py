@@ -357,7 +357,7 @@ def test_the_page_shows_all_of_it(run, page):
     drawn = {path.name.rpartition(".")[0] for path in (run / "report" / "figures").iterdir()}
     assert {*FIGURES, "figure7", "figure8"} <= drawn
     assert page.count("<figure") == 1 + len(drawn) and page.count("data:image/gif;base64,") == 1
-    assert re.search(r"An episode of meta, layout 100: \d+ steps", page)
+    assert re.search(r"Episode \d of meta, layout 100: \d+ steps", page)
     assert page.count("<h3>Seed by seed: ") == 1, "one run of an agent is no table of pairs"
     assert "1 run: layout seed 100, run seed 0" in page
     assert "Figure 6 of the paper" in page

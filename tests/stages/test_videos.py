@@ -170,14 +170,16 @@ def test_a_run_without_such_an_agent_is_one_line(tmp_path):
 
 
 def test_the_film_of_a_page_is_one_in_which_members_differ(run, monkeypatch):
-    """Spec E1, F7: the first of a few episodes; where they differ in none, the first of all."""
+    """Spec E1, F7: the first of a few that the right one of two members solves; where there is none, the first."""
     from hypogoal.meta import episodes
 
-    frame = Frame(np.zeros((8, 8, 3), np.uint8), 0, 0, (False, False), 5, "the task is over")
-    plays = [[frame], [frame], [frame, replace(frame, predictions=(True, False))], [frame]]
+    frame = Frame(np.zeros((8, 8, 3), np.uint8), 0, 0, (True, True), 5, "solved")
+    differ = replace(frame, predictions=(True, False))
+    wrong = [replace(frame, ended="the episode, unsolved"), replace(frame, predictions=(False, True))]
+    plays = [[frame], *([differ, last] for last in wrong), [differ, frame], [frame]]
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: plays.pop(0))
     (film,) = play_films(agents_of(run), run, None)
-    assert film.name == "meta-episode-2.gif" and len(plays) == 1
+    assert film.name == "meta-episode-3.gif" and len(plays) == 1
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
     assert play_films(agents_of(run), run, None)[0].name == "meta-episode-0.gif"
 
