@@ -279,6 +279,11 @@ def spans(numbers: Iterable[int]) -> str:
     return listed([text for row in rows for text in (row if len(row) < 3 else [f"{row[0]} to {row[-1]}"])])
 
 
+def states(count: int) -> str:
+    """'1 state', '37 states'."""
+    return f"{count:,} state{'' if count == 1 else 's'}"
+
+
 def fixed(value: float | None, digits: int) -> str:
     """A number with a fixed number of decimals; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}f}"

@@ -20,6 +20,7 @@ MOST_SIDE = 128  # pixels of a picture on the page
 COLOURS = 256  # that a PNG's palette holds
 LEVELS, SHADES = 12, 6  # steps of an attribution's strength and of the state behind it, so that a palette holds all
 AGAINST, FOR = (0, 114, 178), (213, 94, 0)  # Okabe and Ito's blue and vermillion: a pair that all readers tell apart
+STATES = "termination-states"  # in an evaluation's arrays: of how many states each option's overlay is
 FEW = 200  # states whose median is taken for what is usual
 MOST_STATES = 60  # on a sheet
 COLUMNS = 10
@@ -117,7 +118,7 @@ def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     unusual = states != usual
     if states.shape[-1] == 3:  # a colour is one thing, a stack's frames are several
         unusual = np.repeat(unusual.any(-1, keepdims=True), 3, axis=-1)
-    whole = unusual.sum((1, 2, 3)).argmin()
+    whole = unusual.reshape(len(states), -1).sum(1).argmin()
     shown, count = states[whole], unusual.sum(0)
     others = np.where(unusual, states, 0).sum(0, dtype=np.float64) / np.maximum(count, 1)
     return np.where((count > 0) & ~unusual[whole], (shown + others) / 2, shown).round().astype(np.uint8)

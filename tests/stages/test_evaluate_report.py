@@ -439,6 +439,8 @@ def test_arrays_say_what_the_report_draws(run, metrics):
             assert arrays[f"curves/{index}/reward"].shape == (len(agent["runs"]), len(grid))
         some = next(iter(arrays["terminations/meta"].values()))
         assert some.shape == (64, 64, 3)
+        counts = arrays["termination-states/meta"][()]
+        assert [str(option) for option in np.flatnonzero(counts)] == sorted(arrays["terminations/meta"], key=int)
 
 
 @pytest.mark.parametrize("damage", ["episodes.csv", "choices.csv", "layout.json", "terminations.h5"])
