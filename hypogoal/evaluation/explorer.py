@@ -21,9 +21,9 @@ from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, STATES, attribution_png, brightness, flat, reduced, to_bytes
 from hypogoal.evaluation.table import Row
 
-MOST_STATES = 300  # over all sub-goals: the page of ten DoorKey agents has 1.2 MB, of the ladders 1.7 MB
+MOST_STATES = 300  # over all sub-goals: the page of the ladders has 1.4 MB
 MOST_OF_ONE = 180  # of one sub-goal
-MOST_EXPLAINED = 120  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
+MOST_EXPLAINED = 90  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
 MOST_INTEGRATED = 12  # where they are integrated gradients: of a large network seconds
 PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 TITLE = "Explore the hypotheses"

@@ -144,7 +144,7 @@ def figures(material: Material) -> list[Drawn]:
         "Dotted: always the same answer."
     )
     title, nothing = "Members' balanced accuracy on held-out states", "No held-out states have both classes."
-    return [Drawn("members", title, drawn, caption, f"Ensemble seeds: {page.spans(seeds)}.", nothing)]
+    return [Drawn("members", title, drawn, caption, f"Ensemble seeds {page.spans(seeds)}.", nothing)]
 
 
 def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:

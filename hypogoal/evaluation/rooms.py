@@ -263,7 +263,7 @@ def figures(material: Material) -> Iterator[Drawn]:
         nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
         title, drawn = "Figure 3: members against labelled ladder groups", scores_over_groups(rows, panels)
         suffix = f"-{rows[0]['sub_goal']}" if len(by_sub_goal) > 1 else ""
-        yield Drawn(f"figure3{suffix}", title, drawn, caption, f"Ensemble seeds: {page.spans(seeds)}.", nothing)
+        yield Drawn(f"figure3{suffix}", title, drawn, caption, f"Ensemble seeds {page.spans(seeds)}.", nothing)
 
 
 def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:

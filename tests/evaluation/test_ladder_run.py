@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from ladder_run import ROOMS, SUB_GOAL, executions, write_data, write_members, write_options, write_run
+from openings import agrees
 from rich.console import Console
 from toy_data import reseal
 
@@ -60,6 +61,12 @@ def metrics(run):
 @pytest.fixture(scope="module")
 def page(run, metrics):
     return report(run).read_text(encoding="utf-8")
+
+
+def test_the_page_opens_with_a_verdict_of_its_numbers(run, page):
+    """Spec I1: options of several members against those of one classifier, recomputed from ``numbers.csv``."""
+    task = "The reward and the end of an episode are those of the domain 'ladder_run:DOMAIN'"
+    agrees(run, task, "Several hypotheses made no difference over 2 ladders: options", "Two runs are not evidence")
 
 
 def test_members_are_judged_room_by_room(run, metrics):

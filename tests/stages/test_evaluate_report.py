@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import h5py
 import numpy as np
 import pytest
+from openings import agrees
 from rich.console import Console
 
 from hypogoal.cli import main
@@ -71,6 +72,11 @@ def metrics(run):
 @pytest.fixture(scope="module")
 def page(run, metrics):
     return report(run).read_text(encoding="utf-8")
+
+
+def test_the_page_opens_with_the_task_and_a_verdict_of_its_numbers(run, page):
+    """Spec I1: recomputed from ``numbers.csv``, with what a baseline was given beside it."""
+    agrees(run, "Take the red key, open the red door and reach the goal", "One run is not", "On primitive actions")
 
 
 def test_agents_are_grouped_and_counted_whole(run, metrics):
