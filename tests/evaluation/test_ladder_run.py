@@ -276,7 +276,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     assert "At N=3 no unseen room has a ladder base left" in page
     assert "Ensemble seeds 0 and 1" in page
     assert "A member that is never positive has accuracy 0.86 (N=1), 0.86 (N=2) and 0.86 (N=3)" in page
-    assert "mean over the ladders 1L and 2-6" in page
+    assert "Ladders: 1L and 2-6; seeds: 0 and 1." in page
     assert "not drawn" not in re.sub(r"rooms that are not drawn none", "", page)
     assert "Missing in this run" not in page
     names = {path.stem for path in (run / "report" / "figures").iterdir()}
