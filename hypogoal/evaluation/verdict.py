@@ -155,7 +155,8 @@ def tasks(work: Work) -> list[str]:
         config = work.artefact(runs[0].path).config
         sentences.append(" ".join(filter(None, [task_of(config), cap_of(config, work.agents[name])])))
     sentences += [task_of(artefact.config) for artefact in work.contents.ladders] if not sentences else []
-    return list(dict.fromkeys(filter(None, sentences)))
+    longest = [text for text in sentences if not any(other != text and other.startswith(text) for other in sentences)]
+    return list(dict.fromkeys(filter(None, longest)))
 
 
 def scenes(work: Work) -> list[dict[str, Any]]:
