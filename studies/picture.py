@@ -71,11 +71,12 @@ def main() -> None:
         for chooser in ("agent", "uniform")
     ]
     names = {"dbat": "D-BAT", "one": "one classifier"}
+    who = {"agent": "agent", "uniform": "uniform-random\nchoice"}
     draw(
         right,
         [
-            (f"{'agent' if who == 'agent' else 'chance'},\n{names[method]}", values, INK if who == "agent" else PALE)
-            for who, method, values in pairs
+            (f"{who[chooser]},\n{names[method]}", values, INK if chooser == "agent" else PALE)
+            for chooser, method, values in pairs
         ],
     )
     right.set_title("A wrong key ends the episode:\nchoosing decides, the ensemble does not", fontsize=10)

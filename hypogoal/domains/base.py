@@ -53,6 +53,14 @@ class Step(NamedTuple):
     succeeded: NDArray[np.bool_] | None = None
 
 
+class Scene(NamedTuple):
+    """A picture, uint8 (H, W, 3), its title, and whether each feature that it is about holds in it."""
+
+    picture: NDArray[np.uint8]
+    title: str
+    features: Mapping[str, bool]
+
+
 class Plan(NamedTuple):
     """The transitions between the states reachable from the start."""
 
@@ -384,6 +392,10 @@ class Domain(ABC):
         ``world``: as of :meth:`world`; settings that it lacks have their defaults.
         """
         return f"The reward and the end of an episode are those of the domain '{self.name}'."
+
+    def scenes(self, world: Mapping[str, Any]) -> Sequence[Scene]:
+        """Pictures for a report's first screens, of what competes in the task; none where its film shows it."""
+        return ()
 
     def small(self, config: Any) -> Any:
         """The settings with which ``check`` collects: ``config`` with fewer states."""

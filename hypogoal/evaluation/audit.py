@@ -123,7 +123,7 @@ def _film(loop: OptionLoop, path: NDArray[np.int64], option: int) -> bytes:
     timeout = loop.config.option_timeout
     states = zip(loop.engine.images(path), loop.terminations.of(path)[:, option].tolist(), strict=True)
     frames = [
-        Frame(picture, step, option, positive, timeout - step, "") for step, (picture, positive) in enumerate(states)
+        Frame(picture, step, option, (positive,), timeout - step, "") for step, (picture, positive) in enumerate(states)
     ]
     return episode_gif([*frames[:-1], replace(frames[-1], ended="fooled")], POLICIES, 1, timeout)
 

@@ -213,9 +213,9 @@ COLUMNS = (
     page.number("solved", "success", page.spread, 2),
     page.number(*NEARLY, page.spread, 2),
     page.number("steps", "length", page.spread, 1),
-    page.number("within-rho", "within_rho", page.spread, 2),
-    page.number("better of two", "pair", page.spread, 2),
-    page.number("score", "score", page.spread, 2),
+    page.number("preference follows quality (within-rho)", "within_rho", page.spread, 2),
+    page.number("better of two taken", "pair", page.spread, 2),
+    page.number("quality gained, of the most possible (score)", "score", page.spread, 2),
     page.number("runs", "success.n"),
 )
 
@@ -241,9 +241,10 @@ def sections(material: Material) -> list[Block]:
         "The trained agent plays without learning: the first episodes of each of many environments, as many in each. "
         "For comparison, uniform-random choice plays with the agent's own final options. An "
         "option's quality is the share of its executions that reach the true sub-goal, begun where agents decide. "
-        "Choice is judged among the members of the sub-goal that was chosen: the rank correlation of preference with "
-        "quality, how often the better of two that differ by .2 is taken (.5 at random), and how much of the way from "
-        "the mean to the best quality it goes (0 at random)."
+        "Choice is judged among the members of the sub-goal that was chosen. Within-rho: the rank correlation of "
+        "preference with quality (1: the better, the more often chosen; 0 at random). Better of two taken: how often, "
+        "of two whose qualities differ by .2 (.5 at random). Score: how much of the way from the mean to the best "
+        "quality the choices go (1: always the best; 0 at random)."
     )
     table = page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED)
     return [page.section("choosing", TITLE, [text], [table])]

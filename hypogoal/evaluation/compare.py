@@ -165,8 +165,8 @@ def _runs(comparison: Entry) -> Block:
         page.label("run", "label"),
         page.label("folder", "path"),
         page.label("artefacts", lambda run: str(run["artefacts"])),
-        page.label("seeds", lambda run: page.listed(run["seeds"])),
-        page.label("layouts", lambda run: page.listed(run["layout_seeds"])),
+        page.label("seeds", lambda run: page.spans(run["seeds"])),
+        page.label("layouts", lambda run: page.spans(run["layout_seeds"])),
     ]
     labels = [run["label"] for run in comparison["runs"]]
     text = (
@@ -208,11 +208,13 @@ def _curves(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
             counts = "; ".join(f"{run}, {curves.runs_of(agent)}" for run, _, agent in shown)
             caption = (
                 f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and "
-                f"seeds; {curves.BANDS} over them ({counts})."
+                f"seeds; {curves.BANDS} over them."
             )
             title = f"{heading}: {name}"
             kind = "reward" if quantity == "reward" else "length"
-            yield Drawn(f"{kind}-{number}", title, curves.learning_curves(lines, quantity), caption, heading=title)
+            yield Drawn(
+                f"{kind}-{number}", title, curves.learning_curves(lines, quantity), caption, f"{counts}.", heading=title
+            )
 
 
 def _pairs(comparison: Mapping[str, Any]) -> Block:

@@ -387,10 +387,12 @@ def runs_of(agent: Entry) -> str:
     """How many runs an agent has, and of which layouts and seeds."""
     runs = agent["runs"]
     seeds = sorted({run["seed"] for run in runs})
-    layouts = sorted({run.get("layouts") or run["layout_seed"] for run in runs}, key=str)
+    layouts = {run["layout_seed"] for run in runs if not run.get("layouts")}
+    texts = [page.spans(layouts)] if layouts else []
+    texts += sorted({run["layouts"] for run in runs if run.get("layouts")})
     return (
-        f"{len(runs)} run{'s' if len(runs) > 1 else ''}: layout seed{'s' if len(layouts) > 1 else ''} "
-        f"{page.listed(layouts)}, run seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}"
+        f"{len(runs)} run{'s' if len(runs) > 1 else ''}: layout seed{'s' if len(layouts) != 1 else ''} "
+        f"{page.listed(texts)}, run seed{'s' if len(seeds) > 1 else ''} {page.spans(seeds)}"
     )
 
 
@@ -449,11 +451,11 @@ def _curve(material: Material, quantity: str) -> Drawn | None:
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
         f"{f'{which_figure}{title.lower()}' if of_paper else title}, mean of the last 100 episodes at each step."
-        f"{practice}{several} {titled(agents[0]['name'])}: {runs_of(agents[0])}; other agents' runs: numbers.csv."
-        f"{reference}"
+        f"{practice}{several}{reference}"
     )
-    name = "reward" if quantity == "reward" else "length"
-    return Drawn(name, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
+    more = "; other agents' runs: numbers.csv" if len(agents) > 1 else ""
+    name, file = ("reward", "figure6") if quantity == "reward" else ("length", "figure6-length")
+    return Drawn(name, title, drawn, caption, f"{titled(agents[0]['name'])}: {runs_of(agents[0])}{more}.", file=file)
 
 
 @dataclass(frozen=True)

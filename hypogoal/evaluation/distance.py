@@ -35,7 +35,7 @@ from hypogoal.evaluation.numbers import (
     over,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.pictures import overlay
+from hypogoal.evaluation.pictures import STATES, overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
 from hypogoal.evaluation.rooms import VALIDATION, group_name
 from hypogoal.evaluation.run import read_terminations, takes, thresholds_of, within
@@ -217,8 +217,11 @@ def rows(work: Work) -> Iterator[Row]:
         path, config = work.contents.name(artefact), artefact.config
         executions = Executions.read(artefact.path / "executions.csv")
         if "terminations.h5" in artefact.manifest["files"]:
-            for option, states in read_terminations(artefact.path / "terminations.h5").items():
+            ends = read_terminations(artefact.path / "terminations.h5")
+            for option, states in ends.items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
+            every = range(len(config["sub_goals"]) * config["members"])
+            work.arrays[f"{STATES}/{path}"] = np.array([len(ends.get(option, ())) for option in every], np.int64)
         more: dict[str, Any] = {"masked": config["mask_reached"], "thresholds": thresholds_of(artefact)}
         more |= {**place, "ladder": config["start"], "seed": artefact.seed, "artefact": path}
         yield from rows_of_ladder(executions, config["sub_goals"], config["members"], validated, **more)
@@ -435,12 +438,15 @@ def _bars(material: Material) -> Drawn:
     seeds = sorted({row["seed"] for row in distance["options"]})
     ladders = distance["over_ladders"][0]["ladders"]
     caption = (
-        "Figure 4 of the paper: distance of the best member of each ladder, mean over the ladders "
-        f"{page.listed(ladders)}; bars: mean over seeds ({page.listed(seeds)}), whiskers: ± one standard deviation "
-        "over seeds, dots: each seed. Lower is better. The paper's error bars are the deviation over the last 100 "
-        "executions instead: in the table."
+        "Figure 4 of the paper: distance of the best member of each ladder, mean over ladders; bars: mean over seeds, "
+        "whiskers: ± one standard deviation over seeds, dots: each seed. Lower is better. The paper's error bars are "
+        "the deviation over the last 100 executions instead: in the table."
     )
-    return Drawn("figure4", name, drawn, caption, "No seed has executions on all ladders of the run.")
+    runs, nothing = (
+        f"Ladders: {page.listed(ladders)}; seeds: {page.spans(seeds)}.",
+        "No seed has executions on all ladders of the run.",
+    )
+    return Drawn("figure4", name, drawn, caption, runs, nothing)
 
 
 def _stops(material: Material) -> list[Drawn]:

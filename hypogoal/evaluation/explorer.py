@@ -18,12 +18,12 @@ from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, variants
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Entry, Material, Question
-from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
+from hypogoal.evaluation.pictures import FULL, STATES, attribution_png, brightness, flat, reduced, to_bytes
 from hypogoal.evaluation.table import Row
 
-MOST_STATES = 300  # over all sub-goals: the page of ten DoorKey agents has 1.2 MB, of the ladders 1.7 MB
+MOST_STATES = 300  # over all sub-goals: the page of the ladders has 1.4 MB
 MOST_OF_ONE = 180  # of one sub-goal
-MOST_EXPLAINED = 120  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
+MOST_EXPLAINED = 90  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
 MOST_INTEGRATED = 12  # where they are integrated gradients: of a large network seconds
 PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 TITLE = "Explore the hypotheses"
@@ -182,8 +182,8 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
                     ("mean steps", page.fixed(option["duration"], 1)),
                     ("match on this layout", page.fixed(option["match"], 2)),
                 ]
-                png = _overlay(material, run["path"], option["option"])
-                options.append({"name": name, "note": "".join(notes[:1]), "facts": facts, "png": png})
+                picture = _overlay(material, run["path"], option["option"])
+                options.append({"name": name, "note": "".join(notes[:1]), "facts": facts, **picture})
     for row in material.metrics["distance"]["options"]:
         if row["ensemble"] == ensemble and row["sub_goal"] == sub_goal:
             option = row["options"][member]
@@ -196,14 +196,18 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
                 ("mean steps", page.fixed(option["duration"], 1)),
             ]
             name, note = f"ladder {row['ladder']}, seed {row['seed']}", f"{picks} member here" if picks else ""
-            png = _overlay(material, row["path"], option["option"])
-            options.append({"name": name, "note": note, "facts": facts, "png": png})
+            options.append(
+                {"name": name, "note": note, "facts": facts, **_overlay(material, row["path"], option["option"])}
+            )
     return options
 
 
-def _overlay(material: Material, path: str, option: int) -> str:
-    place = f"terminations/{path}/{option}"
-    return page.picture(material.arrays[place]) if place in material.arrays else ""
+def _overlay(material: Material, path: str, option: int) -> dict[str, str]:
+    """The picture of the states in which an option ends, and their number."""
+    image, counts = (material.arrays.get(place) for place in (f"terminations/{path}/{option}", f"{STATES}/{path}"))
+    if image is None:
+        return {"png": "", "states": ""}
+    return {"png": page.picture(image), "states": "" if counts is None else f"ends in {page.states(counts[option])}"}
 
 
 QUESTION = Question(

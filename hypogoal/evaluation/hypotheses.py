@@ -140,11 +140,11 @@ def figures(material: Material) -> list[Drawn]:
     where = "layouts, pooled over them" if _has_layouts(material.metrics) else "states"
     caption = (
         f"The quantity of the paper's Figure 3, for one labelled context: balanced accuracy on held-out {where}. "
-        "Filled: best member; bar: mean of members; hollow: worst member; each a mean over ensemble seeds "
-        f"({page.listed(seeds)}). Dotted: always the same answer."
+        "Filled: best member; bar: mean of members; hollow: worst member; each a mean over ensemble seeds. "
+        "Dotted: always the same answer."
     )
     title, nothing = "Members' balanced accuracy on held-out states", "No held-out states have both classes."
-    return [Drawn("members", title, drawn, caption, nothing)]
+    return [Drawn("members", title, drawn, caption, f"Ensemble seeds {page.spans(seeds)}.", nothing)]
 
 
 def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:

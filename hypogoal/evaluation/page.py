@@ -88,7 +88,8 @@ class Drawn:
     name: str  # the file's name in a report, and the id on the page
     label: str  # what it shows
     figure: Figure | None  # None where it cannot be drawn
-    caption: str = ""  # with seeds and intervals
+    caption: str = ""  # with intervals
+    runs: str = ""  # and seeds that it is of, a list that may be long
     missing: str = ""  # which artefact would be needed
     folded: str = ""  # what is shown of it on the page until asked for
     file: str = ""  # the file's name among the paper's figures, where that is another
@@ -210,8 +211,8 @@ def shown(material: Material, drawn: Drawn) -> Block:
         svg = re.sub(r"<style.*?</style>", "", svg, flags=re.S)  # the page allows its own alone, which says the same
         for colour, variable in COLOURS.items():
             svg = svg.replace(colour, f"var(--{variable})")
-    texts = {"label": drawn.label, "caption": drawn.caption, "missing": drawn.missing, "folded": drawn.folded}
-    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, "heading": drawn.heading, **texts}
+    texts = {key: getattr(drawn, key) for key in ("label", "caption", "runs", "missing", "folded", "heading")}
+    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, **texts}
 
 
 def pick(rows: Iterable[Entry], key: str, value: Any) -> Entry:
@@ -265,6 +266,22 @@ def listed(items: Sequence[Any]) -> str:
     """1, 2 and 3."""
     texts = [str(item) for item in items]
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}" if texts else "none"
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """Seeds in order, three and more in a row as '970 to 972'."""
+    rows: list[list[int]] = []
+    for seed in sorted(numbers):
+        if rows and seed == rows[-1][-1] + 1:
+            rows[-1].append(seed)
+        else:
+            rows.append([seed])
+    return listed([text for row in rows for text in (row if len(row) < 3 else [f"{row[0]} to {row[-1]}"])])
+
+
+def states(count: int) -> str:
+    """'1 state', '37 states'."""
+    return f"{count:,} state{'' if count == 1 else 's'}"
 
 
 def fixed(value: float | None, digits: int) -> str:

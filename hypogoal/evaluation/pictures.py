@@ -20,6 +20,8 @@ MOST_SIDE = 128  # pixels of a picture on the page
 COLOURS = 256  # that a PNG's palette holds
 LEVELS, SHADES = 12, 6  # steps of an attribution's strength and of the state behind it, so that a palette holds all
 AGAINST, FOR = (0, 114, 178), (213, 94, 0)  # Okabe and Ito's blue and vermillion: a pair that all readers tell apart
+STATES = "termination-states"  # in an evaluation's arrays: of how many states each option's overlay is
+FEW = 200  # states whose median is taken for what is usual
 MOST_STATES = 60  # on a sheet
 COLUMNS = 10
 SCALE = 2
@@ -27,9 +29,11 @@ CAPTION_HEIGHT, GAP = 14, 4  # pixels
 BACKGROUND, INK = 40, 230  # grey levels
 SIDE = 336  # pixels that a moving state is enlarged to, or a little less
 LINE, MARGIN, BAR = 18, 8, 8  # pixels below it
+BOX, BOXES = 2 * 18 + 8, 4  # pixels of a member's box, and how many stand in a row
 FONT = 13
-PAPER, DARK, SOFT = (255, 255, 255), (36, 39, 43), (212, 215, 220)
-STEP, END, LAST = 140, 600, 1_500  # milliseconds of a step, of an option's end, of the last frame
+# Below the state it is dark on pages of either scheme.
+STRIP, PALE, FAINT, EMPTY = (31, 34, 38), (228, 230, 233), (162, 169, 178), (84, 90, 98)
+STEP, PAUSE, END, LAST = 140, 500, 600, 1_500  # milliseconds: a step, members differ, an option's end, the last frame
 PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
 WHERE = (("x", "y"), ("agent_x", "agent_y"))  # origins that say where the agent is
 
@@ -106,12 +110,18 @@ def to_bytes(values: NDArray[np.floating]) -> NDArray[np.int8]:
 def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Figures 7 and 8: termination states uint8 (n, H, W, C), n at least 1, laid over each other.
 
-    Pixels that all states share stay as they are; where states differ it is the root of the mean brightness, so that
-    what few of them show can still be seen.
+    The state with the fewest unusual pixels is drawn whole. Over it, half transparent, is what the others show that is
+    unusual: agents in other cells, say. A pixel is usual that is as in the median state.
     """
-    mean = states.astype(np.float32).mean(axis=0)
-    varies = states.min(axis=0) != states.max(axis=0)
-    return np.where(varies, 255 * np.sqrt(mean / 255), mean).round().astype(np.uint8)
+    few = states[:: max(1, len(states) // FEW)]
+    usual = np.partition(few, len(few) // 2, axis=0)[len(few) // 2]
+    unusual = states != usual
+    if states.shape[-1] == 3:  # a colour is one thing, a stack's frames are several
+        unusual = np.repeat(unusual.any(-1, keepdims=True), 3, axis=-1)
+    whole = unusual.reshape(len(states), -1).sum(1).argmin()
+    shown, count = states[whole], unusual.sum(0)
+    others = np.where(unusual, states, 0).sum(0, dtype=np.float64) / np.maximum(count, 1)
+    return np.where((count > 0) & ~unusual[whole], (shown + others) / 2, shown).round().astype(np.uint8)
 
 
 def contact_sheets(split: States, kinds: Sequence[str] = ()) -> dict[str, NDArray[np.uint8]]:
@@ -170,21 +180,21 @@ def _caption(origins: Mapping[str, NDArray[np.int64]], index: int, kinds: Sequen
     return " ".join(words)
 
 
-def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
-    """What is written below a frame: option and member, of several; prediction and time left; why it ended."""
+def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> list[str]:
+    """What is written below a frame: the option, with its member of several; the steps left; why it ended."""
     sub_goal, member = sub_goals[frame.option // members], frame.option % members
-    prediction = "positive" if frame.says_yes else "negative"
     return [
-        f"{sub_goal}, member {member}" if members > 1 else sub_goal,
-        f"step {frame.step}   {prediction}   {frame.left} steps left",
-        f"ends: {frame.ended}" if frame.ended else "",
+        f"option: {sub_goal}, member {member}" if members > 1 else f"option: {sub_goal}",
+        f"{frame.left} of {timeout} steps left",
+        f"step {frame.step}, ends: {frame.ended}" if frame.ended else f"step {frame.step}",
     ]
 
 
 def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> NDArray[np.uint8]:
-    """A frame as a picture, uint8 (H, W, 3); a bar shows the time left, in the sub-goal's colour.
+    """A frame as a picture, uint8 (H, W, 3); a bar shows the steps left, a box each member's prediction.
 
-    Option g*K + k is member k of sub-goal g; ``timeout`` is an option's steps at most.
+    Option g*K + k is member k of sub-goal g, whose box has a frame in the sub-goal's colour; ``timeout`` is an option's
+    steps at most.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -192,26 +202,47 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     times = max(1, SIDE // max(state.shape[:2]))
     large = np.ascontiguousarray(state.repeat(times, axis=0).repeat(times, axis=1))
     height, width = large.shape[:2]
-    lines = frame_lines(frame, sub_goals, members)
-    picture = Image.new("RGB", (width, height + BAR + 2 * MARGIN + LINE * len(lines)), PAPER)
+    option, left, last = frame_lines(frame, sub_goals, members, timeout)
+    rows = -(-members // BOXES)
+    picture = Image.new("RGB", (width, height + 3 * MARGIN + 3 * LINE + rows * (BOX + MARGIN)), STRIP)
     picture.paste(Image.fromarray(large))
-    draw = ImageDraw.Draw(picture)
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(FONT)
     colour = PALETTE[frame.option // members % len(PALETTE)]
-    draw.rectangle((0, height, width, height + BAR), fill=SOFT)
-    draw.rectangle((0, height, width * frame.left / timeout, height + BAR), fill=colour)
-    font = ImageFont.load_default(FONT)
-    for index, line in enumerate(lines):
-        draw.text((MARGIN, height + BAR + MARGIN + index * LINE), line, fill=DARK, font=font)
+    top = height + MARGIN
+    draw.text((MARGIN, top), option, fill=PALE, font=font)
+    top += LINE + BAR // 2
+    middle = width // 2
+    draw.rectangle((MARGIN, top, middle, top + BAR), fill=EMPTY)
+    if frame.left:
+        draw.rectangle((MARGIN, top, MARGIN + (middle - MARGIN) * frame.left / timeout, top + BAR), fill=colour)
+    draw.text((middle + MARGIN, top - BAR // 2), left, fill=PALE, font=font)
+    top += LINE
+    wide = (width - MARGIN) // min(members, BOXES)
+    for member, positive in enumerate(frame.predictions):
+        corner = (MARGIN + member % BOXES * wide, top + member // BOXES * (BOX + MARGIN))
+        runs = member == frame.option % members
+        end = (corner[0] + wide - MARGIN, corner[1] + BOX)
+        draw.rectangle((*corner, *end), EMPTY if positive else STRIP, colour if runs else EMPTY, width=3 if runs else 1)
+        texts = (f"member {member}" if members > 1 else "its classifier", "positive" if positive else "negative")
+        for line, (text, ink) in enumerate(zip(texts, (PALE, PALE if positive else FAINT), strict=True)):
+            draw.text((corner[0] + MARGIN, corner[1] + 4 + line * LINE), text, fill=ink, font=font)
+    draw.text((MARGIN, top + rows * (BOX + MARGIN)), last, fill=PALE, font=font)
     return np.asarray(picture)
 
 
 def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int, timeout: int) -> bytes:
-    """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1."""
+    """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1.
+
+    It pauses where an option ends, and where its member comes to differ from others of its sub-goal.
+    """
     from PIL import Image
 
     pictures = [Image.fromarray(draw_frame(frame, sub_goals, members, timeout)) for frame in frames]
     pictures = [picture.quantize(64, dither=Image.Dither.NONE) for picture in pictures]
-    times = [END if frame.ended else STEP for frame in frames]
+    times = []
+    for before, frame in zip([None, *frames], frames, strict=False):
+        differ = len(set(frame.predictions)) > 1 and (before is None or before.predictions != frame.predictions)
+        times.append(END if frame.ended else PAUSE if differ else STEP)
     times[-1] = LAST
     buffer = io.BytesIO()
     pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=times, loop=0, optimize=False)

@@ -258,12 +258,12 @@ def figures(material: Material) -> Iterator[Drawn]:
             "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
             "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
             "mean one; mean over ensemble seeds, bands (bars where a method has one N): ± one standard deviation over "
-            f"seeds. Dotted: never positive. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}."
+            "seeds. Dotted: never positive."
         )
         nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
         title, drawn = "Figure 3: members against labelled ladder groups", scores_over_groups(rows, panels)
         suffix = f"-{rows[0]['sub_goal']}" if len(by_sub_goal) > 1 else ""
-        yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
+        yield Drawn(f"figure3{suffix}", title, drawn, caption, f"Ensemble seeds {page.spans(seeds)}.", nothing)
 
 
 def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:

@@ -23,7 +23,7 @@ from hypogoal.evaluation.curves import variants, which
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.pictures import overlay
+from hypogoal.evaluation.pictures import STATES, overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
 from hypogoal.evaluation.run import takes, thresholds_of, within
 from hypogoal.evaluation.table import Row, by_fields, by_run, rows_by_member, select
@@ -82,10 +82,9 @@ def rows(work: Work) -> Iterator[Row]:
         layout = run.layout["layout_seed"]
         seeds = layout_seeds(config.get("layouts", ""), layout)[:LOOKED_AT]
         choices, members = Choices.read(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
-        for option, (picture, count) in members.sets.items():
-            dataset = f"terminations/{run.path}/{option}"
-            work.arrays[dataset] = picture
-            work.arrays[dataset].attrs["states"] = count
+        for option, picture in members.sets.items():
+            work.arrays[f"terminations/{run.path}/{option}"] = picture
+        work.arrays[f"{STATES}/{run.path}"] = members.counts
         more = {"match": members.match, "threshold": thresholds_of(artefact)}
         place = {"method": name, "layout": layout, "seed": run.seed, "artefact": run.path}
         yield from rows_of_choices(choices, config["sub_goals"], config["members"], more, **place)
@@ -119,12 +118,13 @@ class OnLayout(NamedTuple):
     """The members of an ensemble, as options, on the states of layouts.
 
     ``match``, float (G*K,), is their balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal but
-    the user's own labels do: its truth is unknown there. ``sets``, of pictures only, has for options that are positive
-    anywhere an :func:`overlay` of the states in which they are, and their number.
+    the user's own labels do: its truth is unknown there. ``counts``, int (G*K,), are of the states in which they are
+    positive. ``sets``, of pictures only, has for options that are positive anywhere an :func:`overlay` of these.
     """
 
     match: NDArray[np.float64]
-    sets: dict[int, tuple[NDArray[np.uint8], int]]
+    counts: NDArray[np.int64]
+    sets: dict[int, NDArray[np.uint8]]
 
 
 def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
@@ -139,16 +139,18 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
     ids = states_of_layout(engine)
     images, labels = engine.images(ids), dict(zip(domain.sub_goals, engine.labels(ids).T, strict=True))
     match, sets = np.full(len(source.config["sub_goals"]) * members, np.nan), {}
+    counts = np.zeros(len(match), np.int64)
     for index, sub_goal in enumerate(source.config["sub_goals"]):
         ensemble = read_ensemble(source.path, source.config, sub_goal)
         verdicts = ensemble.verdicts(images, engine.positions(ids) if ensemble.needs_positions else None)
         options = range(index * members, (index + 1) * members)
         if sub_goal in labels:
             match[options] = member_scores(verdicts, labels[sub_goal])["balanced_accuracy"]
+        counts[options] = verdicts.sum(axis=0)
         for option, says_yes in zip(options, verdicts.T, strict=True):
             if says_yes.any() and images.dtype == PICTURE:
-                sets[option] = overlay(images[says_yes]), int(says_yes.sum())
-    return OnLayout(match, sets)
+                sets[option] = overlay(images[says_yes])
+    return OnLayout(match, counts, sets)
 
 
 def states_of_layout(engine: Engine) -> NDArray[np.int64]:
@@ -235,8 +237,11 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
     """Title, note and picture of the most or the least preferred member."""
     member = goal["members"][goal[word]]
     note = f"preference {page.fixed(member['preference'], 2)}, match {page.fixed(member['match'], 2)}"
-    image = material.arrays.get(f"terminations/{path}/{member['option']}")
-    return f"{word} preferred: member {goal[word]}", note, image
+    image, counts = (
+        material.arrays.get(place) for place in (f"terminations/{path}/{member['option']}", f"{STATES}/{path}")
+    )
+    count = "" if image is None or counts is None else f"\n{page.states(counts[member['option']])}"
+    return f"{word} preferred: member {goal[word]}", f"{note}{count}", image
 
 
 def sections(material: Material) -> list[Block]:
@@ -252,9 +257,9 @@ def sections(material: Material) -> list[Block]:
         f"for the random chooser if there is one. '{choosing.TITLE}' says what the choices gain."
     )
     stops = (
-        "A picture lays over each other all states of the layout in which a member is positive, where its option ends: "
-        "what all of them share is sharp, what few of them show is dim. For each sub-goal it shows the member that the "
-        "agent prefers most and the one that it prefers least."
+        "A picture shows a state of the layout in which a member is positive, where its option ends, and over it, half "
+        "transparent, the agent and all else where other such states have it; above it, how many there are. For each "
+        "sub-goal it shows the member that the agent prefers most and the one that it prefers least."
     )
     lines = []
     for goal in run["sub_goals"]:
@@ -284,9 +289,9 @@ def figures(material: Material) -> Iterator[Drawn]:
         name = NUMBERED.get(goal["sub_goal"], f"terminations-{goal['sub_goal']}")
         title = name.replace("figure", "Figure ") if name in NUMBERED.values() else "As Figures 7 and 8"
         caption = (
-            f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
-            f"prefers most and of the one it prefers least ({run['path']}, {where}): all states of the layout that are "
-            "known and in which the member is positive. Preference: chosen / expected under uniform "
+            f"{title} of the paper: termination states of {goal['sub_goal']}, of the member that the agent prefers "
+            f"most and of the one it prefers least ({run['path']}, {where}): one state of the layout in which the "
+            "member is positive, the others half transparent over it. Preference: chosen / expected under uniform "
             f"choice; match: balanced accuracy on that layout. {which(agent, selection) if agent else ''}"
         ).rstrip()
         drawn = termination_states([(f"{title}\n{note}", image) for title, note, image in sides])

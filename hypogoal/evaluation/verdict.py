@@ -19,7 +19,7 @@ from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM
 from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name, titled
 from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
-from hypogoal.evaluation.page import Question, listed, percent
+from hypogoal.evaluation.page import Block, Material, Question, listed, percent, picture, section
 from hypogoal.evaluation.table import Row, select
 
 if TYPE_CHECKING:
@@ -155,7 +155,18 @@ def tasks(work: Work) -> list[str]:
         config = work.artefact(runs[0].path).config
         sentences.append(" ".join(filter(None, [task_of(config), cap_of(config, work.agents[name])])))
     sentences += [task_of(artefact.config) for artefact in work.contents.ladders] if not sentences else []
-    return list(dict.fromkeys(filter(None, sentences)))
+    longest = [text for text in sentences if not any(other != text and other.startswith(text) for other in sentences)]
+    return list(dict.fromkeys(filter(None, longest)))
+
+
+def scenes(work: Work) -> list[dict[str, Any]]:
+    """The domain's scenes of the first agent's task, their pictures put into the arrays as ``scenes/<i>``."""
+    first = next((work.artefact(runs[0].path).config for runs in work.agents.values()), {})
+    domain = installed_domain(first["domain"]) if first.get("domain") else None
+    shown = domain.scenes(domain.world(first.get("domain_config") or {})) if domain else ()
+    for index, scene in enumerate(shown):
+        work.arrays[f"scenes/{index}"] = scene.picture
+    return [{"title": scene.title, "features": dict(scene.features)} for scene in shown]
 
 
 def task_of(config: Mapping[str, Any]) -> str:
@@ -192,13 +203,31 @@ def as_in_paper(artefacts: Iterable[Artefact]) -> bool:
 
 
 def view(work: Work) -> dict[str, Any]:
-    """``verdict``: the task, whether it is the paper's, and the findings."""
+    """``verdict``: the task with its scenes, whether it is the paper's, and the findings."""
     artefacts = [*work.contents.agents, *work.contents.ladders]
     compared = [asdict(finding) for finding in (*findings(work), *on_ladders(work))]
-    return {"verdict": {"task": tasks(work), "paper": as_in_paper(artefacts), "findings": compared}}
+    task = {"task": tasks(work), "scenes": scenes(work), "paper": as_in_paper(artefacts)}
+    return {"verdict": {**task, "findings": compared}}
 
 
-QUESTION = Question(view=view)
+def sections(material: Material) -> list[Block]:
+    """The scenes, where the domain has any."""
+    cards = [
+        {
+            "png": picture(material.arrays[f"scenes/{index}"]),
+            "alt": scene["title"],
+            "title": scene["title"],
+            "lines": [
+                {"class": "yes" if holds else "no", "text": f"{name}: {'yes' if holds else 'no'}"}
+                for name, holds in scene["features"].items()
+            ],
+        }
+        for index, scene in enumerate(material.metrics.get("verdict", {}).get("scenes", []))
+    ]
+    return [section("scenes", "The task in pictures", [], [{"kind": "cards", "cards": cards}])] if cards else []
+
+
+QUESTION = Question(view=view, sections=sections)
 
 OUTCOMES = {
     (CHOOSING, BETTER): "Choosing mattered",

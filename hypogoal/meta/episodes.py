@@ -17,6 +17,7 @@ from hypogoal.meta.training import ONE_LAYOUT, assemble, continue_with
 from hypogoal.options.loop import OptionLoop, Transitions
 
 REPLAY = 1_000  # nothing is learned: a small one
+SOLVED = "solved"  # why the last option of an episode ended
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Frame:
     observation: Observations  # (*obs)
     step: int  # of the episode
     option: int  # that runs in this state, or ended in it
-    says_yes: bool  # its own classifier's verdict on the state
+    predictions: tuple[bool, ...]  # of its sub-goal's K members on the state; option g*K + k goes by the k-th
     left: int  # steps until its timeout
     ended: str  # why it ended in this state; empty where it goes on
 
@@ -76,19 +77,21 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
     return loop
 
 
-def play_episode(loop: OptionLoop) -> list[Frame]:
-    """One episode of :func:`agent_of`: a frame per step, and one for the state in which each execution ended."""
+def play_episode(loop: OptionLoop, members: int) -> list[Frame]:
+    """One episode of :func:`agent_of`, K ``members``: a frame per step, and one for where each execution ended."""
     frames = []
     for step, moved in enumerate(_steps(loop)):
         option, left = int(moved.options[0]), loop.config.option_timeout - int(loop.age[0])
+        first = option - option % members
         before, after = (
-            (loop.engine.images(ids)[0].copy(), bool(loop.terminations.of(ids)[0, option]))
+            (loop.engine.images(ids)[0].copy(), tuple(loop.terminations.of(ids)[0, first : first + members].tolist()))
             for ids in (moved.ids, moved.next_ids)
         )
         frames.append(Frame(before[0], step, option, before[1], left + 1, ""))
         if moved.ended[0]:
-            why = "its classifier is positive" if after[1] else "the episode is cut"
-            why = "the task is over" if moved.terminated[0] else "its time is up" if moved.timed_out[0] else why
+            why = "its classifier is positive" if after[1][option - first] else "the episode is cut"
+            over = SOLVED if moved.terminated[0] and loop.recorder.episodes[-1][4] else "the episode, unsolved"
+            why = over if moved.terminated[0] else "its time is up" if moved.timed_out[0] else why
             frames.append(Frame(after[0], step + 1, option, after[1], left, why))
     return frames
 

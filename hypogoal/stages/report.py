@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hypogoal.cards import create_artefact
 from hypogoal.core.artefacts import Artefact, claim, find_artefacts, versions
@@ -14,8 +14,12 @@ from hypogoal.core.files import replace_text, replacing
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
 
+if TYPE_CHECKING:
+    from hypogoal.meta.episodes import Frame
+
 KINDS = ("svg", "pdf", "png")
 MOST_BYTES = 2_000_000  # of a film on the page
+MOST_FRAMES = 200  # played for the page's film, till an episode has members that differ
 
 
 def report(run: Path, *, videos: int | None = None, force: bool = False, resume: bool = False) -> Path:
@@ -66,7 +70,7 @@ def _films(run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
     if videos == 0:
         return [], []
     try:
-        return play_films(agents_of(run), run, videos or 1), []
+        return play_films(agents_of(run), run, videos), []
     except UserError as error:
         if videos:
             raise
@@ -90,27 +94,60 @@ class NoAgent(UserError):
     """A run has no agent that learned to choose among members' options."""
 
 
-def play_films(agents: Sequence[Artefact], run: Path, count: int) -> list[Film]:
-    """Spec E1: episodes of the agents in turn, played from their saved weights."""
-    from hypogoal.evaluation.pictures import episode_gif
+def play_films(agents: Sequence[Artefact], run: Path, count: int | None) -> list[Film]:
+    """Spec E1: ``count`` episodes of the agents in turn, played from their saved weights.
+
+    None: one of the first agent, the first that :func:`_tells` within ``MOST_FRAMES``, else the first of all.
+    """
     from hypogoal.meta.episodes import agent_of, play_episode
 
-    films = []
-    for index in range(count):
-        artefact, episode = agents[index % len(agents)], index // len(agents)
-        loop, path = agent_of(artefact, seed=episode), artefact.path.relative_to(run).as_posix()
+    loops = [agent_of(artefact, seed=0) for artefact in agents[: count or 1]]
+    for artefact, loop in zip(agents, loops, strict=False):
         if loop.engine.observation_dtype != PICTURE:
             raise NoAgent("videos need an agent that sees pictures", artefact.path, "Leave --videos out.")
-        config, frames = artefact.config, play_episode(loop)
-        gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
-        steps, options = frames[-1].step, sum(bool(frame.ended) for frame in frames)
-        caption = (
-            f"An episode of {path}, layout {config['layout_seed']}: {steps} steps, {options} "
-            f"option{'' if options == 1 else 's'}. Below each state: the running option's sub-goal and member, that "
-            "classifier's prediction, and the steps left to the option (the bar)."
-        )
-        films.append(Film(artefact, f"{path.replace('/', '-')}-episode-{episode}.gif", caption, gif))
+    if count is None:
+        members, played = agents[0].config["members"], [play_episode(loops[0], agents[0].config["members"])]
+        while sum(map(len, played)) < MOST_FRAMES and not _tells(played[-1], members):
+            played.append(play_episode(loops[0], members))
+        number = len(played) - 1 if _tells(played[-1], members) else 0
+        return [_film(agents[0], run, number, played[number])]
+    films = []
+    for index in range(count):
+        number, which = divmod(index, len(agents))
+        frames = play_episode(loops[which], agents[which].config["members"])
+        films.append(_film(agents[which], run, number, frames))
     return films
+
+
+def _tells(frames: Sequence[Frame], members: int) -> bool:
+    """Whether the agent took the right one of members that differ: the last option's own ended a solved episode."""
+    from hypogoal.meta.episodes import SOLVED
+
+    last = frames[-1]
+    right = last.ended == SOLVED and last.predictions[last.option % members]
+    return right and any(len(set(frame.predictions)) > 1 for frame in frames)
+
+
+def _film(artefact: Artefact, run: Path, number: int, frames: Sequence[Frame]) -> Film:
+    """An agent's episode, the ``number``-th that it played."""
+    from hypogoal.evaluation.pictures import episode_gif
+
+    path, config = artefact.path.relative_to(run).as_posix(), artefact.config
+    gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
+    steps, options = frames[-1].step, sum(bool(frame.ended) for frame in frames)
+    caption = (
+        f"Episode {number} of {path}, layout {config['layout_seed']}: {steps} step{'' if steps == 1 else 's'}, "
+        f"{options} option{'' if options == 1 else 's'}. Below each state: the option that runs, the steps left to it "
+        f"(the bar), and {_boxes(config['members'])}."
+    )
+    return Film(artefact, f"{path.replace('/', '-')}-episode-{number}.gif", caption, gif)
+
+
+def _boxes(members: int) -> str:
+    """What the boxes below a state of a film are."""
+    if members == 1:
+        return "what its classifier predicts; it ends at a positive prediction"
+    return "what each member of its sub-goal predicts; it ends at a positive prediction of its member (framed)"
 
 
 def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:
@@ -139,7 +176,8 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
             if drawing.figure is not None:
                 with replacing(path) as fresh:
                     fresh.write_bytes(to_file(drawing.figure, drawing.stem, kind))
-        text = [f"## {path.name}\n\n{escape(drawing.caption, quote=False)}\n" for path, drawing in files.items()]
+        captions_of = {path: " ".join(filter(None, (drawing.caption, drawing.runs))) for path, drawing in files.items()}
+        text = [f"## {path.name}\n\n{escape(caption, quote=False)}\n" for path, caption in captions_of.items()]
         replace_text(captions, "\n".join([*text, *(f"{line}\n" for line in missing)]))
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None

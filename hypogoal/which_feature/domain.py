@@ -15,7 +15,7 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States
-from hypogoal.domains.base import Domain, Engine, Plan, Step
+from hypogoal.domains.base import Domain, Engine, Plan, Scene, Step
 from hypogoal.which_feature import states
 from hypogoal.which_feature.states import FACTORS, KNOWN, MOVED, SIDE, crossed_states, drawn
 
@@ -143,13 +143,22 @@ class RoomsDomain(Domain):
 
     def task(self, world: Mapping[str, Any]) -> str:
         settings = RoomsConfig(**world)
-        others = [name for name in settings.factors if name != settings.truth]
-        rivals = f"{', '.join(others)} always {'agrees' if len(others) == 1 else 'agree'} with it"
+        others = [f"{name} ({states.MEANINGS[name]})" for name in settings.factors if name != settings.truth]
         return (
-            f"Enter one of {settings.rooms} rooms; only one is right and gives a reward of 1: the room where "
-            f"{states.MEANINGS[settings.truth]} ({settings.truth}). "
-            f"In the labelled states {rivals}; in these rooms not."
+            f"Enter one of {settings.rooms} rooms; only that where {states.MEANINGS[settings.truth]} "
+            f"({settings.truth}) gives a reward of 1. The labels fit {' and '.join(others)} as well; in the rooms "
+            "they part."
         )
+
+    def scenes(self, world: Mapping[str, Any]) -> list[Scene]:
+        settings = RoomsConfig(**world)
+        column, count = _column(settings.factors, settings.truth), len(settings.factors)
+        true = np.arange(count) == column
+        holds = np.stack([np.ones(count, np.bool_), np.zeros(count, np.bool_), true, ~true])
+        titles = ("labelled: positive", "labelled: negative", "a room: right, reward 1", "a room: wrong")
+        pictures = drawn(holds, settings.factors, rng_for(0, "which-feature", "scenes")).observations
+        features = [dict(zip(settings.factors, row, strict=True)) for row in holds.tolist()]
+        return [Scene(*scene) for scene in zip(pictures, titles, features, strict=True)]
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
         settings = {name: arguments.get(name, getattr(RoomsConfig(), name)) for name in self.engine_settings}

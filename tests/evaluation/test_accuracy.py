@@ -95,11 +95,14 @@ def test_the_most_and_the_least_preferred_member():
 
 
 def test_overlay_keeps_what_is_shared():
-    """Figures 7 and 8: what all states share stays, what one in four shows is dimmer: 255 sqrt(50 / 255)."""
-    states = np.zeros((4, 1, 2, 3), np.uint8)
+    """Figures 7 and 8: what all states share stays; one agent is whole, the others are half transparent."""
+    states = np.zeros((4, 1, 6, 3), np.uint8)
     states[:, 0, 0] = 200
-    states[0, 0, 1] = 200
-    assert overlay(states)[0, :, 0].tolist() == [200, 113]
+    for index, cell in enumerate((2, 3, 4, 5)):
+        states[index, 0, cell] = (100, 0, 0)
+    states[1, 0, 1] = (100, 0, 0)
+    assert overlay(states)[0, :, 0].tolist() == [200, 50, 100, 50, 50, 50]
+    assert overlay(states[:1])[0, :, 0].tolist() == [200, 0, 100, 0, 0, 0]
 
 
 def test_ranking_is_the_share_of_pairs_in_order():

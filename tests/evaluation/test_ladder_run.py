@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from ladder_run import ROOMS, SUB_GOAL, executions, write_data, write_members, write_options, write_run
+from openings import agrees
 from rich.console import Console
 from toy_data import reseal
 
@@ -60,6 +61,12 @@ def metrics(run):
 @pytest.fixture(scope="module")
 def page(run, metrics):
     return report(run).read_text(encoding="utf-8")
+
+
+def test_the_page_opens_with_a_verdict_of_its_numbers(run, page):
+    """Spec I1: options of several members against those of one classifier, recomputed from ``numbers.csv``."""
+    task = "The reward and the end of an episode are those of the domain 'ladder_run:DOMAIN'"
+    agrees(run, task, "Several hypotheses made no difference over 2 ladders: options", "Two runs are not evidence")
 
 
 def test_members_are_judged_room_by_room(run, metrics):
@@ -269,7 +276,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     assert "At N=3 no unseen room has a ladder base left" in page
     assert "Ensemble seeds 0 and 1" in page
     assert "A member that is never positive has accuracy 0.86 (N=1), 0.86 (N=2) and 0.86 (N=3)" in page
-    assert "mean over the ladders 1L and 2-6" in page
+    assert "Ladders: 1L and 2-6; seeds: 0 and 1." in page
     assert "not drawn" not in re.sub(r"rooms that are not drawn none", "", page)
     assert "Missing in this run" not in page
     names = {path.stem for path in (run / "report" / "figures").iterdir()}

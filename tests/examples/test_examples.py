@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from openings import agrees
 from PIL import Image
 from test_docs import blocks, commands
 
@@ -22,6 +23,8 @@ from hypogoal.evaluation import explorer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
+UNKNOWN = "Whether hypotheses mattered is unknown"
+OWN_TASK = "The reward and the end of an episode are those of the domain 'own'"
 
 
 @pytest.fixture(autouse=True)
@@ -94,6 +97,7 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
     assert [row["sub_goal"] for row in metrics["ensembles"][0]["sub_goals"]] == ["hold-key", "open-door"]
     assert metrics["agents"][0]["runs"]
     assert "open-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    agrees(run, OWN_TASK, UNKNOWN)
 
 
 def test_the_example_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,6 +156,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     page = (run / "report" / "index.html").read_text(encoding="utf-8")
     assert all(text in page for text in ("position[0]", "held[1]", "What members go by: at-exit"))
     assert not any(text in page for text in ("Explore the hypotheses", "laid over each other"))
+    agrees(run, OWN_TASK, UNKNOWN)
     assert open_dataset(run / "options" / "visited.h5").unlabelled().dtype == "float32"
     policies = load_options(options)
     env = OptionEnv(policies.make_env(), policies)
@@ -199,6 +204,7 @@ def test_key_corridor_goes_through_all_stages(
         assert all(row["positives"] >= 3 for row in data.counts()[split].values())
     assert [entry["path"] for entry in data.inputs] == ["key_corridor.json"]
     assert (tmp_path / "runs" / "corridor" / "report" / "index.html").is_file()
+    agrees(tmp_path / "runs" / "corridor", OWN_TASK, UNKNOWN)
     assert main(["collect", "key_corridor:DOMAIN", "--out", "plain.h5", "-q", *LAYOUTS]) == 2
     assert "hold-ball has no positives" in capsys.readouterr().err
 
@@ -228,6 +234,7 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
     worst = max(member["completeness_error"] for state in states for member in state["members"])
     assert worst < 1e-3
     assert "Attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    agrees(run, "Take the red key, open the red door", "One run is not evidence")
     found: dict[str, Any] = {}
     exec(compile(blocks(EXAMPLES.parent / "docs" / "formats.md", "python")[4], "formats.md", "exec"), found)
     logits = load_ensemble(run / "ensemble", "collect-red-key").logits(found["images"].numpy())[:, 0]
@@ -255,6 +262,7 @@ def test_freeway_goes_through_all_stages(tmp_path: Path) -> None:
     rows = {row["sub_goal"]: row for row in metrics["ensembles"][0]["sub_goals"]}
     assert set(rows) == {"half-way", "far-side"} and metrics["agents"]
     assert "far-side" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    agrees(run, OWN_TASK, UNKNOWN)
     assert all(row["best"]["mean"] is not None for row in metrics["hypotheses"])
 
 
@@ -270,6 +278,7 @@ def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: py
     members = metrics["hypotheses"][0]
     assert members["best"]["mean"] > 0.95 and members["worst"]["mean"] < 0.9
     assert "lamp-on" in Path("runs/lamp/report/index.html").read_text(encoding="utf-8")
+    agrees(Path("runs/lamp"), "", "No agent has been trained yet", "D-BAT")
 
 
 @pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)

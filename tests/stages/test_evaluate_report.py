@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import h5py
 import numpy as np
 import pytest
+from openings import agrees
 from rich.console import Console
 
 from hypogoal.cli import main
@@ -71,6 +72,11 @@ def metrics(run):
 @pytest.fixture(scope="module")
 def page(run, metrics):
     return report(run).read_text(encoding="utf-8")
+
+
+def test_the_page_opens_with_the_task_and_a_verdict_of_its_numbers(run, page):
+    """Spec I1: recomputed from ``numbers.csv``, with what a baseline was given beside it."""
+    agrees(run, "Take the red key, open the red door and reach the goal", "One run is not", "On primitive actions")
 
 
 def test_agents_are_grouped_and_counted_whole(run, metrics):
@@ -357,7 +363,7 @@ def test_the_page_shows_all_of_it(run, page):
     drawn = {path.name.rpartition(".")[0] for path in (run / "report" / "figures").iterdir()}
     assert {*FIGURES, "figure7", "figure8"} <= drawn
     assert page.count("<figure") == 1 + len(drawn) and page.count("data:image/gif;base64,") == 1
-    assert re.search(r"An episode of meta, layout 100: \d+ steps", page)
+    assert re.search(r"Episode \d of meta, layout 100: \d+ steps", page)
     assert page.count("<h3>Seed by seed: ") == 1, "one run of an agent is no table of pairs"
     assert "1 run: layout seed 100, run seed 0" in page
     assert "Figure 6 of the paper" in page
@@ -439,6 +445,8 @@ def test_arrays_say_what_the_report_draws(run, metrics):
             assert arrays[f"curves/{index}/reward"].shape == (len(agent["runs"]), len(grid))
         some = next(iter(arrays["terminations/meta"].values()))
         assert some.shape == (64, 64, 3)
+        counts = arrays["termination-states/meta"][()]
+        assert [str(option) for option in np.flatnonzero(counts)] == sorted(arrays["terminations/meta"], key=int)
 
 
 @pytest.mark.parametrize("damage", ["episodes.csv", "choices.csv", "layout.json", "terminations.h5"])

@@ -124,7 +124,7 @@ def test_one_file_is_enough(setting: str, stage: str, ensemble: Path, tmp_path: 
     if stage == "train-meta":
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("HYPOGOAL_TRUST", f"corridor_env:DOMAIN,{name}")
-            assert len(play_episode(agent_of(open_artefact(tmp_path / "made"), seed=0))) > 1
+            assert len(play_episode(agent_of(open_artefact(tmp_path / "made"), seed=0), 2)) > 1
         with pytest.raises(UserError, match="names code of its own"):
             agent_of(open_artefact(tmp_path / "made"), seed=0)
 

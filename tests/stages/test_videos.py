@@ -18,7 +18,7 @@ from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation import choosing
 from hypogoal.evaluation.curves import read_run
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.pictures import BAR, draw_frame, episode_gif, frame_lines
+from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
 from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
@@ -52,7 +52,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frames(run):
-    played = [play_episode(agent_of(open_artefact(run / "meta"), seed=3)) for _ in range(2)]
+    played = [play_episode(agent_of(open_artefact(run / "meta"), seed=3), MEMBERS) for _ in range(2)]
     for first, second in zip(*played, strict=True):
         assert (first.option, first.step, first.ended) == (second.option, second.step, second.ended)
     return played[0]
@@ -72,19 +72,19 @@ def test_an_episode_is_whole(frames):
             assert (after.left, after.option, after.step) == (before.left - 1, before.option, before.step + 1)
     for frame in frames:
         if frame.ended == "its time is up":
-            assert frame.left == 0 and not frame.says_yes
+            assert frame.left == 0 and not frame.predictions[frame.option % MEMBERS]
         if frame.ended == "its classifier is positive":
-            assert frame.says_yes
+            assert frame.predictions[frame.option % MEMBERS]
 
 
-def test_verdicts_are_those_of_the_member_that_runs(run, frames):
+def test_predictions_are_those_of_the_sub_goals_members(run, frames):
     """Spec D1, D6: recomputed here from the pictures and the weights."""
     source = open_artefact(run / "ensemble")
-    for option in {frame.option for frame in frames}:
-        own = [frame for frame in frames if frame.option == option]
-        ensemble = read_ensemble(source.path, source.config, source.config["sub_goals"][option // MEMBERS])
-        says = ensemble.verdicts(np.stack([frame.observation for frame in own]))[:, option % MEMBERS]
-        assert says.tolist() == [frame.says_yes for frame in own]
+    for goal in {frame.option // MEMBERS for frame in frames}:
+        alike = [frame for frame in frames if frame.option // MEMBERS == goal]
+        ensemble = read_ensemble(source.path, source.config, source.config["sub_goals"][goal])
+        says = ensemble.verdicts(np.stack([frame.observation for frame in alike]))
+        assert says.tolist() == [list(frame.predictions) for frame in alike]
 
 
 def test_videos_are_of_the_agents_that_choose(run):
@@ -137,7 +137,7 @@ def test_a_bandit_is_back_and_learns_no_more(run, tmp_path):
     assert "meta.safetensors" in files_of("meta", artefact.config)
     kept = load_tensors(artefact.path / "meta.safetensors")["credit"].numpy()
     loops = [agent_of(artefact, seed=1) for _ in range(2)]
-    first, second = ([frame.option for frame in play_episode(loop)] for loop in loops)
+    first, second = ([frame.option for frame in play_episode(loop, MEMBERS)] for loop in loops)
     assert type(loops[0].chooser) is ThompsonChooser and kept.any() and first == second
     np.testing.assert_array_equal(loops[0].chooser.credit, kept)
     contents = Contents(tmp_path, [], [artefact], [], [], [])
@@ -169,16 +169,37 @@ def test_a_run_without_such_an_agent_is_one_line(tmp_path):
         agents_of(tmp_path)
 
 
+def test_the_film_of_a_page_is_one_in_which_members_differ(run, monkeypatch):
+    """Spec E1, F7: the first of a few that the right one of two members solves; where there is none, the first."""
+    from hypogoal.meta import episodes
+
+    frame = Frame(np.zeros((8, 8, 3), np.uint8), 0, 0, (True, True), 5, "solved")
+    differ = replace(frame, predictions=(True, False))
+    wrong = [replace(frame, ended="the episode, unsolved"), replace(frame, predictions=(False, True))]
+    plays = [[frame], *([differ, last] for last in wrong), [differ, frame], [frame]]
+    monkeypatch.setattr(episodes, "play_episode", lambda loop, members: plays.pop(0))
+    (film,) = play_films(agents_of(run), run, None)
+    assert film.name == "meta-episode-3.gif" and len(plays) == 1
+    monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
+    assert play_films(agents_of(run), run, None)[0].name == "meta-episode-0.gif"
+
+
 def test_what_is_drawn_of_a_frame():
-    """Spec F7: option, member, verdict and time left in words; the bar is as long as the time that is left."""
+    """Spec F7: option, member, predictions and steps left in words; the bar is as long as the steps that are left."""
     stack = np.zeros((84, 84, 4), np.uint8)
     stack[..., 3] = 200
-    frame = Frame(stack, 12, 3, False, 5, "")
-    assert frame_lines(frame, ["red", "door"], 2) == ["door, member 1", "step 12   negative   5 steps left", ""]
-    assert frame_lines(replace(frame, ended="its time is up"), ["red", "door"], 2)[2] == "ends: its time is up"
+    frame = Frame(stack, 12, 3, (True, False), 5, "")
+    assert frame_lines(frame, ["red", "door"], 2, 10) == ["option: door, member 1", "5 of 10 steps left", "step 12"]
+    ended = replace(frame, ended="its time is up")
+    assert frame_lines(ended, ["red", "door"], 2, 10)[2] == "step 12, ends: its time is up"
     picture = draw_frame(frame, ["red", "door"], 2, timeout=10)
     assert picture.shape[1] == 336 and (picture[:336] == 200).all()
-    bar = picture[336 + BAR // 2]
-    assert (bar[:168] == bar[0]).all() and (bar[170:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
+    bar = picture[336 + MARGIN + LINE + BAR, MARGIN : 336 // 2]
+    assert (bar[:80] == bar[0]).all() and (bar[82:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
+    boxes = picture[336 + MARGIN + 2 * LINE + BAR // 2 + BOX // 2]
+    framed = [(boxes[MARGIN + member * 164] == bar[0]).all() for member in (0, 1)]
+    assert framed == [False, True], "the box of the member that runs has the colour of the bar"
+    differ = draw_frame(replace(frame, predictions=(False, False)), ["red", "door"], 2, timeout=10) != picture
+    assert differ[:, :168].any() and not differ[:, 168:].any(), "the other member's box alone"
     video = Image.open(io.BytesIO(episode_gif([frame, replace(frame, left=0, ended="x")], ["red", "door"], 2, 10)))
     assert video.n_frames == 2

@@ -95,7 +95,7 @@
     const found = goal().members[member];
     const options = found.options.map((option) => {
       const drawn = option.png
-        ? image(option.png, `Overlaid termination states: ${option.name}`)
+        ? make("div", {}, image(option.png, `States in which it ends: ${option.name}`), soft(option.states))
         : make("div", { class: "nothing" }, "no state in which it ends");
       const body = make("div", {}, make("h4", {}, option.name), ...(option.note ? [soft(option.note)] : []), facts(option.facts));
       return make("div", { class: "option card" }, drawn, body);
@@ -105,7 +105,7 @@
       make("h3", { tabindex: "-1" }, `Member ${member} of ${goal().name}`),
       facts(found.facts),
       ...(options.length
-        ? [make("p", {}, "Its options: overlaid termination states, and how they fared in training."), make("div", { class: "options" }, ...options)]
+        ? [make("p", {}, "Its options: the states in which they end, one whole and the others half transparent, and how they fared in training."), make("div", { class: "options" }, ...options)]
         : [make("p", { class: "soft" }, none)]),
     ];
   };
