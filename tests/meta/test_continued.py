@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,12 +77,15 @@ def test_the_papers_preset_plays_and_learns(ensemble: Path, tmp_path: Path) -> N
 def test_options_go_on_with_the_time_they_learned_for(
     ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Spec D1: the timeout is part of an option; another one is refused, not put in its place."""
+    """Spec D1: the timeout is part of an option: it is taken over, and another one is refused."""
     few = ["--set", "steps=64", "--set", "random_episodes=2", "-q"]
     options, out = str(tmp_path / "options"), str(tmp_path / "meta")
     assert main(["train-options", str(ensemble), "--out", options, "--set", "option_timeout=40", *few]) == 0
-    assert main(["train-meta", str(ensemble), "--options", options, "--out", out, *few]) == 2
+    meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
+    assert main([*meta, "--set", "option_timeout=10"]) == 2
     assert "trained with option_timeout=40, not 10" in capsys.readouterr().err
+    assert main(meta) == 0
+    assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["option_timeout"] == 40
 
 
 def test_an_embedding_by_name_goes_through_both_stages(
@@ -92,9 +96,10 @@ def test_an_embedding_by_name_goes_through_both_stages(
     options, out, named = str(tmp_path / "options"), str(tmp_path / "meta"), ["--set", "embedding=tiles"]
     assert main(["train-options", str(ensemble), "--out", options, *named, *few]) == 0
     meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
-    assert main(meta) == 2
+    assert main([*meta, "--set", "embedding=auto"]) == 2
     assert "trained with embedding=tiles, not auto" in capsys.readouterr().err
-    assert main([*meta, *named]) == 0
+    assert main(meta) == 0
+    assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["embedding"] == "tiles"
     assert main([*meta[:2], "--out", str(tmp_path / "other"), *named, "--set", "network=planned"]) == 2
     assert "needs embedding=auto" in capsys.readouterr().err
 
