@@ -34,7 +34,7 @@ def train_baseline(
     """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
 
     With ``data``, states of the domain, it plays in the world they are of; without, in that of the ``ensemble``, whose
-    members' verdicts earn the bonus; else in that of the domain's defaults.
+    members' positive predictions earn the bonus; else in that of the domain's defaults.
     Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states or
     an ensemble of another domain, a bonus without an ensemble or the other way round, or an ``out`` that exists is a
     ``UserError``, NaN or Inf in a weight a ``NumericalError``.
