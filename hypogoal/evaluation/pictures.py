@@ -173,7 +173,7 @@ def _caption(origins: Mapping[str, NDArray[np.int64]], index: int, kinds: Sequen
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
     """What is written below a frame: option and member, of several; prediction and time left; why it ended."""
     sub_goal, member = sub_goals[frame.option // members], frame.option % members
-    prediction = "positive" if frame.positive else "negative"
+    prediction = "positive" if frame.says_yes else "negative"
     return [
         f"{sub_goal}, member {member}" if members > 1 else sub_goal,
         f"step {frame.step}   {prediction}   {frame.left} steps left",

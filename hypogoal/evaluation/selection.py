@@ -141,13 +141,13 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
     match, sets = np.full(len(source.config["sub_goals"]) * members, np.nan), {}
     for index, sub_goal in enumerate(source.config["sub_goals"]):
         ensemble = read_ensemble(source.path, source.config, sub_goal)
-        predictions = ensemble.predictions(images, engine.positions(ids) if ensemble.needs_positions else None)
+        verdicts = ensemble.predictions(images, engine.positions(ids) if ensemble.needs_positions else None)
         options = range(index * members, (index + 1) * members)
         if sub_goal in labels:
-            match[options] = member_scores(predictions, labels[sub_goal])["balanced_accuracy"]
-        for option, positive in zip(options, predictions.T, strict=True):
-            if positive.any() and images.dtype == PICTURE:
-                sets[option] = overlay(images[positive]), int(positive.sum())
+            match[options] = member_scores(verdicts, labels[sub_goal])["balanced_accuracy"]
+        for option, says_yes in zip(options, verdicts.T, strict=True):
+            if says_yes.any() and images.dtype == PICTURE:
+                sets[option] = overlay(images[says_yes]), int(says_yes.sum())
     return OnLayout(match, sets)
 
 

@@ -108,6 +108,14 @@ def by_member(scores: Scores) -> list[dict[str, float]]:
     ]
 
 
+def best_mean_worst(scores: NDArray[np.float64]) -> dict[str, float]:
+    """Spec F1: best, mean and worst of members' scores (K,) without undefined ones; NaN if none is defined."""
+    defined = scores[~np.isnan(scores)]
+    if len(defined) == 0:
+        return dict.fromkeys(("best", "mean", "worst"), math.nan)
+    return {"best": float(defined.max()), "mean": float(defined.mean()), "worst": float(defined.min())}
+
+
 def most_and_least(values: NDArray[np.float64]) -> tuple[int | None, int | None]:
     """The members (K,) with the highest and with the lowest value; None without any."""
     defined = np.flatnonzero(~np.isnan(values))

@@ -26,7 +26,7 @@ class Frame:
     observation: Observations  # (*obs)
     step: int  # of the episode
     option: int  # that runs in this state, or ended in it
-    positive: bool  # its own classifier's prediction
+    says_yes: bool  # its own classifier's verdict on the state
     left: int  # steps until its timeout
     ended: str  # why it ended in this state; empty where it goes on
 

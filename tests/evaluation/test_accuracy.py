@@ -6,6 +6,7 @@ import pytest
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.selection import preference
 from hypogoal.hypotheses.scores import (
+    best_mean_worst,
     best_threshold,
     cross_fitted,
     halves,
@@ -59,6 +60,12 @@ def test_member_order_does_not_matter():
     for name, values in member_scores(VERDICTS[:, order], LABELS).items():
         np.testing.assert_array_equal(values, member_scores(VERDICTS, LABELS)[name][order])
     assert mean_disagreement(VERDICTS[:, order]) == pytest.approx(mean_disagreement(VERDICTS))
+
+
+def test_best_mean_and_worst_member():
+    """Spec F1: the paper shows only the best; members without a score are left out."""
+    assert best_mean_worst(np.array([0.5, np.nan, 0.9, 0.7])) == pytest.approx({"best": 0.9, "mean": 0.7, "worst": 0.5})
+    assert np.isnan(best_mean_worst(np.array([np.nan]))["best"])
 
 
 def test_disagreement_by_hand():

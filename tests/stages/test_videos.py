@@ -72,9 +72,9 @@ def test_an_episode_is_whole(frames):
             assert (after.left, after.option, after.step) == (before.left - 1, before.option, before.step + 1)
     for frame in frames:
         if frame.ended == "its time is up":
-            assert frame.left == 0 and not frame.positive
+            assert frame.left == 0 and not frame.says_yes
         if frame.ended == "its classifier is positive":
-            assert frame.positive
+            assert frame.says_yes
 
 
 def test_verdicts_are_those_of_the_member_that_runs(run, frames):
@@ -84,7 +84,7 @@ def test_verdicts_are_those_of_the_member_that_runs(run, frames):
         own = [frame for frame in frames if frame.option == option]
         ensemble = read_ensemble(source.path, source.config, source.config["sub_goals"][option // MEMBERS])
         says = ensemble.predictions(np.stack([frame.observation for frame in own]))[:, option % MEMBERS]
-        assert says.tolist() == [frame.positive for frame in own]
+        assert says.tolist() == [frame.says_yes for frame in own]
 
 
 def test_videos_are_of_the_agents_that_choose(run):
