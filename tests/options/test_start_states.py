@@ -104,6 +104,8 @@ def test_every_option_begins_at_a_start_state(tmp_path: Path) -> None:
         (0, 0, 0, 0), (0, 2, 0, 20), (0, 5, 0, 50),
     ]  # fmt: skip
     assert recorder.recent(restarted=True) == pytest.approx({"reached": 1 / 3, "terminated": 1 / 3, "duration": 3.0})
+    assert recorder.recent(restarted=False) == pytest.approx({"success": 0.0, "length": 3.0})
+    assert Recorder(2, engine).recent(restarted=False) == {}
 
 
 def test_an_option_that_begins_inside_its_sub_goal_runs_and_says_so(tmp_path: Path) -> None:
