@@ -97,3 +97,9 @@ def test_networks_give_a_score_per_option_and_a_value(network: type) -> None:
     out = network((64, 64, 3), 15)(torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8))
     assert out.shape == (2, 16)
     assert float(out.detach()[:, :15].softmax(1).max()) < 0.08
+
+
+def test_the_papers_network_has_the_size_that_its_deviation_gives() -> None:
+    """Spec E2, DEV-49: 0.4 million weights on DoorKey's picture."""
+    size = sum(weights.numel() for weights in PaperMetaNetwork((64, 64, 3), 15).parameters())
+    assert 400_000 < size < 450_000

@@ -261,6 +261,24 @@ def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
     assert learner._update(1, learner.members[1]) > 0.0
 
 
+@pytest.mark.usefixtures("small_gru")
+def test_an_execution_whose_beginning_was_overwritten_is_not_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D2, D3: five steps of an execution, then five of the next in a replay of eight: only those are unrolled."""
+    engine = LongCorridor(1)
+    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 8, "option_timeout": 5}))
+    learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
+    states = [int(engine.ids[0]), *(int(engine.step(np.array([STAY])).next_ids[0]) for _ in range(10))]
+    for begin in (0, 5):
+        path = zip(states[begin : begin + 5], states[begin + 1 : begin + 6], strict=True)
+        learner._store(0, [(state, STAY, after, False, False, False) for state, after in path])
+    seen: set[int] = set()
+    images = engine.images
+    monkeypatch.setattr(engine, "images", lambda ids, *out: (seen.update(ids.tolist()), images(ids, *out))[1])
+    for _ in range(3):
+        learner._update(0, learner.members[0])
+    assert seen == set(states[5:])
+
+
 def test_same_seed_same_bytes_with_every_switch() -> None:
     """The project's rule: randomness is passed in."""
     every = {"n_step": 4, "exploration": "persistent", "actions": "moves"}
