@@ -11,6 +11,7 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
+from hypogoal.options import recurrent
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import make_policies
@@ -277,6 +278,21 @@ def test_an_execution_whose_beginning_was_overwritten_is_not_replayed(monkeypatc
     for _ in range(3):
         learner._update(0, learner.members[0])
     assert seen == set(states[5:])
+
+
+@pytest.mark.usefixtures("small_gru")
+def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D1, D2: reward 1 there, and no value of what lies behind, though the episode goes on."""
+    engine = LongCorridor(1)
+    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 8, "option_timeout": 5}))
+    learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
+    middle, beside, end = int(engine.ids[0]), *(int(engine.step(np.array([LEFT])).next_ids[0]) for _ in range(2))
+    learner._store(0, [(middle, LEFT, beside, False, False, False), (beside, LEFT, end, False, False, True)])
+    seen, targets = [], recurrent.double_q_targets
+    monkeypatch.setattr(recurrent, "double_q_targets", lambda *of, **more: (seen.append(of), targets(*of, **more))[1])
+    learner._update(0, learner.members[0])
+    ((rewards, terminal, *_),) = seen
+    assert set(rewards.tolist()) == {0.0, 1.0} and torch.equal(terminal, rewards == 1)
 
 
 def test_same_seed_same_bytes_with_every_switch() -> None:
