@@ -139,7 +139,7 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
     >>> observations = numpy.zeros((2, *ensemble.observation_shape), dtype="uint8")
     >>> ensemble.predict(observations).shape  # P(sub-goal reached) of each state, per member
     (2, 3)
-    >>> ensemble.verdicts(observations).dtype
+    >>> ensemble.predictions(observations).dtype
     dtype('bool')
     """
     artefact = open_artefact(Path(path), "ensemble").whole()

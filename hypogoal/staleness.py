@@ -99,10 +99,10 @@ def _since(artefact: Artefact, artefacts: Mapping[Path, Artefact]) -> Iterator[s
     """Of an evaluation the artefacts of its run that it lacks; options that an agent continues are part of that one."""
     if artefact.kind != EVALUATION:
         return
-    known, run = {*_places(artefact)}, artefact.path.parent.resolve()
+    recorded, run = {*_places(artefact)}, artefact.path.parent.resolve()
     continued = {place for other in artefacts.values() if other.kind == "meta" for place in _places(other)}
     for path, other in artefacts.items():
-        if path.is_relative_to(run) and other.kind in EVALUATED and path not in known | continued:
+        if path.is_relative_to(run) and other.kind in EVALUATED and path not in recorded | continued:
             yield f"{_shown(path)} was made since"
 
 

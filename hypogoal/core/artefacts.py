@@ -76,8 +76,8 @@ class Artefact:
             if entry["kind"] == kind:
                 path, fault = find_input(self.path, entry)
                 if path is None:
-                    what = f"the {kind} that {self.path} was made from is {fault}"
-                    raise UserError(what, entry["path"], "Restore it.")
+                    source = f"the {kind} that {self.path} was made from"
+                    raise UserError(f"{source} is {fault}", entry["path"], "Restore it.")
                 return path
         raise UserError(f"{self.path} was not made from any {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
@@ -151,8 +151,8 @@ def check_kind(out: Path, kind: str) -> None:
             raise UserError(f"the existing output is not of kind {kind!r}: a folder without a manifest", out, AWAY)
         existing = _manifest_kind(out)
         if existing != kind:
-            what = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
-            raise UserError(f"the existing output is not of kind {kind!r}: {what}", out, AWAY)
+            reason = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
+            raise UserError(f"the existing output is not of kind {kind!r}: {reason}", out, AWAY)
         return
     with open_file(out, "the existing output is", AWAY) as file:
         begin = file.read(FRONT)
@@ -246,8 +246,8 @@ def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefa
     manifest = read_manifest(manifest_path)
     kinds = (kind,) if isinstance(kind, str) else kind
     if kinds is not None and manifest["kind"] not in kinds:
-        what = f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed"
-        raise UserError(what, path, "Give the right folder.")
+        fault = f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed"
+        raise UserError(fault, path, "Give the right folder.")
     return Artefact(path, manifest)
 
 

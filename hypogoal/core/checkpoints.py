@@ -129,8 +129,8 @@ class Checkpoints:
             replace_file(fresh, self.path)
         except (OSError, SafetensorError) as error:
             fresh.unlink(missing_ok=True)
-            what = f"a checkpoint cannot be written ({error})"
-            raise UserError(what, self.path, "Free some disk space, then continue with --resume.") from None
+            fault = f"a checkpoint cannot be written ({error})"
+            raise UserError(fault, self.path, "Free some disk space, then continue with --resume.") from None
 
     def load(self) -> State | None:
         """The saved state, or None. A damaged file is a ``UserError``."""
@@ -145,8 +145,8 @@ class Checkpoints:
                 raise ValueError
             state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
         except (SafetensorError, KeyError, TypeError, ValueError, RecursionError):
-            what = "the checkpoint is damaged, or of an earlier version"
-            raise UserError(what, self.path, ANEW) from None
+            fault = "the checkpoint is damaged, or of an earlier version"
+            raise UserError(fault, self.path, ANEW) from None
         return state
 
     @contextlib.contextmanager

@@ -191,10 +191,10 @@ def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
         raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
 
 
-def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str, do: str) -> None:
+def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, subject: str, do: str) -> None:
     """Refuse (``UserError``) to continue another identity, naming the first difference.
 
-    ``what`` begins the message ("the complete output was made"); ``do`` is what to do about it.
+    ``subject`` begins the message ("the complete output was made"); ``do`` is what to do about it.
     """
     before, now = _that_matters(before), _that_matters(now)
     for key in {**before, **now}:
@@ -205,7 +205,7 @@ def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str
             key = next(name for name in {**old, **new} if old.get(name) != new.get(name))
             old, new = old.get(key), new.get(key)
         other = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
-        raise UserError(f"{what} with {other}", out, do)
+        raise UserError(f"{subject} with {other}", out, do)
 
 
 def _that_matters(identity: dict[str, Any]) -> dict[str, Any]:

@@ -33,37 +33,37 @@ NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
 FORMULA = "=+-@＝＋－＠"  # a cell that begins with one is a formula to a spreadsheet; full-width ones too
 
 
-def require_file(path: Path, what: str, do: str) -> int:
+def require_file(path: Path, subject: str, do: str) -> int:
     """The size in bytes of a regular file; a missing one, a folder, device or pipe is a ``UserError``.
 
-    ``what`` begins the message, with its verb ("the weights are"); ``do`` is what to do.
+    ``subject`` begins the message, with its verb ("the weights are"); ``do`` is what to do.
     """
     try:
         state = path.stat()
     except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"{what} missing", path, do) from None
+        raise UserError(f"{subject} missing", path, do) from None
     except (OSError, ValueError) as error:  # a name too long or with a null character, a folder without permission
-        raise UserError(f"{what} not readable ({getattr(error, 'strerror', error)})", path, do) from None
+        raise UserError(f"{subject} not readable ({getattr(error, 'strerror', error)})", path, do) from None
     if not stat.S_ISREG(state.st_mode):
-        raise UserError(f"{what} not a regular file", path, do)
+        raise UserError(f"{subject} not a regular file", path, do)
     return state.st_size
 
 
-def open_file(path: Path, what: str, do: str) -> BufferedReader:
+def open_file(path: Path, subject: str, do: str) -> BufferedReader:
     """A regular file, or a link to one, opened for reading bytes; see :func:`require_file`.
 
     The file may be replaced by a pipe at any time: opening does not wait for the pipe's other end, and the opened file
     is checked again.
     """
-    require_file(path, what, do)
+    require_file(path, subject, do)
     flags = [getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY", "O_NOINHERIT")]
     try:
         file = os.fdopen(os.open(path, os.O_RDONLY | sum(flags)), "rb")
     except OSError as error:
-        raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
+        raise UserError(f"{subject} not readable ({error.strerror})", path, do) from None
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
-        raise UserError(f"{what} not a regular file", path, do)
+        raise UserError(f"{subject} not a regular file", path, do)
     return file
 
 
@@ -78,24 +78,24 @@ def is_hole(file: BufferedReader) -> bool:
     return hole < state.st_size
 
 
-def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
+def read_bytes(path: Path, subject: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
     """The bytes of a regular file, up to its size when opened; over ``limit`` or unreadable, a ``UserError``."""
-    with open_file(path, what, do) as file:
+    with open_file(path, subject, do) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
-            raise UserError(f"{what} too large ({size} bytes, at most {limit} are read)", path, do)
+            raise UserError(f"{subject} too large ({size} bytes, at most {limit} are read)", path, do)
         try:
             return file.read(size)
         except OSError as error:
-            raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
+            raise UserError(f"{subject} not readable ({error.strerror})", path, do) from None
 
 
-def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
+def read_text(path: Path, subject: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
     """The text of a file in UTF-8 (else a ``UserError``) with line feeds as line ends; see :func:`read_bytes`."""
     try:
-        text = read_bytes(path, what, do, limit).decode()
+        text = read_bytes(path, subject, do, limit).decode()
     except UnicodeDecodeError:
-        raise UserError(f"{what} not text in UTF-8", path, do) from None
+        raise UserError(f"{subject} not text in UTF-8", path, do) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -111,18 +111,18 @@ def read_end(path: Path, limit: int = END_BYTES) -> list[str]:
     return lines[1:] if cut else lines
 
 
-def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> Any:
+def read_json(path: Path, subject: str, do: str, limit: int = MAX_TEXT_BYTES) -> Any:
     """The contents of a JSON file; see :func:`read_text` and :func:`parse_json`."""
-    return parse_json(read_text(path, what, do, limit), path, what, do)
+    return parse_json(read_text(path, subject, do, limit), path, subject, do)
 
 
-def parse_json(text: str, where: object, what: str, do: str) -> Any:
+def parse_json(text: str, where: object, subject: str, do: str) -> Any:
     """JSON whose values are :func:`_bounded`, finite and valid UTF-8; else a ``UserError``."""
     try:
         value = _parsed(text)
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, NaN, 1e999
     except ValueError:
-        raise UserError(f"{what} not valid JSON", where, do) from None
+        raise UserError(f"{subject} not valid JSON", where, do) from None
     return value
 
 
@@ -155,7 +155,7 @@ def _bounded(value: T) -> T:
     raise ValueError("it is too deep")
 
 
-def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
+def parse_toml(text: str, where: object, subject: str, do: str) -> dict[str, Any]:
     """Valid TOML, else a ``UserError``; keys of hundreds of parts (``a.a.a``) take quadratic time and are refused."""
     try:
         for number, line in enumerate(text.split("\n"), 1):
@@ -165,7 +165,7 @@ def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
         repr(table)  # raises for hexadecimals too long to print
         return _bounded(table)
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
-        raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
+        raise UserError(f"{subject} not valid TOML ({str(error)[:200]})", where, do) from None
 
 
 def replace_text(path: Path, text: str) -> None:

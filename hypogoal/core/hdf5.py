@@ -27,7 +27,7 @@ MAX_ENTRIES = 100_000  # per group
 
 
 @contextlib.contextmanager
-def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
+def open_hdf5(path: Path, subject: str, do: str) -> Iterator[Any]:
     """An HDF5 file opened for reading, locked if the file system can.
 
     A file that is missing, truncated, not HDF5, open for writing elsewhere, or in which something is ``Foreign`` is a
@@ -35,20 +35,20 @@ def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
     """
     import h5py
 
-    require_file(path, f"{what} is", do)
+    require_file(path, f"{subject} is", do)
     try:
         opened = h5py.File(path, "r", locking="best-effort")
     except (OSError, ValueError, RuntimeError, KeyError) as error:
         if "unable to lock" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
-            raise UserError(f"{what} is open in another program", path, "Close it there first.") from None
+            raise UserError(f"{subject} is open in another program", path, "Close it there first.") from None
         if isinstance(error, PermissionError):
-            raise UserError(f"{what} may not be read (permission denied)", path, "Ask for permission.") from None
-        raise UserError(f"{what} is truncated or not HDF5", path, do) from None
+            raise UserError(f"{subject} may not be read (permission denied)", path, "Ask for permission.") from None
+        raise UserError(f"{subject} is truncated or not HDF5", path, do) from None
     with opened as file:
         try:
             yield file
         except Foreign as error:
-            raise UserError(f"{what} cannot be used: {error}", path, do) from None
+            raise UserError(f"{subject} cannot be used: {error}", path, do) from None
 
 
 @contextlib.contextmanager
@@ -72,12 +72,12 @@ class Foreign(Exception):
 
 
 @contextlib.contextmanager
-def _readable(what: str) -> Iterator[None]:
-    """Whatever the HDF5 library raises in the block, if ``what`` is damaged, is ``Foreign``."""
+def _readable(subject: str) -> Iterator[None]:
+    """Whatever the HDF5 library raises in the block, if ``subject`` is damaged, is ``Foreign``."""
     try:
         yield
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, MemoryError):
-        raise Foreign(f"{what} is not readable") from None
+        raise Foreign(f"{subject} is not readable") from None
 
 
 def fixed(text: str) -> NDArray[np.bytes_]:

@@ -79,37 +79,37 @@ def environment_of_children() -> dict[str, str]:
     return {TRUST: ",".join(sorted(allowed())), OF_FILE: "1"}
 
 
-def require_trust(name: str, what: str) -> None:
+def require_trust(name: str, role: str) -> None:
     """Refuse (``UserError``) to load ``module:object`` that the user neither typed nor allowed; other names pass.
 
-    ``what`` it is used as ("domain") is for the message.
+    The message names its ``role`` ("domain").
     """
     if ":" in name and name not in allowed():
         do = f"Do you trust it? Set {permission([name, *in_environment()])}"
-        raise UserError(f"a file names code of its own as its {what}", name, do)
+        raise UserError(f"a file names code of its own as its {role}", name, do)
 
 
-def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> Any:
+def load_own(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
     """The object called ``name``: one of ``built_in``, an installed entry point of ``group``, or ``module:object``.
 
     Modules in the current folder can be loaded too, however hypogoal was started; installed ones come first. An unknown
-    name, one that cannot be loaded, and code that the user did not allow are a ``UserError``; ``what`` it is ("domain")
-    is for the message.
+    name, one that cannot be loaded, and code that the user did not allow are a ``UserError``, whose message calls it by
+    its ``role`` ("domain").
     """
     entries = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     target = built_in.get(name) or entries.get(name)
     if target is None and ":" in name:
-        require_trust(name, what)
+        require_trust(name, role)
         if "" not in sys.path and os.getcwd() not in sys.path:
             sys.path.append(os.getcwd())
         target = name
     if target is None:
         names = ", ".join(sorted({*built_in, *entries}))
-        raise UserError(f"unknown {what}", name, f"Choose one of {names}, or give module:object.")
+        raise UserError(f"unknown {role}", name, f"Choose one of {names}, or give module:object.")
     module, _, attribute = target.partition(":")
     if name not in built_in and not target.startswith("hypogoal."):
         _own.add(module.partition(".")[0])
-    with UsersCode(f"the {what}", name, failed="cannot be loaded:"):
+    with UsersCode(f"the {role}", name, failed="cannot be loaded:"):
         loaded = importlib.import_module(module)
         return getattr(loaded, attribute) if attribute else loaded
 

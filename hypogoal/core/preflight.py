@@ -34,8 +34,8 @@ def preflight(stage: str, out: Path, needs: Needs, *, resume: bool = False, quie
     if free is not None:
         free_text = human(free)
         if memory > free:
-            what = f"not enough memory: about {human(memory)} needed, {free_text} free"
-            raise UserError(what, stage, smaller)
+            fault = f"not enough memory: about {human(memory)} needed, {free_text} free"
+            raise UserError(fault, stage, smaller)
     if disk > space:
         raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
     if not quiet:

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import re
 import sys
 import threading
 import time
@@ -16,7 +15,6 @@ from hypogoal.core.terminal import printable, say, screen
 
 FIRST_SECONDS, PLAIN_INTERVAL_SECONDS = 2.0, 10.0  # until the first line, and between lines
 LOOK_SECONDS = 1.0
-UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86400.0}  # seconds of each unit
 
 
 class Progress:
@@ -142,12 +140,6 @@ def duration(seconds: float) -> str:
     if seconds < 90 * 60:
         return f"{round(seconds / 60)} min"
     return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} days"
-
-
-def said_left(text: str) -> float | None:
-    """The seconds left according to a line of :class:`Progress`; None if it does not say."""
-    match = re.search(rf", ([0-9]{{1,9}}(?:\.[0-9]+)?) ({'|'.join(UNITS)}) left\)", text)
-    return float(match[1]) * UNITS[match[2]] if match else None
 
 
 class MetricsLog:

@@ -256,8 +256,8 @@ class TurnEngine(Engine):
         """The ids; ``ValueError`` if one is unknown or, where it must be ``kept``, forgotten."""
         if len(ids) and not 0 <= ids.min() <= ids.max() < self.n_states:
             raise ValueError(f"ids are 0 to {self.n_states - 1}, not {ids.min()} to {ids.max()}")
-        if kept and not (there := self.remembers(ids)).all():
-            raise ValueError(f"state {ids[~there][0]} is forgotten; the oldest kept is {self.oldest}")
+        if kept and not (remembered := self.remembers(ids)).all():
+            raise ValueError(f"state {ids[~remembered][0]} is forgotten; the oldest kept is {self.oldest}")
         return ids
 
     @abstractmethod

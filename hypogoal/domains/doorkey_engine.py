@@ -75,10 +75,10 @@ Configuration = tuple[int, ...]  # the layout's seed; the door; the places of th
 @cache
 def tiles() -> NDArray[np.uint8]:
     """MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
-    things: list[Any] = [None, Wall(), Goal(), *(Key(colour) for colour in KEY_COLOURS)]
-    things += [Door(DOOR_COLOUR, is_open=state == OPEN, is_locked=state == LOCKED) for state in (OPEN, CLOSED, LOCKED)]
-    drawn = [Grid.render_tile(thing, tile_size=TILE) for thing in things]
-    for under in (None, things[DOOR + OPEN], things[GOAL]):
+    objects: list[Any] = [None, Wall(), Goal(), *(Key(colour) for colour in KEY_COLOURS)]
+    objects += [Door(DOOR_COLOUR, is_open=state == OPEN, is_locked=state == LOCKED) for state in (OPEN, CLOSED, LOCKED)]
+    drawn = [Grid.render_tile(item, tile_size=TILE) for item in objects]
+    for under in (None, objects[DOOR + OPEN], objects[GOAL]):
         drawn += [Grid.render_tile(under, agent_dir=direction, tile_size=TILE) for direction in range(4)]
     table = np.stack(drawn).astype(np.uint8)  # render_tile returns float64
     table.flags.writeable = False

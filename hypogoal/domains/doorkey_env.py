@@ -189,11 +189,11 @@ class DoorKeyGrid(MiniGridEnv):
         x, y = self.agent_pos
         where: dict[Any, int] = {}
         walls = set()
-        for cell, thing in enumerate(self.grid.grid):
-            if isinstance(thing, Wall):
+        for cell, content in enumerate(self.grid.grid):
+            if isinstance(content, Wall):
                 walls.add(cell)
-            elif thing is not None:
-                where[thing.color if isinstance(thing, Key) else type(thing)] = cell
+            elif content is not None:
+                where[content.color if isinstance(content, Key) else type(content)] = cell
         return Layout(
             walls=frozenset(walls),
             door=where[_RingDoor],

@@ -102,7 +102,6 @@ class _Task(NamedTuple):
     name: str
     gather: Callable[[], RoomStates]
     kept: Checkpoints
-    wanted: int
 
     def load(self) -> RoomStates | None:
         """The states gathered before, if any."""
@@ -196,7 +195,7 @@ class MontezumaDomain(Domain):
             draw = partial(gather, play=play, held_out=name == "heldout", runs_on=name == "unlabelled")
             for room in rooms:
                 job = partial(draw, room, wanted, seed, ("montezuma", name, *stream))
-                tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None), wanted))
+                tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None)))
             expected += wanted * len(rooms)
         progress.expect(expected)
         gathered = {number: states for number, task in enumerate(tasks) if (states := task.load())}

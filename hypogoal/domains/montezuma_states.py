@@ -364,9 +364,9 @@ def standing_places(emulator: Emulator, room: int) -> NDArray[np.int64]:
     return np.unique(np.stack([x[columns], level[rows]], axis=1), axis=0)
 
 
-def _in_turn(things: Sequence[Any], rng: np.random.Generator) -> Iterator[Any] | None:
-    """Cycles through the things in a random order; None if there are none."""
-    return cycle([things[index] for index in rng.permutation(len(things)).tolist()]) if things else None
+def _in_turn(items: Sequence[Any], rng: np.random.Generator) -> Iterator[Any] | None:
+    """Cycles through the items in a random order; None if there are none."""
+    return cycle([items[index] for index in rng.permutation(len(items)).tolist()]) if items else None
 
 
 def _climbs(ladder: Ladder) -> list[tuple[Position, int, int]]:

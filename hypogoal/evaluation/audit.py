@@ -80,8 +80,8 @@ def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict
     engine.reset()
     ids = states_met(engine, RANDOM_STEPS, rng)
     ids = ids[engine.remembers(ids)]
-    truth, says_yes = engine.labels(ids)[:, column], loop.terminations.of(ids)[:, :1]
-    scores = {name: score.item() for name, score in member_scores(says_yes, truth).items()}
+    truth, positive = engine.labels(ids)[:, column], loop.terminations.of(ids)[:, :1]
+    scores = {name: score.item() for name, score in member_scores(positive, truth).items()}
     return {"states": len(ids), "positives": int(truth.sum()), **scores}
 
 
@@ -90,12 +90,12 @@ def findings(
 ) -> dict[str, Any]:
     """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
 
-    False yes are of one kind where the same sub-goals hold and, of engines that know positions, the cell is the same;
+    False positives are of one kind where the same sub-goals hold and, where positions are known, the cell is the same;
     of each of the most frequent kinds a film of the shortest execution is put into ``folder``, of pictures.
     """
     engine, of_policy, rows = loop.engine, table["option"] == option, list(loop.recorder.executions[option])
-    says_yes, near = table["reached"][of_policy] > 0, table["near"][of_policy] > 0
-    fooled = [row for row, wrong in zip(rows, says_yes & ~near, strict=True) if wrong]
+    positive, near = table["reached"][of_policy] > 0, table["near"][of_policy] > 0
+    fooled = [row for row, wrong in zip(rows, positive & ~near, strict=True) if wrong]
 
     def kind_of(row: Execution) -> tuple[tuple[str, ...], tuple[int, ...]]:
         end = np.array(row.states[-1:])
@@ -113,13 +113,13 @@ def findings(
             (folder / film).write_bytes(_film(loop, path, option))
         description = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
         kinds.append({"executions": len(alike), **description, "film": film if shown else None})
-    ends = {"fooled": len(fooled), "there": int((says_yes & near).sum())}
+    ends = {"fooled": len(fooled), "there": int((positive & near).sum())}
     begun = {"yes_at_start": sum(row.inside_at_start for row in rows)}
     return option_numbers(table, option) | ends | begun | {"kinds": kinds}
 
 
 def _film(loop: OptionLoop, path: NDArray[np.int64], option: int) -> bytes:
-    """An execution that ended in a false yes, from where it began."""
+    """An execution that ended in a false positive, from where it began."""
     timeout = loop.config.option_timeout
     states = zip(loop.engine.images(path), loop.terminations.of(path)[:, option].tolist(), strict=True)
     frames = [
@@ -135,7 +135,7 @@ def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
     for name in POLICIES:
         if row := report[name]:
             ends = f"fooled in {row['fooled']} of {row['executions']} executions, there in {row['there']}"
-            yield f"{name}, yes above {row['threshold']:.4g}: {ends}"
+            yield f"{name}, positive above {row['threshold']:.4g}: {ends}"
             for kind in row["kinds"][:FILMS]:
                 sub_goals = " and ".join(kind["holds"]) or "no sub-goal"
                 yield f"  {kind['film'] or '':12s} {kind['executions']:4d} x  while {sub_goals} holds"

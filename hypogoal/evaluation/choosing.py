@@ -204,7 +204,8 @@ def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
 
 UNITS = {"length": "steps", "within_rho": "Spearman's rho", "score": "ratio"}
 FROZEN = "frozen"  # in numbers.csv: played after training
-UNIFORM = "uniform among its own options"
+UNIFORM = "uniform among its own options"  # in numbers.csv
+UNIFORM_CHOICE = "uniform-random choice among its own options"  # for people
 TABLE = Table(
     {"name": "method"}, {name: Number(name, FROZEN, UNITS.get(name, "fraction")) for name in (*OF_PLAY, *OF_CHOICE)}
 )
@@ -222,7 +223,7 @@ COLUMNS = (
 
 def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
     """Each agent, and below it uniform-random choice among its own options."""
-    both = ((agent | {"chooser": agent["name"]}, agent["uniform"] | {"chooser": UNIFORM}) for agent in agents)
+    both = ((agent | {"chooser": agent["name"]}, agent["uniform"] | {"chooser": UNIFORM_CHOICE}) for agent in agents)
     return [chooser for pair in both for chooser in pair]
 
 

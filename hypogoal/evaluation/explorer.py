@@ -35,11 +35,11 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
         return ()
     from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, method_of
 
-    split, sub_goal, verdicts = judgement.split, judgement.case.sub_goal, judgement.judged.verdicts
+    split, sub_goal, predictions = judgement.split, judgement.case.sub_goal, judgement.judged.predictions
     sub_goals = len(judgement.case.config["sub_goals"])
     most = min(MOST_OF_ONE, MOST_STATES // sub_goals)  # all sub-goals share the page
     places = [split.origins[name] for name in PLACES if name in split.origins]
-    picked = pick_to_browse(verdicts, split.labels, places, most, rng_for(0, "browse", sub_goal))
+    picked = pick_to_browse(predictions, split.labels, places, most, rng_for(0, "browse", sub_goal))
     kind, kinds = split.origins.get("kind"), judgement.kinds
     names = [kinds[kind[index]] if kind is not None and kind[index] < len(kinds) else "" for index in picked]
     group = work.arrays.create_group(f"explorer/{sub_goal}")
@@ -59,18 +59,18 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
 
 
 def pick_to_browse(
-    verdicts: NDArray[np.bool_],
+    predictions: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     places: Sequence[NDArray[np.int64]],
     most: int,
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Which states are shown, int64 (n,) with n at most ``most``, by verdicts (N, K), labels (N,), places (N,) each.
+    """Which states are shown, int64 (n,), n at most ``most``, by predictions (N, K), labels (N,), places (N,) each.
 
     States alike in all places are from the same one; ``rng`` draws among states alike.
     """
-    errors = (verdicts != labels[:, None]).sum(1)
-    outcome = np.where(errors == 0, 0, np.where(errors == verdicts.shape[1], 2, 1)) * 2 + labels
+    errors = (predictions != labels[:, None]).sum(1)
+    outcome = np.where(errors == 0, 0, np.where(errors == predictions.shape[1], 2, 1)) * 2 + labels
     order = rng.permutation(len(labels))
     if places:
         _, place = np.unique(np.stack(places, axis=1), axis=0, return_inverse=True)

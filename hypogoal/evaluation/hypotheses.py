@@ -46,12 +46,12 @@ def look(work: Work, judgement: Judgement) -> Iterator[Row]:
     """Spec F1, F2: each member on held-out states, pooled over layouts, and how much members disagree."""
     split, judged, place = judgement.split, judgement.judged, work.place(judgement)
     layouts = split.origins.get("layout_seed", np.zeros(0))
-    calls = judged.told.mean(0) if len(judged.told) else np.full(judged.told.shape[1], math.nan)
+    calls = judged.unlabelled.mean(0) if len(judged.unlabelled) else np.full(judged.unlabelled.shape[1], math.nan)
     more = {"says_yes_unlabelled": calls, "threshold": judged.thresholds.astype(np.float64)}
-    yield from rows_by_member(member_scores(judged.verdicts, split.labels) | more, **place, scope="heldout")
+    yield from rows_by_member(member_scores(judged.predictions, split.labels) | more, **place, scope="heldout")
     counts = {"states": len(split.labels), "positives": int(split.labels.sum()), "layouts": len(np.unique(layouts))}
-    yield from rows_of(counts | {"disagreement": mean_disagreement(judged.verdicts)}, **place, scope="heldout")
-    yield from rows_of({"disagreement": mean_disagreement(judged.told)}, **place, scope="unlabelled")
+    yield from rows_of(counts | {"disagreement": mean_disagreement(judged.predictions)}, **place, scope="heldout")
+    yield from rows_of({"disagreement": mean_disagreement(judged.unlabelled)}, **place, scope="unlabelled")
 
 
 def of_layouts(rows: Sequence[Row]) -> list[Row]:

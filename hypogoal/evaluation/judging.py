@@ -60,8 +60,8 @@ class Judged(NamedTuple):
     """What K members say of N held-out and M unlabelled states."""
 
     probabilities: NDArray[np.float32]  # (N, K), that the sub-goal is reached
-    verdicts: NDArray[np.bool_]  # (N, K), each at its member's own threshold
-    told: NDArray[np.bool_]  # (M, K), the verdicts on unlabelled states
+    predictions: NDArray[np.bool_]  # (N, K), each at its member's own threshold
+    unlabelled: NDArray[np.bool_]  # (M, K), the predictions on unlabelled states
     thresholds: NDArray[np.float32]  # (K,), each member's own, of the probability
 
 
@@ -100,7 +100,7 @@ class Judgement:
         split, index = self.split, np.array([index for index, _ in picked], dtype=np.int64)
         group["observations"] = split.observations[index]
         group["probabilities"] = self.judged.probabilities[index]
-        group["verdicts"] = self.judged.verdicts[index]
+        group["verdicts"] = self.judged.predictions[index]
         group["labels"] = split.labels[index]
         seeds = split.origins.get("layout_seed")
         group["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)

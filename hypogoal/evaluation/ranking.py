@@ -30,7 +30,7 @@ TABLE = Table(
 
 def knowledge(
     probabilities: NDArray[np.float32],
-    verdicts: NDArray[np.bool_],
+    predictions: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     contexts: NDArray[np.int64] | None,
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
@@ -42,7 +42,7 @@ def knowledge(
     """
 
     def scores(inside: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
-        accuracy = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
+        accuracy = member_scores(predictions[inside], labels[inside])["balanced_accuracy"]
         return {"ranking": ranking(probabilities[inside], labels[inside]), "balanced_accuracy": accuracy}
 
     best, every = best_threshold(probabilities, labels)[1], scores(np.ones(len(labels), dtype=np.bool_))
@@ -62,7 +62,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[Row]:
     unseen = origins["seen"] == 0 if by_room else np.ones(len(judgement.split.labels), dtype=np.bool_)
     contexts = next((origins[name][unseen] for name in ("layout_seed", "room") if name in origins), None)
     labels = judgement.split.labels[unseen]
-    columns, crossed = knowledge(judged.probabilities[unseen], judged.verdicts[unseen], labels, contexts)
+    columns, crossed = knowledge(judged.probabilities[unseen], judged.predictions[unseen], labels, contexts)
     if by_room:  # ``rooms`` has their ranking
         del columns["ranking"]
     scope = "unseen" if by_room else HELDOUT

@@ -58,7 +58,7 @@ BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at
 
 def rows_by_room(
     probabilities: NDArray[np.float32],
-    verdicts: NDArray[np.bool_],
+    predictions: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
     **place: Any,
@@ -71,24 +71,24 @@ def rows_by_room(
     seen = origins["seen"]
     for name, values in SCOPES.items():
         inside = np.isin(seen, values)
-        scores = member_scores(verdicts[inside], labels[inside])
+        scores = member_scores(predictions[inside], labels[inside])
         scores["ranking"] = ranking(probabilities[inside], labels[inside])
         yield from rows_by_member(scores, **place, scope=name)
         counts = {"states": int(inside.sum()), "positives": int(labels[inside].sum())}
         counts |= {"rooms": len(np.unique(origins["room"][inside]))} if "room" in origins else {}
         yield from rows_of(counts, **place, scope=name)
-    yield from rows_of(choose(verdicts, labels, seen), **place, scope=VALIDATION)
+    yield from rows_of(choose(predictions, labels, seen), **place, scope=VALIDATION)
 
 
 def choose(
-    verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], seen: NDArray[np.int64]
+    predictions: NDArray[np.bool_], labels: NDArray[np.bool_], seen: NDArray[np.int64]
 ) -> dict[str, int | float | None]:
     """Spec F1: the member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
 
     The first of equally good ones, since their order is random; None where those rooms lack a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
-    scores = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
+    scores = member_scores(predictions[inside], labels[inside])["balanced_accuracy"]
     if np.isnan(scores).all():
         return {VALIDATED: None, "validation": math.nan}
     return {VALIDATED: int(np.nanargmax(scores)), "validation": float(np.nanmax(scores))}
@@ -146,7 +146,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[Row]:
     split, judged = judgement.split, judgement.judged
     if "seen" in split.origins:
         place = work.place(judgement)
-        yield from rows_by_room(judged.probabilities, judged.verdicts, split.labels, split.origins, **place)
+        yield from rows_by_room(judged.probabilities, judged.predictions, split.labels, split.origins, **place)
 
 
 def missing(work: Work) -> list[str]:

@@ -77,7 +77,7 @@ def most_used(contents: Contents) -> int | None:
 
 
 def takes(artefact: Artefact) -> bool:
-    """Whether it was learned with the verdicts of an ensemble's members."""
+    """Whether it was learned with the predictions of an ensemble's members."""
     return artefact.kind != "baseline" and artefact.config["termination"] != "oracle"
 
 

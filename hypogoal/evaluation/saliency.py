@@ -45,10 +45,10 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     split, sub_goal, judged = judgement.split, judgement.case.sub_goal, judgement.judged
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
-    labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
+    labels, probabilities, predictions = split.labels[among], judged.probabilities[among], judged.predictions[among]
     pictures = split.observations.dtype == PICTURE
     spread = np.linspace(0, len(among) - 1, min(len(among), AVERAGED)).astype(np.int64).tolist()
-    explained = pick_to_explain(probabilities, verdicts, labels) if pictures else [(at, SPREAD) for at in spread]
+    explained = pick_to_explain(probabilities, predictions, labels) if pictures else [(at, SPREAD) for at in spread]
     picked = [(int(among[index]), kind) for index, kind in explained]
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
@@ -69,19 +69,19 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
 
 
 def pick_to_explain(
-    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]
+    probabilities: NDArray[np.float32], predictions: NDArray[np.bool_], labels: NDArray[np.bool_]
 ) -> list[tuple[int, str]]:
     """Figures 2 and 9: the few of N states, (index, kind), whose attributions are drawn, no state twice.
 
     ``true positive``: where most of K members are right and surest on average; ``disagree``: where members differ and
     their probabilities are furthest apart; ``false positive``: where most err, and are surest. Fewer where none are.
     """
-    positive, mean = verdicts.sum(1), probabilities.mean(1)
+    positive, mean = predictions.sum(1), probabilities.mean(1)
     spread = probabilities.max(1) - probabilities.min(1)
     picked: list[tuple[int, str]] = []
     for kind, mask, order in (
         ("true positive", labels & (positive > 0), -(positive + mean)),
-        ("disagree", (positive > 0) & (positive < verdicts.shape[1]), -spread),
+        ("disagree", (positive > 0) & (positive < predictions.shape[1]), -spread),
         ("false positive", ~labels & (positive > 0), -(positive + mean)),
     ):
         free = mask.copy()

@@ -16,7 +16,7 @@ import numpy as np
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
-from hypogoal.evaluation.choosing import FROZEN, UNIFORM
+from hypogoal.evaluation.choosing import FROZEN, UNIFORM, UNIFORM_CHOICE
 from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name, titled
 from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
 from hypogoal.evaluation.page import Block, Material, Question, listed, percent, picture, section
@@ -105,7 +105,7 @@ def findings(work: Work) -> Iterator[Finding]:
     for name in several:
         played, title = select(frozen, method=name), called(agents[name][0])
         if pairs := paired(played, uniform, "artefact"):
-            second = "uniform-random choice among its own options"
+            second = UNIFORM_CHOICE
         else:
             second = "an agent whose choice is uniform-random"  # it has learned other options
             pairs = paired(select(trained, method=name), learning, "layout", "seed")

@@ -17,7 +17,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.choosing import UNIFORM
+from hypogoal.evaluation.choosing import UNIFORM, UNIFORM_CHOICE
 from hypogoal.evaluation.curves import NEAR, scores
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import Metrics
@@ -164,7 +164,7 @@ SCORES = (
     page.number("within 2, %", "within_2", page.interval, 0, 100),
 )
 AGENTS = (
-    page.label("agent", "name"),
+    page.label("agent", lambda entry: UNIFORM_CHOICE if entry["name"] == UNIFORM else entry["name"]),
     *SCORES,
     page.number("steps", "length", page.interval, 0),
     page.number("trained on", "trained_on"),

@@ -152,7 +152,7 @@ class Ensemble(nn.Module):
             raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", kind, do)
         return np.ascontiguousarray(self.view.see(observations, positions))  # torch takes no flipped arrays
 
-    def verdicts(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+    def predictions(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
         """Every member's prediction, whether the sub-goal holds: bool (N, K); see :meth:`predict`.
 
         Within rounding of its threshold, some 1e-6, a prediction may depend on the other states of the call.

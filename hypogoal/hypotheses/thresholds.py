@@ -67,7 +67,7 @@ def thresholds(
 
     A threshold stays below 1, so a member that is certain of more states than the rule allows still predicts them
     positive. The prediction for the state whose probability is the threshold depends on rounding, see
-    :meth:`Ensemble.verdicts`.
+    :meth:`Ensemble.predictions`.
 
     Args:
         name: of the rule.

@@ -48,10 +48,10 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation = self._reader.read(self.env, observation)
         if self.by == "mean":
             return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
-        verdicts = self.ensemble.verdicts(observation[None])[0]
+        predictions = self.ensemble.predictions(observation[None])[0]
         if isinstance(self.by, str):
-            return bool({"any": verdicts.any(), "all": verdicts.all(), "vote": verdicts.mean() > 0.5}[self.by])
-        return bool(verdicts[self.by])
+            return bool({"any": predictions.any(), "all": predictions.all(), "vote": predictions.mean() > 0.5}[self.by])
+        return bool(predictions[self.by])
 
 
 class SubgoalReward(_Subgoal):

@@ -157,8 +157,8 @@ def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termin
     """The columns of these sub-goals among the domain's; a ``UserError`` that says ``do`` where it lacks one."""
     for sub_goal in sub_goals:
         if sub_goal not in domain.sub_goals:
-            what, names = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
-            raise UserError(what, sub_goal, f"It knows of {names}. {do}")
+            fault, names = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
+            raise UserError(fault, sub_goal, f"It knows of {names}. {do}")
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 
@@ -179,8 +179,8 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
         return layouts
     for start in config.start.split(",") if domain.many_starts else [config.start]:
         if start not in domain.starts:
-            what = "unknown start" if start else "where are episodes to begin?"
-            raise UserError(what, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
+            fault = "unknown start" if start else "where are episodes to begin?"
+            raise UserError(fault, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
     return {"start": config.start, "memory": memory, "seed": seed, **layouts}
 
@@ -249,15 +249,15 @@ def check_fit(
     """Refuse (``UserError``) to train options further that are of another ensemble or differ in ``fixed`` settings."""
     made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
     if sha256_of(source.path / "manifest.json") not in made_from:
-        what = "these options were trained with another ensemble"
-        raise UserError(what, trained.path, f"Train them from {source.path}.")
+        fault = "these options were trained with another ensemble"
+        raise UserError(fault, trained.path, f"Train them from {source.path}.")
     before = as_dict(type(config)()) | trained.config  # older artefacts lack some settings
     for key in fixed:
         if key == "layout_seed" and before["layouts"]:  # options of many layouts may be played in any
             continue
         if before[key] != getattr(config, key):
-            what = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
-            raise UserError(what, trained.path, f"Give --set {key}={before[key]}, or leave it out.")
+            fault = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
+            raise UserError(fault, trained.path, f"Give --set {key}={before[key]}, or leave it out.")
 
 
 def options_of(ensemble_config: Mapping[str, Any], config: PlayConfig) -> int:

@@ -38,7 +38,7 @@ class Outcome:
     options: NDArray[np.int64]  # that they were of
     began: NDArray[np.int64]  # the states in which these were chosen
     reached: NDArray[np.bool_]  # the options' own classifiers ended them
-    inside: NDArray[np.bool_]  # these said yes already where they began
+    inside: NDArray[np.bool_]  # these were positive already where they began
     returns: NDArray[np.float64]  # the environment's rewards inside the option, discounted from its start
     durations: NDArray[np.int64]  # tau, the options' steps
     discounts: NDArray[np.float64]  # gamma ** tau, for the state reached

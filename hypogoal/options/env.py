@@ -75,21 +75,21 @@ class Options:
         """For example ``open-red-door/2``."""
         return f"{self.sub_goals[option // self.members]}/{option % self.members}"
 
-    def verdicts(self, observation: Observations) -> NDArray[np.bool_]:
+    def predictions(self, observation: Observations) -> NDArray[np.bool_]:
         """Which options' sub-goals hold in one observation (*obs): bool (G*K,)."""
-        return np.concatenate([ensemble.verdicts(observation[None])[0] for ensemble in self.ensembles])
+        return np.concatenate([ensemble.predictions(observation[None])[0] for ensemble in self.ensembles])
 
     def offered(self, observation: Observations) -> NDArray[np.bool_]:
         """Spec D6, D7: which options may start in an observation (*obs): bool (G*K,)."""
         offered: NDArray[np.bool_] = np.ones(self.count, dtype=np.bool_)
         if self.mask_reached:
-            offered = offered_options(self.verdicts(observation)[None])[0]
+            offered = offered_options(self.predictions(observation)[None])[0]
         return offered if self.initiation is None else self.initiation(observation, offered)
 
     def holds(self, option: int, observation: Observations) -> bool:
         """Whether one option's own sub-goal holds in an observation (*obs)."""
         ensemble = self.ensembles[option // self.members]
-        return bool(ensemble.verdicts(observation[None])[0, option % self.members])
+        return bool(ensemble.predictions(observation[None])[0, option % self.members])
 
 
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

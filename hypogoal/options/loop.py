@@ -26,9 +26,9 @@ from hypogoal.options.visited import Visited
 NONE = -1
 
 
-def offered_options(verdicts: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def offered_options(predictions: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Spec D6: options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
-    offered = ~verdicts
+    offered = ~predictions
     offered[~offered.any(1)] = True
     return offered
 

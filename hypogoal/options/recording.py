@@ -27,7 +27,7 @@ class Execution(NamedTuple):
     option: int  # g*K + k
     duration: int  # its steps
     reached: bool  # its own classifier ended it
-    inside_at_start: bool  # its own classifier said yes where it began
+    inside_at_start: bool  # its own classifier was positive where it began
     terminated: bool  # it ended in a terminal state of the episode
     states: list[int]  # the ids of those that it came to, the last one that it ended in
     began: int = -1  # the id of the one before them

@@ -134,8 +134,8 @@ def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArr
         if len(images) == 1:
             require_memory(count * images[0].nbytes, file)
         if _size(images[-1]) != _size(images[0]):
-            what = f"the image is {_size(images[-1])}, others are {_size(images[0])}"
-            raise UserError(what, file, "Make them all one size.")
+            fault = f"the image is {_size(images[-1])}, others are {_size(images[0])}"
+            raise UserError(fault, file, "Make them all one size.")
     return images
 
 

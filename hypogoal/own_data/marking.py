@@ -67,8 +67,8 @@ class Marks:
             self._before.append((name, before))
             return
         if self._files and (shape := read_image(next(iter(self._files.values()))).shape) != state.shape:
-            what = f"the states are {size_text(state.shape)}, those marked before {size_text(shape)}"
-            raise UserError(what, self.folder, "Give another --out.")
+            fault = f"the states are {size_text(state.shape)}, those marked before {size_text(shape)}"
+            raise UserError(fault, self.folder, "Give another --out.")
         for each in self.kinds:
             (self.folder / each).mkdir(parents=True, exist_ok=True)
         suffix, content = _encoded(state)

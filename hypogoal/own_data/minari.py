@@ -68,8 +68,8 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list
             raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
         stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
         if stored is not None and stored[1:] != shape:
-            what = "its images are stored as JPEG, not as they were seen"
-            raise UserError(what, path, "Make it with jpeg_encoding=False.")
+            fault = "its images are stored as JPEG, not as they were seen"
+            raise UserError(fault, path, "Make it with jpeg_encoding=False.")
         places = [f"{name}/{place}" for name in names]
         require_memory(sum(size_of(checked(file, name, "uif")) for name in places), path)
         episodes = [read_array(file, name, "uif") for name in places]

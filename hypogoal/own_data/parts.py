@@ -117,8 +117,8 @@ def require_memory(size: int, where: Path) -> None:
     """Refuse (``UserError``) states whose ``size`` bytes, with the copies made of them, exceed the free memory."""
     free = free_memory()
     if free is not None and COPIES * size > free:
-        what = f"the states need {human(COPIES * size)} of memory, {human(free)} are free"
-        raise UserError(what, where, "Give fewer states.")
+        fault = f"the states need {human(COPIES * size)} of memory, {human(free)} are free"
+        raise UserError(fault, where, "Give fewer states.")
 
 
 def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, role: str, do: str, warned: list[str]) -> States:
@@ -134,7 +134,7 @@ def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, role: str,
 
 
 def as_observations(
-    values: NDArray[Any], what: str, like: NDArray[Any] | None = None, *, resize: int = 0, stack: bool = False
+    values: NDArray[Any], subject: str, like: NDArray[Any] | None = None, *, resize: int = 0, stack: bool = False
 ) -> NDArray[Any]:
     """Pictures uint8 (N, H, W, C) or numbers float32 (N, *shape), told apart by ``hypogoal.domains.observations``.
 
@@ -144,16 +144,16 @@ def as_observations(
     actual = f"{values.dtype} {values.shape}"
     if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
         do = "Give images (N, height, width, channels), or numbers (N, ...)."
-        raise UserError(f"{what} are not observations", actual, do)
+        raise UserError(f"{subject} are not observations", actual, do)
     if not len(values):
-        raise UserError(f"{what} are empty", actual, "Give some; unlabelled ones from other contexts.")
+        raise UserError(f"{subject} are empty", actual, "Give some; unlabelled ones from other contexts.")
     reading = _reading(values)
     stackable = reading.dtype == PICTURE and reading.picture is not None and len(reading.picture.axes) > 2
     if reading.fault and not (stack and stackable):
         pictures = reading.picture.expression(batch=True) if reading.picture else "uint8 (N, H, W, C)"
         stacks = ", as 'import --stack' does" if stackable else ""
         do = f"Of pictures give {pictures}{stacks}; of numbers x.reshape(len(x), -1)"
-        raise UserError(f"{what} {reading.fault}", actual, f"{do}.")
+        raise UserError(f"{subject} {reading.fault}", actual, f"{do}.")
     if reading.dtype == PICTURE:
         values = reading.picture.arrange(values) if reading.picture else values
         if resize and max(values.shape[1:3]) > resize:
@@ -163,10 +163,10 @@ def as_observations(
     else:
         values = values.astype(NUMBERS, copy=False)
         if not np.isfinite(values).all():
-            raise UserError(f"{what} have numbers that are not finite", actual, "Give finite ones.")
+            raise UserError(f"{subject} have numbers that are not finite", actual, "Give finite ones.")
     if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
         difference = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
-        raise UserError(f"{what} differ in shape or type from the labelled ones", difference)
+        raise UserError(f"{subject} differ in shape or type from the labelled ones", difference)
     return np.ascontiguousarray(values)
 
 
@@ -176,18 +176,20 @@ def _reading(values: NDArray[Any]) -> Reading:
     return reading_of(values.shape[1:], values.dtype, top)
 
 
-def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = None) -> NDArray[np.bool_]:
+def as_labels(values: NDArray[Any], count: int, subject: str, goals: int | None = None) -> NDArray[np.bool_]:
     """Labels bool (count, G); another number, or values other than 0 and 1, are a ``UserError``."""
     actual = f"{values.dtype} {values.shape}"
     columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or len(columns) != count or columns.shape[1] == 0:
-        raise UserError(f"{what} do not fit {count} states", actual, f"Give ({count},), or ({count}, sub-goals).")
+        raise UserError(f"{subject} do not fit {count} states", actual, f"Give ({count},), or ({count}, sub-goals).")
     numbers = columns.dtype.kind in "biuf"
     odd = np.setdiff1d(columns, (0, 1))[:3].tolist() if numbers else actual
     if odd:
-        raise UserError(f"{what} are not only 0 and 1", odd, "1 where the sub-goal holds, 0 where not.")
+        raise UserError(f"{subject} are not only 0 and 1", odd, "1 where the sub-goal holds, 0 where not.")
     if goals is not None and columns.shape[1] != goals:
-        raise UserError(f"{what} are of {columns.shape[1]} sub-goals, not {goals}", actual, "Give a column for each.")
+        raise UserError(
+            f"{subject} are of {columns.shape[1]} sub-goals, not {goals}", actual, "Give a column for each."
+        )
     return columns.astype(np.bool_)
 
 
@@ -216,6 +218,6 @@ def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.b
         chosen[rng.permutation(rows)[:taken]] = True
         due -= taken
     if not chosen.any():
-        what = f"none of {len(labels)} labelled states can be held out"
-        raise UserError(what, f"heldout={share:g}", "Give held-out states, a larger --heldout, or more labelled ones.")
+        fault = f"none of {len(labels)} labelled states can be held out"
+        raise UserError(fault, f"heldout={share:g}", "Give held-out states, a larger --heldout, or more labelled ones.")
     return chosen

@@ -54,8 +54,8 @@ def audit(
     threshold = config.threshold or target.threshold
     edges = np.array([threshold, config.mend] if config.mend else [threshold])
     if (np.diff(edges) <= 0).any():
-        what = f"mend must be above the threshold {threshold:g}"
-        raise UserError(what, f"mend={config.mend:g}", "Give a higher one, or 0.")
+        fault = f"mend must be above the threshold {threshold:g}"
+        raise UserError(fault, f"mend={config.mend:g}", "Give a higher one, or 0.")
     if config.termination == ORACLE:
         raise UserError("an audit takes one classifier only", "termination=oracle", "Leave it out.")
     ensemble_config = {

@@ -34,7 +34,7 @@ def train_baseline(
     """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
 
     With ``data``, states of the domain, it plays in the world they are of; without, in that of the ``ensemble``, whose
-    members' verdicts earn the bonus; else in that of the domain's defaults.
+    members' positive predictions earn the bonus; else in that of the domain's defaults.
     Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states or
     an ensemble of another domain, a bonus without an ensemble or the other way round, or an ``out`` that exists is a
     ``UserError``, NaN or Inf in a weight a ``NumericalError``.
@@ -46,12 +46,12 @@ def train_baseline(
     if ensemble and not config.bonus:
         raise UserError("an ensemble without a bonus changes nothing", ensemble, "Give --set bonus=0.1 too.")
     if config.bonus and not ensemble:
-        what = "a bonus is paid where an ensemble's members are positive"
-        raise UserError(what, f"bonus={config.bonus:g}", "Give --ensemble too, or leave bonus out.")
+        fault = "a bonus is paid where an ensemble's members are positive"
+        raise UserError(fault, f"bonus={config.bonus:g}", "Give --ensemble too, or leave bonus out.")
     taught = open_artefact(ensemble, "ensemble").whole() if ensemble else None
     if taught and taught.config["domain"] != domain:
-        what = f"this ensemble is for {taught.config['domain']!r}, not for {domain!r}"
-        raise UserError(what, taught.path, "Name its domain.")
+        fault = f"this ensemble is for {taught.config['domain']!r}, not for {domain!r}"
+        raise UserError(fault, taught.path, "Name its domain.")
     inputs = [path for path in (data, ensemble) if path]
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
@@ -59,8 +59,8 @@ def train_baseline(
     if data:
         dataset = open_dataset(data)
         if dataset.domain != domain:
-            what = f"these are states of {dataset.domain!r}, not of {domain!r}"
-            raise UserError(what, data, "Name their domain.")
+            fault = f"these are states of {dataset.domain!r}, not of {domain!r}"
+            raise UserError(fault, data, "Name their domain.")
         lived = played.world(dataset.config)
     world = played_world(played, lived, config.world)
     chosen = HYPERPARAMETERS[config.agent, config.setting]

@@ -225,7 +225,7 @@ def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dic
     """Best, mean and worst member's balanced accuracy on some held-out states; NaN without states of both classes."""
     try:
         states = dataset.some_heldout(sub_goal, LOOKED_AT)
-        verdicts = ensemble.verdicts(states.observations, positions_of(states.origins))
+        predictions = ensemble.predictions(states.observations, positions_of(states.origins))
     except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
         return best_mean_worst(np.full(len(ensemble), np.nan))
-    return best_mean_worst(member_scores(verdicts, states.labels)["balanced_accuracy"])
+    return best_mean_worst(member_scores(predictions, states.labels)["balanced_accuracy"])

@@ -16,10 +16,10 @@ class TimeUp(UserError):
     """A check ran out of time: the rest is skipped, which breaks no promise."""
 
 
-def promise(kept: bool, what: str, do: str) -> None:
+def promise(kept: bool, fault: str, do: str) -> None:
     """Raise a ``UserError``, with what is wrong and what to do about it, unless a promise is ``kept``."""
     if not kept:
-        raise UserError(what, do=do)
+        raise UserError(fault, do=do)
 
 
 @dataclass(frozen=True)

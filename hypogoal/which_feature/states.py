@@ -75,21 +75,21 @@ def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Gener
     order = rng.random((count, CELLS))
     order[rows, now], order[rows, before] = -1.0, 2.0  # nothing else stands where the object is or may have been
     cells = order.argsort(axis=1)
-    things = np.full((count, CELLS), FLOOR)
-    things[:, 0] = OBJECT + 2 * shape + colour
-    things[:, 1] = AGENT + rng.integers(4, size=count)
+    contents = np.full((count, CELLS), FLOOR)
+    contents[:, 0] = OBJECT + 2 * shape + colour
+    contents[:, 1] = AGENT + rng.integers(4, size=count)
     boxes = BOX + rng.integers(len(BOX_COLOURS), size=(count, MOST_BOXES))
     number = 1 + rng.integers(2, size=count) + 2 * many
-    things[:, 2 : 2 + MOST_BOXES] = np.where(np.arange(MOST_BOXES) < number[:, None], boxes, FLOOR)
-    things[:, 2 + MOST_BOXES] = np.where(rng.random(count) < 0.5, GOAL, FLOOR)
+    contents[:, 2 : 2 + MOST_BOXES] = np.where(np.arange(MOST_BOXES) < number[:, None], boxes, FLOOR)
+    contents[:, 2 + MOST_BOXES] = np.where(rng.random(count) < 0.5, GOAL, FLOOR)
     ids = np.empty((count, CELLS), dtype=np.int64)
-    np.put_along_axis(ids, cells, things, axis=1)
+    np.put_along_axis(ids, cells, contents, axis=1)
     frames = [_image(ids)]
     if MOVED in truth:
         earlier = ids.copy()
         earlier[rows, cells[:, 1]] = AGENT + rng.integers(4, size=count)
         moved = rows[truth[MOVED]]
-        earlier[moved, now[moved]], earlier[moved, before[moved]] = FLOOR, things[moved, 0]
+        earlier[moved, now[moved]], earlier[moved, before[moved]] = FLOOR, contents[moved, 0]
         frames.insert(0, _image(earlier))
     return Scenes(np.concatenate(frames, axis=-1), factors)
 
@@ -105,7 +105,7 @@ def _image(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
 def tiles() -> NDArray[np.uint8]:
     """Every kind of tile as MiniGrid draws it, uint8 (kinds, 8, 8, 3)."""
     objects = [shape(colour) for shape in (Key, Ball) for colour in ("red", "blue")]
-    things = [None, Wall(), None, None, None, None, *objects, *map(Box, BOX_COLOURS), Goal()]
+    contents = [None, Wall(), None, None, None, None, *objects, *map(Box, BOX_COLOURS), Goal()]
     directions = {AGENT + direction: direction for direction in range(4)}
-    images = [Grid.render_tile(thing, directions.get(kind), tile_size=TILE) for kind, thing in enumerate(things)]
+    images = [Grid.render_tile(content, directions.get(kind), tile_size=TILE) for kind, content in enumerate(contents)]
     return np.stack(images).astype(np.uint8)  # MiniGrid draws in floats, and truncates them when it fills a picture

@@ -69,14 +69,6 @@ def test_how_long_it_will_take_is_said_early(
     assert capsys.readouterr().err == "collect: 600/1000 (33/s, 12 s left)\n"
 
 
-@pytest.mark.parametrize("seconds", [3, 600, 9000, 400_000])
-def test_the_time_left_is_read_as_it_is_said(seconds: int) -> None:
-    """Spec A8: a sweep's status goes by what a stage says of itself."""
-    line = f"train-meta: 5/10 (2 s each, {progress.duration(seconds)} left), success 0.5"
-    assert progress.said_left(line) == pytest.approx(seconds, rel=0.03)
-    assert progress.said_left("train-meta: 10/10, success 0.5") is None
-
-
 def test_a_bar_has_a_pace_from_its_first_second(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within 80 columns: the time spent until something is done, then the rate."""
     now, drawn = 0.0, io.StringIO()

@@ -1,8 +1,7 @@
-"""docs/extending.md: a figure with its number is one file and one line."""
+"""examples/durations.py: a figure with its number is one file and one line (docs/extending.md)."""
 
 import csv
 import importlib
-import re
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,12 @@ from hypogoal.evaluation.questions import QUESTIONS
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import draw_figures, report
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 def test_a_figure_with_its_number_is_one_file_and_one_line(tmp_path, monkeypatch):
-    """The page's own code, as it stands there: number, meaning, section, figure, and the figure for a paper."""
-    (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    (tmp_path / "durations.py").write_text(code, encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
+    """The example as it stands: number, meaning, section, figure, and the figure for a paper."""
+    monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.setenv("HYPOGOAL_TRUST", "ladder_run:DOMAIN")
     for name, count in {"MOST_STATES": 8, "MOST_EXPLAINED": 4}.items():
         monkeypatch.setattr(explorer, name, count)
@@ -33,7 +30,7 @@ def test_a_figure_with_its_number_is_one_file_and_one_line(tmp_path, monkeypatch
         drawn, _ = draw_figures(run, tmp_path / "figures")
     finally:
         del QUESTIONS[-1]
-    assert len(code.splitlines()) < 80
+    assert len((EXAMPLES / "durations.py").read_text(encoding="utf-8").splitlines()) < 80
     assert {entry["method"]: entry["seconds"]["mean"] for entry in metrics["durations"]} == {
         "single CNN": pytest.approx(7 / 15),
         "no diversity, K=2": pytest.approx(7 / 15),

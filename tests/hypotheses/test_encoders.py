@@ -138,7 +138,7 @@ def test_large_networks_are_members(network: str, encoder: str, hidden_width: in
     asked: list[int] = []
     if back.trunk is not None:
         back.trunk[0].register_forward_hook(lambda _, given, __: asked.append(len(given[0])))
-    wanted = np.concatenate([back.verdicts(images)] * 2, axis=1)
+    wanted = np.concatenate([back.predictions(images)] * 2, axis=1)
     for running_only in (False, True):
         asked.clear()
         ends = learned_terminations(engine, [back], running_only=running_only)

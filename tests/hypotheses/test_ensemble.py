@@ -117,11 +117,11 @@ def test_verdicts_are_above_each_members_threshold() -> None:
     ensemble = ensemble_of()
     observations = images_of("noise", 20)
     probabilities = ensemble.predict(observations)
-    np.testing.assert_array_equal(ensemble.verdicts(observations), probabilities > 0.5)
+    np.testing.assert_array_equal(ensemble.predictions(observations), probabilities > 0.5)
     chosen = np.median(probabilities, axis=0)
     ensemble.set_thresholds(chosen)
-    np.testing.assert_array_equal(ensemble.verdicts(observations), probabilities > chosen)
-    assert (ensemble.verdicts(observations).sum(axis=0) == 10).all()
+    np.testing.assert_array_equal(ensemble.predictions(observations), probabilities > chosen)
+    assert (ensemble.predictions(observations).sum(axis=0) == 10).all()
     stacked = StackedMembers([ensemble, ensemble_of(1)])
     expected = np.concatenate([probabilities > chosen, ensemble_of(1).predict(observations) > 0.5], axis=1)
     taus = np.concatenate([ensemble.thresholds_as_log_odds(), ensemble_of(1).thresholds_as_log_odds()])
@@ -138,7 +138,7 @@ def test_ensembles_from_before_thresholds_and_views_still_load(tmp_path: Path) -
     config = {"network": "doorkey", "observation_shape": list(SHAPE), "members": 2, "sub_goals": ["goal"]}
     old = read_ensemble(tmp_path, config, "goal")
     observations = images_of("noise", 6)
-    np.testing.assert_array_equal(old.verdicts(observations), ensemble.predict(observations) > 0.5)
+    np.testing.assert_array_equal(old.predictions(observations), ensemble.predict(observations) > 0.5)
 
 
 @pytest.mark.parametrize("localiser", ["ram", "learned"])
@@ -166,6 +166,8 @@ def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path
     observations = np.random.default_rng(0).integers(256, size=(5, *shape), dtype=np.uint8)
     positions = np.array([[1, 20 * x, 235] for x in range(1, 6)])
     np.testing.assert_array_equal(back.predict(observations, positions), ensemble.predict(observations, positions))
-    np.testing.assert_array_equal(back.verdicts(observations, positions), ensemble.verdicts(observations, positions))
+    np.testing.assert_array_equal(
+        back.predictions(observations, positions), ensemble.predictions(observations, positions)
+    )
     with pytest.raises(UserError, match="the weights do not fit the"):
         read_ensemble(tmp_path, config | {"crop_width": 40}, "goal")

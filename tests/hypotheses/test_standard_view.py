@@ -37,7 +37,7 @@ def test_members_learn_numbers_of_any_size_and_shape(shape: tuple[int, ...], tmp
     """Spec C5, A8: by default in the steps that pictures take; stored and read they say the same."""
     ensemble, (seen, labels) = trained(shape), states(1000, 3, shape)
     assert ensemble.network == "mlp" and "float32" in repr(ensemble)
-    assert ((ensemble.verdicts(seen) == labels[:, None]).mean(0) > 0.93).all()
+    assert ((ensemble.predictions(seen) == labels[:, None]).mean(0) > 0.93).all()
     np.testing.assert_array_equal(ensemble.predict(seen.astype(np.float64)), ensemble.predict(seen))
     write_ensemble(tmp_path, "up", ensemble)
     about = {"sub_goals": ["up"], "network": "mlp", "members": 2, "observation_shape": list(shape)}
@@ -116,7 +116,7 @@ def test_numbers_may_have_an_encoder(
     monkeypatch.setenv("HYPOGOAL_TRUST", network)
     settings = {"network": network, "encoder": "frozen" if frozen else encoder}
     ensemble, (seen, labels) = trained(shape, learning_rate=0.01, **settings), states(200, 3, shape)
-    assert ((ensemble.verdicts(seen) == labels[:, None]).mean(0) > 0.8).all()
+    assert ((ensemble.predictions(seen) == labels[:, None]).mean(0) > 0.8).all()
     write_ensemble(tmp_path, "up", ensemble)
     about = {"sub_goals": ["up"], "members": 2, "observation_shape": list(shape), "observation_dtype": "float32"}
     log_odds = ensemble.log_odds(seen)

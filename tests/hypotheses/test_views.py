@@ -244,7 +244,7 @@ def test_an_ensemble_learns_from_windows() -> None:
     others, truth, there = montezuma_states(60, seed=1)
     ensemble = fit_crop(observations, labels, others, origins, there)
     positions = np.stack([there[name] for name in ("room", "x", "y")], axis=1)
-    assert (ensemble.verdicts(others, positions) == truth[:, None]).mean() > 0.95
+    assert (ensemble.predictions(others, positions) == truth[:, None]).mean() > 0.95
 
 
 def test_data_that_do_not_say_enough_are_one_clear_line() -> None:

@@ -381,7 +381,7 @@ def test_observations_may_be_listed(ensemble: Ensemble) -> None:
     observation, _ = corridor().reset(seed=0)
     both = np.stack([observation, observation[::-1]])
     np.testing.assert_array_equal(ensemble.predict(list(both)), ensemble.predict(both))
-    np.testing.assert_array_equal(ensemble.verdicts(list(both)), ensemble.verdicts(both))
+    np.testing.assert_array_equal(ensemble.predictions(list(both)), ensemble.predictions(both))
     for odd in ([observation, observation[:9]], [], [1.0], "no"):
         with pytest.raises(UserError, match="observations do not fit the ensemble"):
             ensemble.predict(odd)

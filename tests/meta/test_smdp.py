@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from corridor import Corridor
 
+from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork
-from hypogoal.meta.ppo import certainty_of, clipped_surrogate, scaled_advantages
+from hypogoal.meta.ppo import Decisions, MetaPolicy, certainty_of, clipped_surrogate, scaled_advantages
 from hypogoal.meta.smdp import smdp_advantages
 
 
@@ -127,3 +129,22 @@ def test_certainty_of_a_choice_where_it_is_forced() -> None:
     leads = [certainty_of(head.probabilities(lead * torch.eye(15)[:1], offered).detach()) for lead in (0.0, 4.0, 8.0)]
     assert [round(lead["top_choice"], 2) for lead in leads] == [0.07, 0.98, 1.0]
     assert leads[0]["choice_entropy"] > 2.7 > leads[1]["choice_entropy"] > leads[2]["choice_entropy"]
+
+
+def test_the_papers_network_has_the_size_that_its_deviation_gives() -> None:
+    """Spec E2, DEV-49: 0.4 million weights on DoorKey's picture."""
+    size = sum(weights.numel() for weights in PaperMetaNetwork((64, 64, 3), 15).parameters())
+    assert 400_000 < size < 450_000
+
+
+def test_the_value_that_is_learned_is_what_decisions_return() -> None:
+    """Spec E1, E2: where each decision returns .5 and ends its episode, every state is worth .5."""
+    policy = MetaPolicy(Corridor(4), 2, MetaConfig(decisions=32, meta_batch=16), 0)
+    states, over = np.arange(32) % 5, np.ones(32, dtype=np.bool_)
+    decisions = Decisions(
+        state=states, offered=np.ones((32, 2), dtype=np.bool_), drawn=(states[:, None] % 2).astype(np.float32),
+        log_prob=np.full(32, np.log(0.5), dtype=np.float32), environment=np.repeat(np.arange(4), 8),
+        returned=np.full(32, 0.5), discount=np.full(32, 0.9), next_state=states, terminated=over, ended=over,
+    )  # fmt: skip
+    values = [policy._update(decisions)["value"] for _ in range(20)]
+    assert abs(values[0]) < 0.1 and values[-1] == pytest.approx(0.5, abs=0.1)

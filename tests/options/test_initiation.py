@@ -88,6 +88,17 @@ def test_an_option_is_not_held_back_before_it_was_tried(monkeypatch: pytest.Monk
     np.testing.assert_array_equal(narrowed, [[False, True]])
 
 
+def test_executions_are_remembered_one_after_another_the_last_of_them_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D7: where KEPT are remembered, a new one takes the oldest one's place."""
+    monkeypatch.setattr(initiation, "KEPT", 5)
+    sets = Initiation(Corridor(4), 2, seed=0)
+    for first in (0, 2, 4):
+        sets.record(np.array([first, first + 1]), np.array([0, 1]), np.array([True, False]))
+    assert sets.states.tolist() == [5, 1, 2, 3, 4] and sets.option.tolist() == [1, 1, 0, 1, 0]
+    assert sets.reached.tolist() == [False, False, True, False, True]
+    assert sets.executions.tolist() == [3, 3] and sets.count == 6
+
+
 def test_executions_that_the_end_of_the_episode_cut_short_say_nothing() -> None:
     """Spec D7: of an episode's last option, not out of time and not at its sub-goal, nobody knows."""
     loop = loop_with_initiation(option_timeout=LENGTH)

@@ -11,6 +11,7 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
+from hypogoal.options import recurrent
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import make_policies
@@ -104,6 +105,8 @@ def test_every_option_begins_at_a_start_state(tmp_path: Path) -> None:
         (0, 0, 0, 0), (0, 2, 0, 20), (0, 5, 0, 50),
     ]  # fmt: skip
     assert recorder.recent(restarted=True) == pytest.approx({"reached": 1 / 3, "terminated": 1 / 3, "duration": 3.0})
+    assert recorder.recent(restarted=False) == pytest.approx({"success": 0.0, "length": 3.0})
+    assert Recorder(2, engine).recent(restarted=False) == {}
 
 
 def test_an_option_that_begins_inside_its_sub_goal_runs_and_says_so(tmp_path: Path) -> None:
@@ -257,6 +260,39 @@ def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
         loop.step()
     assert learner._update(0, learner.members[0]) == 0.0
     assert learner._update(1, learner.members[1]) > 0.0
+
+
+@pytest.mark.usefixtures("small_gru")
+def test_an_execution_whose_beginning_was_overwritten_is_not_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D2, D3: five steps of an execution, then five of the next in a replay of eight: only those are unrolled."""
+    engine = LongCorridor(1)
+    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 8, "option_timeout": 5}))
+    learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
+    states = [int(engine.ids[0]), *(int(engine.step(np.array([STAY])).next_ids[0]) for _ in range(10))]
+    for begin in (0, 5):
+        path = zip(states[begin : begin + 5], states[begin + 1 : begin + 6], strict=True)
+        learner._store(0, [(state, STAY, after, False, False, False) for state, after in path])
+    seen: set[int] = set()
+    images = engine.images
+    monkeypatch.setattr(engine, "images", lambda ids, *out: (seen.update(ids.tolist()), images(ids, *out))[1])
+    for _ in range(3):
+        learner._update(0, learner.members[0])
+    assert seen == set(states[5:])
+
+
+@pytest.mark.usefixtures("small_gru")
+def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D1, D2: reward 1 there, and no value of what lies behind, though the episode goes on."""
+    engine = LongCorridor(1)
+    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 8, "option_timeout": 5}))
+    learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
+    middle, beside, end = int(engine.ids[0]), *(int(engine.step(np.array([LEFT])).next_ids[0]) for _ in range(2))
+    learner._store(0, [(middle, LEFT, beside, False, False, False), (beside, LEFT, end, False, False, True)])
+    seen, targets = [], recurrent.double_q_targets
+    monkeypatch.setattr(recurrent, "double_q_targets", lambda *of, **more: (seen.append(of), targets(*of, **more))[1])
+    learner._update(0, learner.members[0])
+    ((rewards, terminal, *_),) = seen
+    assert set(rewards.tolist()) == {0.0, 1.0} and torch.equal(terminal, rewards == 1)
 
 
 def test_same_seed_same_bytes_with_every_switch() -> None:

@@ -64,7 +64,7 @@ def test_running_members_are_judged_alone_and_once() -> None:
         chances = np.sort(ensemble.predict(engine.images(everything)), axis=0)
         widest = np.diff(chances, axis=0).argmax(0)
         ensemble.set_thresholds(np.take_along_axis(chances, widest + np.array([[0], [1]]), 0).mean(0))
-    wanted = np.concatenate([ensemble.verdicts(engine.images(everything)) for ensemble in ensembles], axis=1)
+    wanted = np.concatenate([ensemble.predictions(engine.images(everything)) for ensemble in ensembles], axis=1)
     assert (wanted.any(0) & ~wanted.all(0)).all()
     verdicts = learned_terminations(engine, ensembles, running_only=True)
     asked: list[tuple[int, int]] = []

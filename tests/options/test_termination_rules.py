@@ -76,6 +76,14 @@ def test_an_option_that_gets_there_keeps_its_threshold() -> None:
     assert rule.thresholds[1] == 2.25
 
 
+def test_an_option_is_given_as_many_steps_of_its_own() -> None:
+    """Steps of other options do not use up its window."""
+    rule = patient((10.0, 5.0), 4)
+    execution(rule, 0, (0, 1))
+    execution(rule, 1, (1, 2, 3, 3))
+    assert rule.thresholds.tolist() == [10, 2.5]
+
+
 def test_patience_goes_on_where_it_was() -> None:
     """Spec G1: in the middle of an execution and of a window."""
     rng = np.random.default_rng(0)

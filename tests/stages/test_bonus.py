@@ -44,6 +44,8 @@ def test_a_member_is_paid_for_once_an_episode_by_hand() -> None:
     assert env.episodes == [(6, 3, 1.0, 1, 1), (12, 3, 1.0, 1, 1), (12, 6, 0.0, 0, 0)]
     env.reset()
     assert env.step(np.array([1, 0]))[1].tolist() == [0.25, 0.25]
+    assert env.step(np.array([1, 0]))[1].tolist() == [0, 0.25]
+    assert env.step(np.array([0, 1]))[1].tolist() == [0, 0], "both are back among cells that were paid for"
 
 
 class Broken(Exception):

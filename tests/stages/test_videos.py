@@ -83,7 +83,7 @@ def test_predictions_are_those_of_the_sub_goals_members(run, frames):
     for goal in {frame.option // MEMBERS for frame in frames}:
         alike = [frame for frame in frames if frame.option // MEMBERS == goal]
         ensemble = read_ensemble(source.path, source.config, source.config["sub_goals"][goal])
-        says = ensemble.verdicts(np.stack([frame.observation for frame in alike]))
+        says = ensemble.predictions(np.stack([frame.observation for frame in alike]))
         assert says.tolist() == [list(frame.predictions) for frame in alike]
 
 

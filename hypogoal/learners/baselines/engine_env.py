@@ -16,29 +16,29 @@ from hypogoal.learners.episodes import EpisodeRecorder
 
 
 class Bonus(Resumable):
-    """What a flat agent is paid for the knowledge of an ensemble: each member's first yes in an episode (ours).
+    """A bonus for what an ensemble knows: paid for a member's first positive prediction in an episode (ours).
 
     The state in which an episode begins is not judged, the one in which it ends is.
 
     Args:
-        verdicts: state ids (n,) -> whether the O members are positive, bool (n, O).
+        predictions: state ids (n,) -> whether the O members are positive, bool (n, O).
         members: O, of all sub-goals together.
         environments: E.
-        size: reward for each first yes.
-        memory: what the verdicts rest on and a resumed run needs (Spec G1), where that changes.
+        size: reward for each of these predictions.
+        memory: what the predictions rest on and a resumed run needs (Spec G1), where that changes.
     """
 
     CHANGING = ("_fired", "_memory")
 
     def __init__(
         self,
-        verdicts: Callable[[NDArray[np.int64]], NDArray[np.bool_]],
+        predictions: Callable[[NDArray[np.int64]], NDArray[np.bool_]],
         members: int,
         environments: int,
         size: float,
         memory: Resumable | None = None,
     ):
-        self.verdicts, self.members, self.size, self._memory = verdicts, members, size, memory
+        self.predictions, self.members, self.size, self._memory = predictions, members, size, memory
         self._fired = np.zeros((environments, members), dtype=np.bool_)  # in the running episodes
 
     def reset(self) -> None:
@@ -47,9 +47,9 @@ class Bonus(Resumable):
 
     def of(self, step: Step) -> NDArray[np.float32]:
         """What one step of every environment earns: float32 (E,)."""
-        says_yes = self.verdicts(step.next_ids)
-        first = (says_yes & ~self._fired).sum(axis=1)
-        self._fired |= says_yes
+        positive = self.predictions(step.next_ids)
+        first = (positive & ~self._fired).sum(axis=1)
+        self._fired |= positive
         self._fired[step.terminated | step.truncated] = False
         return (self.size * first).astype(np.float32)
 
