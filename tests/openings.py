@@ -62,6 +62,10 @@ class Numbers:
             cell for cell in self.cells if (cell["quantity"], cell["scope"]) == (quantity, scope) and not cell["step"]
         ]
 
+    def played(self) -> list[CELL]:
+        """Frozen play; of a run without, play on layouts that were asked for."""
+        return self.of("success", "frozen") or [one for one in self.of("success", "zero-shot") if not one["sub_goal"]]
+
     def members(self, cell: CELL) -> int:
         """Of an agent's artefact."""
         manifest = json.loads((self.run / cell["artefact"] / "manifest.json").read_text(encoding="utf-8"))
@@ -78,8 +82,7 @@ class Numbers:
             first = [float(cell["value"]) for cell in trained if cell["method"] == trained[0]["method"]]
             assert share[1] == percent(float(np.mean(first)))
         elif sentence.startswith("Whether hypotheses mattered is unknown"):
-            played = self.of("success", "frozen")  # of other layouts the verdict says nothing
-            assert not any(cell["method"] == UNIFORM for cell in played) and not self.pairs("hypotheses")
+            assert not any(cell["method"] == UNIFORM for cell in self.played()) and not self.pairs("hypotheses")
         elif share := re.fullmatch(r"Options (of|that end at true).* stop at the base in (\d+) % of .*", sentence):
             oracle = share[1] != "of"
             shares = [self.stopped(cell) for cell in self.of("executions") if not self.other(cell, oracle)]
@@ -143,12 +146,13 @@ class Numbers:
                     elif cell["N"]:
                         first.append((place, share))
             return [(place[0], share, second[place]) for place, share in first if place in second]
-        frozen = self.of("success", "frozen")
+        frozen = self.played()
         played = [cell for cell in frozen if cell["method"] != UNIFORM]
         if subject == "choosing" and frozen:
-            uniform = {cell["artefact"]: float(cell["value"]) for cell in frozen if cell["method"] == UNIFORM}
+            uniform = {(c["artefact"], c["layout"]): float(c["value"]) for c in frozen if c["method"] == UNIFORM}
             agents = [cell for cell in played if self.members(cell) > 1]
-            return [(self.unit(cell, agents), float(cell["value"]), uniform[cell["artefact"]]) for cell in agents]
+            pairs = [(cell, uniform[cell["artefact"], cell["layout"]]) for cell in agents]
+            return [(self.unit(cell, agents), float(cell["value"]), other) for cell, other in pairs]
         agents = played or [cell for cell in self.of("success") if cell["method"].startswith("options (learned")]
         single = {(c["layout"], c["seed"]): float(c["value"]) for c in agents if self.members(c) == 1}
         if subject == "choosing":

@@ -171,7 +171,7 @@ def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.set_xlim(min(0.45, lowest - 0.03), 1.02)
-        axes.set_xlabel("balanced accuracy on held-out states (0.5: chance)")
+        axes.set_xlabel("balanced accuracy on held-out states (0.5: uniform-random)")
     return figure
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name
 from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
 from hypogoal.evaluation.page import Block, Material, Question, listed, percent, picture, section
 from hypogoal.evaluation.table import Row, select
+from hypogoal.evaluation.zero_shot import SCOPE as NEW_LAYOUTS
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
@@ -99,12 +101,13 @@ def findings(work: Work) -> Iterator[Finding]:
     agents = {name: runs for name, runs in work.agents.items() if kinds[name] in (LEARNED, THOMPSON)}
     several = [name for name, runs in agents.items() if runs[0].config["members"] > 1]
     single = [name for name, runs in agents.items() if runs[0].config["members"] == 1]
-    frozen, trained = select(work.rows, quantity="success", scope=FROZEN), at_the_end(work.rows)
+    played_on = partial(select, work.rows, quantity="success", sub_goal="")
+    frozen, trained = played_on(scope=FROZEN) or played_on(scope=NEW_LAYOUTS), at_the_end(work.rows)
     uniform = select(frozen, method=UNIFORM)
     learning = [row for name, kind in kinds.items() if kind == RANDOM for row in select(trained, method=name)]
     for name in several:
         played, title = select(frozen, method=name), called(agents[name][0])
-        if pairs := paired(played, uniform, "artefact"):
+        if pairs := paired(played, uniform, "artefact", "layout"):
             second = UNIFORM_CHOICE
         else:
             second = "an agent whose choice is uniform-random"  # it has learned other options
