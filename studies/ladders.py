@@ -194,7 +194,7 @@ def _tables_of_all_rooms(groups: int, numbers: Numbers) -> Iterator[str]:
 def _at_others_length(groups: int, numbers: Numbers, method: str) -> list[str]:
     names = ("ranking", "balanced_accuracy", "accuracy")
     scores, dbat = ({name: best_at_others_length(numbers[each], name) for name in names} for each in (method, "dbat"))
-    versus = "-" if method == "dbat" else interval(dbat["balanced_accuracy"] - scores["balanced_accuracy"])
+    versus = "-" if method == "dbat" else difference(dbat["balanced_accuracy"] - scores["balanced_accuracy"])
     return [method, *(interval(scores[name]) for name in names), versus, _of_authors(groups, method)]
 
 
