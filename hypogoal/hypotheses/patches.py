@@ -234,12 +234,14 @@ def _batch_norm(
     groups = zip(
         rows.split([share.shape[1] for share in shares]), shares, places, counted or [True] * len(shares), strict=True
     )
-    normed = [_normed(layer, *group) for group in groups]
+    with torch.autocast("cpu", enabled=False):
+        normed = [_normed(layer, *group) for group in groups]
     return normed[0] if len(normed) == 1 else torch.cat(normed)
 
 
 def _normed(layer: nn.BatchNorm2d, rows: Tensor, shares: Tensor, places: int, counted: bool) -> Tensor:
-    """One group's rows in training mode."""
+    """One group's rows in training mode, never in less than float32."""
+    rows = rows.float() if rows.dtype == torch.bfloat16 else rows
     mean = shares @ rows
     centred = rows - mean
     variance = shares @ centred.square()

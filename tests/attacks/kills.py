@@ -65,6 +65,11 @@ _ALL = (
         ("train-ensemble", "{data}", *_set("steps=6", "workers=2", "members=2", "schedule=sequential", GOALS)),
         ("data",),
     ),
+    Stage(
+        "bf16",
+        ("train-ensemble", "{data}", *_set("steps=12", "workers=1", "members=2", "precision=bf16", GOALS)),
+        ("data",),
+    ),
     Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=4", "workers=1", "members=2")), ("rooms",)),
     Stage(
         "options",
