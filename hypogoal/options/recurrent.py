@@ -194,7 +194,8 @@ class RecurrentLearner(Learner):
         descend(loss, backward_of(member.online), member.optimiser, f"option {option}", where)
         member.updates += 1
         if member.updates % config.target_interval == 0:
-            target, online = ([*of.parameters(), *of.buffers()] for of in (member.target, member.online))
+            networks = (member.target, member.online)
+            target, online = ([*network.parameters(), *network.buffers()] for network in networks)
             follow(target, online, config.target_tau)
         member.replay.set_priorities(indices, error.detach().abs().cpu().numpy())
         return float(loss.detach())
