@@ -86,8 +86,8 @@ def states_of(groups: int) -> Collected:
     return DOMAIN.collect(MontezumaConfig(groups=groups, workers=1), 0, Progress("collect", 1, quiet=True))
 
 
-def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> list[Row]:
-    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and score it on the way."""
+def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...], **changes: Any) -> list[Row]:
+    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, with ``changes``, and score it on the way."""
     prepare()
     data = states_of(groups)
     labels, unseen = data.heldout.labels[:, 0], data.heldout.origins["seen"] == SEEN_NOWHERE
@@ -116,7 +116,7 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> lis
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
-        dataclasses.replace(config, **METHODS[method]),
+        dataclasses.replace(config, **METHODS[method], **changes),
         seed_for(seed, "ensemble", SUB_GOAL),
         Watcher(look=look, look_at=looks),
     )

@@ -8,7 +8,7 @@ on a CPU.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -89,7 +89,9 @@ def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | 
     windows = windows_of(network)
     if windows is None or len(observations) == 0 or observations.dtype != np.uint8:
         return None
-    count = max(1, min(SAMPLE, len(observations), SAMPLE_PIXELS // prod(observations.shape[1:3])))
+    few = len(observations) <= 2 * SAMPLE  # of which all are looked at once
+    count = len(observations) if few else SAMPLE
+    count = max(1, min(count, SAMPLE_PIXELS // prod(observations.shape[1:3])))
     spread = np.linspace(0, len(observations) - 1, count).astype(np.int64)
     sample = _tables(observations[spread], windows)
     spatial = [layer for layer in network if isinstance(layer, (nn.Conv2d, nn.MaxPool2d))]
@@ -99,7 +101,9 @@ def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | 
     ]
     tabled = sum(len(level.parts) * each for level, each in zip(sample.levels, work, strict=True))
     plain = sum(level.rows.shape[1] * level.lines.size * each for level, each in zip(sample.levels, work, strict=True))
-    return _tables(observations, windows) if tabled < WORTHWHILE * plain else None
+    if tabled >= WORTHWHILE * plain:
+        return None
+    return sample if count == len(observations) else _tables(observations, windows)
 
 
 def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]]) -> Tables:
@@ -151,8 +155,11 @@ def _distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArra
     return index, np.frombuffer(b"".join(index_of), np.uint8).reshape(-1, items.shape[1])
 
 
-def take(tables: Tables, *groups: NDArray[np.int64]) -> Batch:
-    """The patches in groups of images, by index (B,); repeated images count repeatedly."""
+def take(tables: Tables, *groups: NDArray[np.int64], times: NDArray[np.int64] | None = None) -> Batch:
+    """The patches in groups of images, by index (B,); repeated images count repeatedly.
+
+    BatchNorm counts image n of each group ``times[n]`` times, once where None.
+    """
     levels = len(tables.levels)
     parts: list[list[NDArray[np.int64]]] = [[] for _ in range(levels)]
     shares: list[list[Tensor]] = [[] for _ in range(levels)]
@@ -165,10 +172,13 @@ def take(tables: Tables, *groups: NDArray[np.int64]) -> Batch:
         for index, level in enumerate(tables.levels):
             ids = level.rows[level.lines[images]]
             ranks, occurring = _rank(ids.astype(np.int64), len(level.parts))
-            occurrences = np.bincount(ranks.ravel(), minlength=len(occurring))
+            each = ids[0].size
+            weights = None if times is None else np.repeat(times, each)
+            occurrences = np.bincount(ranks.ravel(), weights, minlength=len(occurring))
+            counted = ids.size if times is None else int(times.sum()) * each
             parts[index].append(_positions(level.parts[occurring].ravel(), used) + offset)
-            shares[index].append(torch.from_numpy((occurrences / ids.size).astype(np.float32))[None])
-            places[index].append(ids.size)
+            shares[index].append(torch.from_numpy((occurrences / counted).astype(np.float32))[None])
+            places[index].append(counted)
             used, offset = occurring, before[index]
             before[index] += len(occurring)
         last.append(ranks.reshape(len(images), -1).astype(np.int64) + offset)
@@ -195,6 +205,7 @@ def _positions(values: NDArray[np.int32], among: NDArray[np.int64]) -> NDArray[n
 def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) -> Tensor:
     """The logits (B, 2) of ``network`` for the images of ``batch``, in training or evaluation mode.
 
+    Of a network without dense layers the last level's patches, (U, C), which ``batch.last`` places in the images.
     ``windows_of`` must support its layers. In training mode, BatchNorm's running statistics include the ``counted``
     groups, all if that is empty.
     """
@@ -234,15 +245,22 @@ def _batch_norm(
     groups = zip(
         rows.split([share.shape[1] for share in shares]), shares, places, counted or [True] * len(shares), strict=True
     )
-    normed = [_normed(layer, *group) for group in groups]
-    return normed[0] if len(normed) == 1 else torch.cat(normed)
+    with torch.autocast("cpu", enabled=False):
+        of_groups = [normed(layer, part, share.matmul, count, counts) for part, share, count, counts in groups]
+    return of_groups[0] if len(of_groups) == 1 else torch.cat(of_groups)
 
 
-def _normed(layer: nn.BatchNorm2d, rows: Tensor, shares: Tensor, places: int, counted: bool) -> Tensor:
-    """One group's rows in training mode."""
-    mean = shares @ rows
+def normed(
+    layer: nn.BatchNorm2d, rows: Tensor, average: Callable[[Tensor], Tensor], places: int, counted: bool = True
+) -> Tensor:
+    """BatchNorm in training mode of rows (U, C), never in less than float32; ``average`` is over so many places.
+
+    The layer's running statistics include them where they are ``counted``.
+    """
+    rows = rows.float() if rows.dtype == torch.bfloat16 else rows
+    mean = average(rows)
     centred = rows - mean
-    variance = shares @ centred.square()
+    variance = average(centred.square())
     if counted:
         running_mean, running_var = layer.running_mean, layer.running_var
         assert running_mean is not None

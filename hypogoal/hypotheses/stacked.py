@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -50,8 +49,8 @@ class StackedMembers:
         for layers in zip(*networks, strict=True):
             self._steps.append((layers[0], _stack(list(layers))))
         split = split_of(networks[0]) if repeats and self._one_view and self.device.type == "cpu" else None
-        self._windows = KnownWindows(partial(self._apply, 0, split[0]), *split[1:]) if split else None
-        self._first = split[0] if split else 0  # of the layers behind the windows
+        self._windows = KnownWindows(self._steps[:split], self.count) if split else None
+        self._first = split or 0  # of the layers behind the windows
 
     def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""

@@ -18,8 +18,9 @@ class OptionConfig:
         "network=planned": (
             *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
             *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
-            *("exploration", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
+            *("exploration", "actions", "epsilon_steps", "epsilon_final", "epsilon_from", "recurrence"),
         ),
+        "network=light": ("recurrence",),
         "network=paper": ("positives",),
     }
 
@@ -30,6 +31,13 @@ class OptionConfig:
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
         own=True,
+    )
+    recurrence: str = setting(
+        "execution",
+        "what the conv-GRU remembers: its execution, from the option's first step on; or none, each step a sequence "
+        "of its own (network=paper)",
+        source="execution: paper; none: the authors' code",
+        choices=("execution", "none"),
     )
     termination: str = setting(
         "learned",

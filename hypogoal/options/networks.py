@@ -1,4 +1,4 @@
-"""Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
+"""Q-networks of the intra-option policies (Spec D2): a small one on cells, or on pictures."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -206,59 +206,6 @@ class LightQNetwork(LightNetwork):
     def head(self, features: Tensor) -> Tensor:
         """float32 (N, members, actions)."""
         return self.heads(features).view(-1, self.members, self.actions)
-
-
-class PaperQNetwork(nn.Module):
-    """The paper's network of one member: two of (conv, BatchNorm, ReLU, MaxPool), a GRU, two dense layers.
-
-    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
-    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands after MaxPool: the same function, cheaper.
-    """
-
-    HIDDEN = 512
-
-    def __init__(self, observation_shape: tuple[int, ...], actions: int):
-        super().__init__()
-        height, width, depth = observation_shape
-        self.features = nn.Sequential(
-            nn.Conv2d(depth, 16, 3), nn.BatchNorm2d(16), nn.MaxPool2d(2), nn.ReLU(),
-            nn.Conv2d(16, 32, 3), nn.BatchNorm2d(32), nn.MaxPool2d(2), nn.ReLU(),
-            nn.Flatten(),
-        )  # fmt: skip
-        with torch.no_grad():
-            size = self.features.eval()(torch.zeros(1, depth, height, width)).shape[1]
-        self.features.train()
-        self.gru = nn.GRU(size, self.HIDDEN, batch_first=True)
-        self.values = nn.Sequential(nn.Linear(self.HIDDEN, 128), nn.ReLU(), nn.Linear(128, actions))
-
-    def embed(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> float32 (N, 3 * 512): what the GRU's gates get from an image alone.
-
-        Nearly all of the arithmetic is in here, so that an image of several executions is computed once.
-        """
-        return self._gates(self.features(images.permute(0, 3, 1, 2).float() / 255.0), "ih")
-
-    def forward(self, embedded: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Unroll the GRU over an option's own steps, float32 (N, T, 3 * 512), from :meth:`embed`.
-
-        Returns values float32 (N, T, actions) and the last state (1, N, 512), ``hidden`` of the next call.
-        The equations are those of ``nn.GRU``, which would embed an image anew for every execution it is in.
-        """
-        state = embedded.new_zeros(len(embedded), self.HIDDEN) if hidden is None else hidden[0]
-        states = []
-        for step in embedded.unbind(1):
-            recurrent = self._gates(state, "hh")
-            both = (step + recurrent)[:, : 2 * self.HIDDEN].sigmoid()
-            reset, update = both.chunk(2, dim=1)
-            new = (step[:, 2 * self.HIDDEN :] + reset * recurrent[:, 2 * self.HIDDEN :]).tanh()
-            state = torch.lerp(new, state, update)
-            states.append(state)
-        return self.values(torch.stack(states, dim=1)), state[None]
-
-    def _gates(self, inputs: Tensor, source: str) -> Tensor:
-        """float32 (N, 3 * 512): what the gates get from images (``ih``) or from the state before (``hh``)."""
-        weight, bias = (self.gru.get_parameter(f"{kind}_{source}_l0") for kind in ("weight", "bias"))
-        return nn.functional.linear(inputs, weight, bias)
 
 
 Pictures = Engine | Viewed

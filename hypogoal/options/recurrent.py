@@ -2,7 +2,7 @@
 
 The GRU is unrolled over the option's own steps: acting carries its hidden state from the option's first step on;
 learning samples a step and replays the option's execution up to it. Every member learns from its own executions.
-BatchNorm sees a batch's distinct images, see DEV-51.
+BatchNorm counts an image as often as it occurs. With ``recurrence=none`` nothing is remembered (DEV-16).
 """
 
 import copy
@@ -28,7 +28,7 @@ from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
-from hypogoal.options.networks import PaperQNetwork
+from hypogoal.options.paper_network import PaperQNetwork, looked_at
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class Member(Resumable):
     ):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights", option))
-            self.online = PaperQNetwork(engine.observation_shape, actions).to(device)
+            remembers = config.recurrence == "execution"
+            self.online = PaperQNetwork(engine.observation_shape, actions, remembers).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, Rows)
@@ -143,7 +144,7 @@ class RecurrentLearner(Learner):
     def _update(self, option: int, member: Member) -> float:
         config, data = self.config, member.replay.data
         indices, weights = member.replay.sample(config.option_batch, self.rng)
-        place = data.place[indices].astype(np.int64)
+        place = data.place[indices].astype(np.int64) * member.online.remembers
         # Steps of an execution lie side by side in the ring; the oldest may have been overwritten at the seam.
         kept = np.arange(int(place.max()) + 1)
         prefix = (indices[:, None] - place[:, None] + kept) % config.replay
@@ -156,17 +157,20 @@ class RecurrentLearner(Learner):
         length = int(place.max()) + 1
         rows = np.arange(len(indices))
         states = data.state[prefix[:, :length]].astype(np.int64)
-        states[kept[:length] > place[:, None]] = states[0, 0]
         states = np.concatenate([states, states[:, :1]], axis=1)
         states[rows, place + 1] = data.next_state[indices]
+        occurs = np.arange(length + 1) <= place[:, None] + 1
+        states[~occurs] = states[0, 0]
 
         unique, inverse = np.unique(states, return_inverse=True)
-        images = self.tensor(self.engine.images(unique))
-        places = self.tensor(inverse.reshape(states.shape))
+        inverse = inverse.reshape(states.shape)
+        times = np.bincount(inverse[occurs], minlength=len(unique))
+        images = looked_at(self.engine.images(unique), times, member.online, self.device)
+        places = self.tensor(inverse)
         member.online.train()
-        values = member.online(member.online.embed(images)[places])[0]
+        values = member.online(member.online.embed(*images)[places])[0]
         with torch.no_grad():
-            next_target = member.target(member.target.embed(images)[places])[0]
+            next_target = member.target(member.target.embed(*images)[places])[0]
         now, later = self.tensor(place), self.tensor(place + 1)
         pick = torch.arange(len(indices), device=self.device)
         options, next_states = np.full(len(indices), option), data.next_state[indices].astype(np.int64)
@@ -190,8 +194,9 @@ class RecurrentLearner(Learner):
         descend(loss, backward_of(member.online), member.optimiser, f"option {option}", where)
         member.updates += 1
         if member.updates % config.target_interval == 0:
-            target, online = member.target.state_dict(), member.online.state_dict()
-            follow(target.values(), online.values(), config.target_tau)
+            networks = (member.target, member.online)
+            target, online = ([*network.parameters(), *network.buffers()] for network in networks)
+            follow(target, online, config.target_tau)
         member.replay.set_priorities(indices, error.detach().abs().cpu().numpy())
         return float(loss.detach())
 
@@ -212,14 +217,15 @@ class PaperPolicies:
 
     def __init__(self, saved: SavedOptions):
         self.weights, self.shape = dict(saved.weights), saved.shape
+        self.remembers = saved.config.get("recurrence", "execution") == "execution"
         self.actions = saved.actions("0.values.2.bias", 1)
         self._networks: dict[int, PaperQNetwork] = {}
 
     def network(self, option: int) -> PaperQNetwork:
         """An option's network."""
         if option not in self._networks:
-            make, weights = partial(PaperQNetwork, self.shape, len(self.actions)), below(f"{option}.", self.weights)
-            self._networks[option] = load_fitting(make, weights, "options.safetensors").eval()
+            make = partial(PaperQNetwork, self.shape, len(self.actions), self.remembers)
+            self._networks[option] = load_fitting(make, below(f"{option}.", self.weights), "options.safetensors").eval()
         return self._networks[option]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

@@ -25,7 +25,7 @@ from hypogoal.needs import play_needs
 from hypogoal.options.tables import Episodes
 
 FIXED = (  # as of the options trained before
-    *("network", "embedding", "termination", "policy_view", "policy_pixels"),
+    *("network", "recurrence", "embedding", "termination", "policy_view", "policy_pixels"),
     *("layout_seed", "start", "option_timeout"),
 )
 WORLD = ("domain_config", "cap", "max_episode_steps")  # where these differ, the agent does not count practice episodes

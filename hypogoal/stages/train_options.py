@@ -20,7 +20,8 @@ from hypogoal.meta.training import (
 )
 from hypogoal.needs import play_needs
 
-FIXED = ("network", "embedding", "termination", "policy_view", "policy_pixels")  # as of the options trained before
+# As of the options trained before.
+FIXED = ("network", "recurrence", "embedding", "termination", "policy_view", "policy_pixels")
 
 
 def train_options(

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
+from hypogoal.core.compute import has_bf16
 from hypogoal.core.drafts import draft_folder
 
 PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
@@ -65,6 +66,11 @@ _ALL = (
         ("train-ensemble", "{data}", *_set("steps=6", "workers=2", "members=2", "schedule=sequential", GOALS)),
         ("data",),
     ),
+    Stage(
+        "bf16",
+        ("train-ensemble", "{data}", *_set("steps=12", "workers=1", "members=2", "precision=bf16", GOALS)),
+        ("data",),
+    ),
     Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=4", "workers=1", "members=2")), ("rooms",)),
     Stage(
         "options",
@@ -91,7 +97,7 @@ _ALL = (
     Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),
     Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=1600", *QUICK[1:]))),
 )
-STAGES = {stage.name: stage for stage in _ALL}
+STAGES = {stage.name: stage for stage in _ALL if stage.name != "bf16" or has_bf16()}
 
 
 @dataclass

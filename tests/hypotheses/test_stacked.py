@@ -79,9 +79,11 @@ def test_networks_without_windows_are_judged_whole() -> None:
     assert split_of(padded) is None
     assert split_of(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3, 2))) is None
     generator = torch.Generator().manual_seed(0)
-    network = Ensemble("doorkey", (64, 64, 3), 1, generator).networks[0]
-    assert split_of(network) is not None
-    assert split_of(network)[1:] == (17, 8)
+    ensemble = Ensemble("doorkey", (64, 64, 3), 1, generator).eval()
+    assert split_of(ensemble.networks[0]) is not None
+    windows = StackedMembers([ensemble], repeats=True)._windows
+    assert windows is not None
+    assert (windows.side, windows.stride) == (17, 8)
 
 
 OWN = {

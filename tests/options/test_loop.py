@@ -15,7 +15,8 @@ from hypogoal.options.choosers import Outcome, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop, offered_options
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork, apply_to_states
+from hypogoal.options.networks import LightQNetwork, apply_to_states
+from hypogoal.options.paper_network import PaperQNetwork
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
@@ -170,7 +171,7 @@ def test_the_tile_path_is_the_image_path(embedding: str) -> None:
 
 
 def test_the_paper_network_unrolls_its_memory() -> None:
-    """Spec D2: step by step with the hidden state, all at once, and PyTorch's own are the same function."""
+    """Spec D2: step by step with the hidden state and all at once are the same; test_paper_network has PyTorch's."""
     torch.manual_seed(0)
     network = PaperQNetwork((64, 64, 3), 7).eval()
     images = torch.randint(0, 256, (1, 5, 64, 64, 3), dtype=torch.uint8)
@@ -182,10 +183,7 @@ def test_the_paper_network_unrolls_its_memory() -> None:
             values, hidden = network(embedded[:, t : t + 1], hidden)
             steps.append(values)
         alone, _ = network(embedded[:, 4:5])
-        features = network.features(images[0].permute(0, 3, 1, 2).float() / 255.0)
-        plain = network.values(network.gru(features[None])[0])
     torch.testing.assert_close(torch.cat(steps, 1), whole)
-    torch.testing.assert_close(whole, plain)
     assert not torch.allclose(alone[:, 0], whole[:, 4])
     assert sum(p.numel() for p in network.parameters()) == pytest.approx(10.5e6, rel=0.02)
 

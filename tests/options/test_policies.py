@@ -11,7 +11,8 @@ import torch
 
 from hypogoal.core.errors import UserError
 from hypogoal.options.learner import Policies, make_policies
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork
+from hypogoal.options.networks import LightQNetwork
+from hypogoal.options.paper_network import PaperQNetwork
 
 SHAPE, OPTIONS, ACTIONS = (24, 24, 3), 2, 5
 

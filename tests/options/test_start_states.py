@@ -17,7 +17,8 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import make_policies
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels
+from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels
+from hypogoal.options.paper_network import PaperQNetwork
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.tables import Executions
