@@ -221,7 +221,7 @@ def rows(work: Work) -> Iterator[Row]:
             for option, states in ends.items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
             every = range(len(config["sub_goals"]) * config["members"])
-            work.arrays[f"{STATES}/{path}"] = np.array([len(ends.get(option, ())) for option in every], np.int64)
+            work.arrays[f"{STATES}/{path}/counts"] = np.array([len(ends.get(option, ())) for option in every], np.int64)
         more: dict[str, Any] = {"masked": config["mask_reached"], "thresholds": thresholds_of(artefact)}
         more |= {**place, "ladder": config["start"], "seed": artefact.seed, "artefact": path}
         yield from rows_of_ladder(executions, config["sub_goals"], config["members"], validated, **more)

@@ -204,7 +204,9 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
 
 def _overlay(material: Material, path: str, option: int) -> dict[str, str]:
     """The picture of the states in which an option ends, and their number."""
-    image, counts = (material.arrays.get(place) for place in (f"terminations/{path}/{option}", f"{STATES}/{path}"))
+    image, counts = (
+        material.arrays.get(place) for place in (f"terminations/{path}/{option}", f"{STATES}/{path}/counts")
+    )
     if image is None:
         return {"png": "", "states": ""}
     return {"png": page.picture(image), "states": "" if counts is None else f"ends in {page.states(counts[option])}"}

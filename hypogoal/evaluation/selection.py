@@ -84,7 +84,7 @@ def rows(work: Work) -> Iterator[Row]:
         choices, members = Choices.read(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
         for option, picture in members.sets.items():
             work.arrays[f"terminations/{run.path}/{option}"] = picture
-        work.arrays[f"{STATES}/{run.path}"] = members.counts
+        work.arrays[f"{STATES}/{run.path}/counts"] = members.counts
         more = {"match": members.match, "threshold": thresholds_of(artefact)}
         place = {"method": name, "layout": layout, "seed": run.seed, "artefact": run.path}
         yield from rows_of_choices(choices, config["sub_goals"], config["members"], more, **place)
@@ -238,7 +238,7 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
     member = goal["members"][goal[word]]
     note = f"preference {page.fixed(member['preference'], 2)}, match {page.fixed(member['match'], 2)}"
     image, counts = (
-        material.arrays.get(place) for place in (f"terminations/{path}/{member['option']}", f"{STATES}/{path}")
+        material.arrays.get(place) for place in (f"terminations/{path}/{member['option']}", f"{STATES}/{path}/counts")
     )
     count = "" if image is None or counts is None else f"\n{page.states(counts[member['option']])}"
     return f"{word} preferred: member {goal[word]}", f"{note}{count}", image

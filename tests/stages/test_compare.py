@@ -81,7 +81,7 @@ def test_the_page_shows_both(runs, compared):
     titles = re.findall(r"<h2>(.*?)</h2>", text)
     assert titles == ["What is compared", "What differs", "Agents", "Who wins, seed by seed"]
     assert text.count("<figure") == 2
-    assert "± one standard error over them (slow, 4 runs: layout seeds 100 and 101, run seeds 0 and 1; fast" in text
+    assert "<summary>runs and seeds</summary>slow, 4 runs: layout seeds 100 and 101, run seeds 0 and 1; fast" in text
     assert "DQN tuned" in text
     assert "within 1.5 shortest paths</th>" in text
     assert not re.search(r'(?:src|href)="(?!#|data:)', text)

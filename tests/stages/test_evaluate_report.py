@@ -445,7 +445,7 @@ def test_arrays_say_what_the_report_draws(run, metrics):
             assert arrays[f"curves/{index}/reward"].shape == (len(agent["runs"]), len(grid))
         some = next(iter(arrays["terminations/meta"].values()))
         assert some.shape == (64, 64, 3)
-        counts = arrays["termination-states/meta"][()]
+        counts = arrays["termination-states/meta/counts"][()]
         assert [str(option) for option in np.flatnonzero(counts)] == sorted(arrays["terminations/meta"], key=int)
 
 
