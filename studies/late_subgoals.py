@@ -49,7 +49,7 @@ def settled(loop: OptionLoop) -> bool:
     """
     episodes, count = loop.recorder.episodes, loop.engine.count
     rows = [(step - length * count, succeeded) for step, length, _, _, succeeded in episodes]
-    rows += [(episodes.steps - elapsed * count, 0) for elapsed in loop.engine.elapsed[~loop.practises].tolist()]
+    rows += [(episodes.steps - elapsed * count, 0) for elapsed in loop.engine.elapsed.tolist()]
     sums = np.concatenate([[0], np.cumsum([succeeded for _, succeeded in sorted(rows)])])
     return bool((sums[LAST:] - sums[:-LAST] >= SOLVED * LAST).any())
 

@@ -119,7 +119,7 @@ class Engine(ABC):
     action_sets: Mapping[str, tuple[int, ...]] = MappingProxyType({})
     position_names: tuple[str, ...] = ()
     layouts: Layouts | None = None
-    restarts = resumes = begins_anywhere = False
+    restarts = resumes = False
 
     @property
     @abstractmethod
@@ -160,10 +160,6 @@ class Engine(ABC):
     def restart(self, where: NDArray[np.bool_]) -> None:
         """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``."""
         raise UserError("this domain's engine cannot begin an episode on request", None, "Let its episodes end.")
-
-    def begin_in(self, numbers: NDArray[np.int64], ids: NDArray[np.int64]) -> None:
-        """Begin a new episode in these environments (n,), in these known states (n,); needs ``begins_anywhere``."""
-        raise UserError("this domain's engine cannot begin an episode in any state", None, "Let its episodes end.")
 
     def snapshot(self) -> dict[str, Any]:
         """Its whole state as nested dicts of arrays and JSON values, to be extended; needs ``resumes``."""

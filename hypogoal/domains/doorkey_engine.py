@@ -94,7 +94,7 @@ class DoorKeyEngine(Engine):
 
     n_actions = N_ACTIONS
     observation_shape = OBSERVATION_SHAPE
-    restarts = resumes = begins_anywhere = alike = True
+    restarts = resumes = alike = True
     n_states = 0
 
     def __init__(
@@ -139,12 +139,6 @@ class DoorKeyEngine(Engine):
         self.ids, self.elapsed = self.ids.copy(), np.where(where, 0, self.elapsed)
         for number in where.nonzero()[0].tolist():
             self.ids[number] = self._start(self.layouts.begin(number))
-
-    def begin_in(self, numbers: NDArray[np.int64], ids: NDArray[np.int64]) -> None:
-        self.ids, self.elapsed = self.ids.copy(), self.elapsed.copy()
-        self.ids[numbers], self.elapsed[numbers] = ids, 0
-        for number, configuration in zip(numbers.tolist(), (self._site[ids] // POSES).tolist(), strict=True):
-            self.layouts.now[number] = self._seeds[configuration]
 
     def _start(self, seed: int) -> int:
         """The start state of a layout."""

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable, State
 
@@ -31,13 +30,12 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
         self.steps = 0
         self._length, self._reward = np.zeros(environments, dtype=np.int64), np.zeros(environments)
 
-    def see(self, step: Step, counted: NDArray[np.bool_] | None = None) -> None:
-        """One step of every environment; episodes are of those that are ``counted``, bool (E,)."""
+    def see(self, step: Step) -> None:
+        """One step of every environment."""
         self.steps += len(step.rewards)
         self._length += 1
         self._reward += step.rewards
         over = step.terminated | step.truncated
-        over = over if counted is None else over & counted
         for e in np.flatnonzero(over):
             length, reward, terminated = int(self._length[e]), float(self._reward[e]), bool(step.terminated[e])
             succeeded = terminated and reward > 0 if step.succeeded is None else step.succeeded[e]

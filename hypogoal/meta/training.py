@@ -31,7 +31,6 @@ from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.parts import Part
 from hypogoal.options.policy_views import Viewed, create_views, views_in
-from hypogoal.options.practice import Practice
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import ORACLE, Terminations, learned_terminations, oracle_terminations, rule_of
 from hypogoal.options.visited import Visited
@@ -85,7 +84,6 @@ def assemble(
         config,
         config.gamma if isinstance(config, MetaConfig) else 1.0,
         initiation=Initiation(engine, options, seed, device) if config.initiation == "learned" else None,
-        practice=Practice(engine, terminations, config, seed) if config.practice else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
     if near := nearness(domain, engine, ensemble_config, config):

@@ -70,11 +70,6 @@ class OptionConfig:
         True, "clip the targets of values to 0..1, the range of an option's return", source="ours; paper: false"
     )
     option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
-    practice: float = setting(0.0, "share of environments", low=0.0, high=1.0)
-    practice_rare: float = setting(0.0, "power", low=0.0)
-    practice_begin: float = setting(0.0, "power", low=0.0)
-    practice_near: float = setting(0.5, "share", low=0.0)
-    practice_turn: int = setting(10, "turn", low=1)
     environments: int = setting(16, "environments stepped together", low=1, high=4096)
     replay: int = setting(100_000, "transitions kept", source="Table 4", low=100)
     warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1)

@@ -19,7 +19,6 @@ from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.practice import Practice
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations
 from hypogoal.options.visited import Visited
@@ -44,7 +43,7 @@ class OptionLoop(Resumable):
     """
 
     CHANGING = (
-        *("terminations", "learner", "chooser", "recorder", "initiation", "visited", "practice"),
+        *("terminations", "learner", "chooser", "recorder", "initiation", "visited"),
         *("option", "began", "age", "inside", "returns"),
     )
 
@@ -59,9 +58,8 @@ class OptionLoop(Resumable):
         gamma: float,
         initiation: Initiation | None = None,
         visited: Visited | None = None,
-        practice: Practice | None = None,
     ):
-        self.initiation, self.visited, self.practice = initiation, visited, practice
+        self.initiation, self.visited = initiation, visited
         self.engine, self.terminations, self.learner, self.chooser = engine, terminations, learner, chooser
         self.recorder, self.config, self.gamma = recorder, config, gamma
         if config.restart_options and not engine.restarts:
@@ -71,8 +69,6 @@ class OptionLoop(Resumable):
                 "Give --set restart_options=false.",
             )
         count = engine.count
-        self.practises = practice.where if practice else np.zeros(count, dtype=np.bool_)
-        self.turns = np.where(self.practises, config.practice_turn, config.option_timeout)
         self.option = np.full(count, NONE, dtype=np.int64)
         self.began = np.zeros(count, dtype=np.int64)  # the states in which the running options were chosen
         self.age = np.zeros(count, dtype=np.int64)
@@ -100,7 +96,7 @@ class OptionLoop(Resumable):
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
-        timed_out = (self.age >= self.turns) & ~reached & ~step.terminated
+        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
         ended = reached | timed_out | over
         moved = Transitions(
             ids, actions, step.next_ids, step.rewards, option, step.terminated, timed_out, reached, ended
@@ -110,13 +106,9 @@ class OptionLoop(Resumable):
         if self.config.restart_options:
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
             self.engine.restart(ended & ~over)
-        if self.practice:
-            if learning:
-                self.practice.see(ids, step.next_ids, step.terminated, self.began)
-            self.practice.begin(np.flatnonzero(ended & self.practises))
         if self.visited:
             self.visited.see(step.next_ids, actions, step.terminated | step.truncated, layouts)
-        self.recorder.see(step, ~self.practises)
+        self.recorder.see(step)
         self._finish_options(step, reached, ended, learning=learning)
         return moved
 
@@ -130,24 +122,17 @@ class OptionLoop(Resumable):
             offered = offered_options(self.terminations.of(ids))
         if self.initiation:
             offered = self.initiation.narrow(ids, offered)
-        agents = ~self.practises[free]
-        chosen = np.empty(len(free), dtype=np.int64)
-        if agents.any():
-            chosen[agents] = self.chooser.choose(free[agents], ids[agents], offered[agents])
-        if self.practice and not agents.all():
-            chosen[~agents] = self.practice.choose(free[~agents], offered[~agents])
+        chosen = self.chooser.choose(free, ids, offered)
         self.option[free], self.began[free] = chosen, ids
         self.inside[free] = self.terminations.of_running(ids, chosen)
         self.age[free] = 0
         self.returns[free] = 0.0
-        if agents.any():
-            self.recorder.chose(chosen[agents], offered[agents])
+        self.recorder.chose(chosen, offered)
 
     def _finish_options(
         self, step: Step, reached: NDArray[np.bool_], ended: NDArray[np.bool_], *, learning: bool
     ) -> None:
-        done = np.flatnonzero(ended & ~self.practises)
-        self.option[ended & self.practises] = NONE
+        done = np.flatnonzero(ended)
         if not len(done):
             return
         outcome = Outcome(

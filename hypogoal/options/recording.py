@@ -61,11 +61,11 @@ class Recorder(Resumable):
         """Environment steps spent before (those of ``train-options``) count in every curve."""
         self.episodes.steps = self._window_start = steps
 
-    def see(self, step: Step, counted: NDArray[np.bool_]) -> None:
-        """A step of every environment; episodes are of those that are ``counted``, bool (E,)."""
-        self.episodes.see(step, counted)
-        for number in np.flatnonzero(counted).tolist():
-            self._states[number].append(int(step.next_ids[number]))
+    def see(self, step: Step) -> None:
+        """A step of every environment."""
+        self.episodes.see(step)
+        for states, state in zip(self._states, step.next_ids.tolist(), strict=True):
+            states.append(state)
 
     def chose(self, options: NDArray[np.int64], offered: NDArray[np.bool_]) -> None:
         """Decisions: the options chosen (n,) among those offered, bool (n, O)."""
