@@ -49,6 +49,7 @@ SETTINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {  # by name: the contro
     "true, 64 environments": ("true", {"termination": "oracle", "environments": 64}),
 }
 GONE = ("practice", "epsilon, replay kept")  # of pilots: the code is in commit 6ba270c, or nowhere
+OF_MEMBERS = ("layout", "seed", "sub_goal", "member", "true_positives", "false_positives")
 COLUMNS = ("setting", "layout", "seed", "steps_to_95", "usual_steps_to_95", "first_success", "seconds")
 
 
@@ -95,6 +96,19 @@ def agent(runs: Path, setting: str, layout: int, seed: int) -> dict[str, Any]:
         before = loop
     row["first_success"] = next((step for step, *_, succeeded in episodes if succeeded), "")
     return row | {"seconds": round(time.process_time() - began, 1)}
+
+
+def members(runs: Path, layout: int, seed: int) -> Iterator[dict[str, Any]]:
+    """How often each member is positive where its sub-goal holds and where not, of a layout's reachable states."""
+    ensemble, domain = open_artefact(runs / f"ensemble-{seed}", "ensemble").whole(), load_domain("doorkey")
+    loop = assemble(domain, ensemble.path, ensemble.config, TrainMetaConfig(layout_seed=layout), seed)
+    states = loop.engine.reachable()
+    assert states is not None
+    positive, true = loop.terminations.of(states), loop.engine.labels(states)
+    for option, (goal, member) in enumerate(product(range(len(domain.sub_goals)), range(ensemble.config["members"]))):
+        shares = [positive[true[:, goal] == holds, option].mean() for holds in (True, False)]
+        row = {"layout": layout, "seed": seed, "sub_goal": domain.sub_goals[goal], "member": member}
+        yield row | {"true_positives": f"{shares[0]:.3f}", "false_positives": f"{shares[1]:.3f}"}
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -181,7 +195,16 @@ def main() -> None:
     )
     parser.add_argument("--layouts", type=parse_integers, default=parse_integers("200-209"))
     parser.add_argument("--seeds", type=parse_integers, default=parse_integers("1-2"))
+    parser.add_argument("--members", action="store_true", help="judge members instead, into a file of their own")
     arguments = parser.parse_args()
+    if arguments.runs and arguments.members:
+        prepare("cpu")
+        with arguments.csv.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, OF_MEMBERS, lineterminator="\n")
+            writer.writeheader()
+            for seed, layout in product(arguments.seeds, arguments.layouts):
+                writer.writerows(members(arguments.runs, layout, seed))
+        return
     if arguments.runs:
         prepare("cpu")
         if not arguments.csv.exists():
