@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from itertools import product
 from pathlib import Path
@@ -27,7 +28,7 @@ from hypogoal.core.config import from_values, parse_integers
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.curves import SOLVED
 from hypogoal.evaluation.numbers import student_interval
-from hypogoal.learners.episodes import LAST
+from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.meta.training import assemble
 from hypogoal.options.loop import OptionLoop
@@ -38,6 +39,7 @@ CHOOSING = tuple(range(210, 214))  # layouts on which settings were chosen
 SETTINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {  # by name: the control beside it, and what it changes
     "today": ("", {}),
     "practice": ("today", {"practice": 0.25, "practice_turn": 20, "practice_rare": 0.5, "practice_begin": 0.5}),
+    "practice, near": ("today", {"practice": 0.25, "practice_turn": 20, "practice_near": 0.5}),
     "epsilon": ("today", {"epsilon_steps": 2_000}),
     "epsilon, replay kept": ("today", {"epsilon_steps": 2_000}),
     "epsilon, target": ("today", {"epsilon_steps": 2_000, "target_tau": 0.05}),
@@ -48,20 +50,19 @@ SETTINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {  # by name: the contro
     "true": ("", {"termination": "oracle"}),
     "true, 64 environments": ("true", {"termination": "oracle", "environments": 64}),
 }
-GONE = ("practice", "epsilon, replay kept")  # of pilots: the code is in commit 6ba270c, or nowhere
+GONE = ("practice", "practice, near", "epsilon, replay kept")  # of pilots: the code is in commit 6ba270c, or nowhere
 OF_MEMBERS = ("layout", "seed", "sub_goal", "member", "true_positives", "false_positives")
 COLUMNS = ("setting", "layout", "seed", "steps_to_95", "usual_steps_to_95", "first_success", "seconds")
 
 
-def settled(loop: OptionLoop) -> bool:
+def settled(episodes: EpisodeRecorder, elapsed: NDArray[np.int64]) -> bool:
     """Whether 95 of 100 episodes begun one after the other have succeeded, of all that were begun so far.
 
-    Other than the last 100 that ended it does not count successes first (docs/results/finished-episodes.md), however
-    many environments there are.
+    Unlike the last 100 that ended it does not count successes first (docs/results/finished-episodes.md), however many
+    environments there are. ``elapsed`` int64 (E,) are the steps of the episodes that go on.
     """
-    episodes, count = loop.recorder.episodes, loop.engine.count
-    rows = [(step - length * count, succeeded) for step, length, _, _, succeeded in episodes]
-    rows += [(episodes.steps - elapsed * count, 0) for elapsed in loop.engine.elapsed.tolist()]
+    rows = [(step - length * len(elapsed), succeeded) for step, length, _, _, succeeded in episodes]
+    rows += [(episodes.steps - steps * len(elapsed), 0) for steps in elapsed.tolist()]
     sums = np.concatenate([[0], np.cumsum([succeeded for _, succeeded in sorted(rows)])])
     return bool((sums[LAST:] - sums[:-LAST] >= SOLVED * LAST).any())
 
@@ -71,13 +72,15 @@ def agent(runs: Path, setting: str, layout: int, seed: int) -> dict[str, Any]:
     began = time.process_time()
     ensemble, domain = open_artefact(runs / f"ensemble-{seed}", "ensemble").whole(), load_domain("doorkey")
     changes = {**SETTINGS[setting][1], "layout_seed": layout}
-    oracle = changes.get("termination") == "oracle"
     row: dict[str, Any] = {"setting": setting, "layout": layout, "seed": seed}
+    configs: list[TrainOptionsConfig | TrainMetaConfig] = [from_values(TrainMetaConfig, changes, "train-meta")]
+    if changes.get("termination") != "oracle":  # true sub-goals are not practised, as in Figure 6
+        configs.insert(0, from_values(TrainOptionsConfig, changes, "train-options"))
     before: OptionLoop | None = None
-    for kind, end in ((TrainOptionsConfig, PRACTICE), (TrainMetaConfig, STEPS)):
-        if (oracle and kind is TrainOptionsConfig) or "steps_to_95" in row:
-            continue  # true sub-goals are not practised, as in Figure 6
-        config = from_values(kind, changes, "train-meta")
+    for config in configs:
+        if "steps_to_95" in row:
+            break
+        end = PRACTICE if isinstance(config, TrainOptionsConfig) else STEPS
         loop = assemble(domain, ensemble.path, ensemble.config, config, seed)
         episodes = loop.recorder.episodes
         if before:  # as continue_with
@@ -91,7 +94,7 @@ def agent(runs: Path, setting: str, layout: int, seed: int) -> dict[str, Any]:
                 row["usual_steps_to_95"] = episodes.steps
             if episodes.steps >= look:
                 look += LOOK
-                if settled(loop):
+                if settled(episodes, loop.engine.elapsed):
                     row["steps_to_95"] = episodes.steps
         before = loop
     row["first_success"] = next((step for step, *_, succeeded in episodes if succeeded), "")
@@ -112,60 +115,51 @@ def members(runs: Path, layout: int, seed: int) -> Iterator[dict[str, Any]]:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """Each setting beside today's, over layouts; then layout by layout."""
+    """Every agent, layout by layout; then each setting beside its control, over the layouts that have both."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    for chosen, title in ((True, "Choosing: layouts 210 to 213."), (False, "Judging: layouts 200 to 209.")):
-        part = [row for row in rows if (int(row["layout"]) in CHOOSING) == chosen]
-        if part:
-            yield title
-            yield ""
-            yield from _tables(part)
-
-
-def _tables(rows: list[dict[str, str]]) -> Iterator[str]:
+    found = {(row["setting"], int(row["layout"]), int(row["seed"])): row for row in rows}
     settings = [name for name in SETTINGS if any(row["setting"] == name for row in rows)]
-    agents = sorted({(int(row["layout"]), int(row["seed"])) for row in rows})
+    agents = sorted({agent[1:] for agent in found}, key=lambda agent: (agent[0] not in CHOOSING, agent))
 
-    def values(setting: str, quantity: str, *, capped: bool = False) -> NDArray[np.float64]:
-        """By agent; inf where it never got there, NaN where it was not run."""
-        never = STEPS if capped else np.inf
-        seen = {
-            (int(row["layout"]), int(row["seed"])): float(row[quantity] or never)
-            for row in rows
-            if row["setting"] == setting
-        }
-        return np.array([seen.get(agent, np.nan) for agent in agents])
-
-    def against(setting: str, quantity: str) -> str:
-        """The ratio to its control, geometric mean over layouts with Student's interval."""
-        if not (control := SETTINGS[setting][0]):
+    def cell(setting: str, agent: tuple[int, int]) -> str:
+        if not (row := found.get((setting, *agent))):
             return "-"
-        pair = np.log(values(setting, quantity, capped=True) / values(control, quantity, capped=True))
-        layouts = np.array([layout for layout, _ in agents])
-        of_layout = [pair[(layouts == layout) & np.isfinite(pair)] for layout in sorted(set(layouts.tolist()))]
-        return _ratio(np.array([part.mean() for part in of_layout if len(part)]))
+        steps = f"{int(row['steps_to_95']) / 1000:.0f}" if row["steps_to_95"] else "never"
+        return f"{steps} ({float(row['seconds']):.0f})"
 
+    titles = ["layout, seed", *(f"{layout}, {seed}" for layout, seed in agents)]
+    yield from table(titles, ([name, *(cell(name, agent) for agent in agents)] for name in settings))
+
+    def ratio(setting: str, quantity: str, *, chosen: bool) -> str:
+        """Geometric mean over layouts with Student's interval; who never got there counts 150,000 steps."""
+        control, logs = SETTINGS[setting][0], defaultdict(list)
+        for layout, seed in agents:
+            pair = [found.get((name, layout, seed)) for name in (setting, control)]
+            if pair[0] and pair[1] and (layout in CHOOSING) == chosen:
+                ours, others = (float(row[quantity] or STEPS) for row in pair if row)
+                logs[layout].append(np.log(ours / others))
+        means = np.array([np.mean(of_layout) for of_layout in logs.values()])
+        return f"{_ratio(means)} (n = {len(means)})" if len(means) else "-"
+
+    cases = [
+        (name, chosen)
+        for name, chosen in product(settings, (True, False))
+        if SETTINGS[name][0] and any(agent[0] == name and (agent[1] in CHOOSING) == chosen for agent in found)
+    ]
+    yield "Beside the control, geometric mean over layouts."
+    yield ""
     yield from table(
-        ["", "reached 95 %", "steps, median", "ratio", "CPU seconds, median", "ratio", "first success, median"],
+        ["", "layouts", "ratio of steps", "ratio of CPU seconds"],
         (
             [
                 name,
-                f"{np.isfinite(steps).sum()} of {(~np.isnan(steps)).sum()}",
-                _thousands(_median(steps)),
-                against(name, "steps_to_95"),
-                f"{_median(values(name, 'seconds')):.0f}",
-                against(name, "seconds"),
-                _thousands(_median(values(name, "first_success"))),
+                "210 to 213" if chosen else "200 to 209",
+                *(ratio(name, quantity, chosen=chosen) for quantity in ("steps_to_95", "seconds")),
             ]
-            for name in settings
-            for steps in [values(name, "steps_to_95")]
+            for name, chosen in cases
         ),
     )
-    yield "Thousands of steps to 95 %, layout and seed."
-    yield ""
-    titles = ["", *(f"{layout}, {seed}" for layout, seed in agents)]
-    yield from table(titles, ([name, *map(_thousands, values(name, "steps_to_95").tolist())] for name in settings))
 
 
 def _ratio(logs: NDArray[np.float64]) -> str:
@@ -173,16 +167,6 @@ def _ratio(logs: NDArray[np.float64]) -> str:
         return f"{np.exp(logs.mean()):.2f}" if len(logs) else "-"
     low, high = student_interval(logs)
     return f"{np.exp(logs.mean()):.2f} [{np.exp(low):.2f}, {np.exp(high):.2f}]"
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    """The upper one of two, so that it is never between a number and never."""
-    ran = np.sort(values[~np.isnan(values)])
-    return float(ran[len(ran) // 2])
-
-
-def _thousands(steps: float) -> str:
-    return "-" if np.isnan(steps) else "never" if np.isinf(steps) else f"{steps / 1000:.0f}"
 
 
 def main() -> None:
