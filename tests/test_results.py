@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from hypogoal.learners.episodes import EpisodeRecorder
 from studies import (
     bandits,
     choosing,
@@ -19,6 +20,7 @@ from studies import (
     labels,
     ladder_options,
     ladders,
+    late_subgoals,
     many_layouts,
     precision,
     thresholds,
@@ -38,6 +40,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "hypotheses-ladders": ladders.tables,
     "initiation": initiation.tables,
     "labels-doorkey": labels.tables,
+    "late-subgoals": late_subgoals.tables,
     "many-layouts": many_layouts.tables,
     "options-that-hold": ladder_options.tables_that_hold,
     "precision": precision.tables,
@@ -182,3 +185,17 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert ran == [("a", 2), ("b", 2), ("a", 3)]
     rows = path.read_text(encoding="utf-8").splitlines()
     assert rows == ["cell,step,score", "a,1,0.1429", "a,2,0.2857", "b,1,0.1429", "b,2,0.2857", "a,3,0.4286"]
+
+
+@pytest.mark.parametrize("share", [0.8, 1.0])
+def test_an_agent_is_not_at_95_percent_because_its_failures_take_longer(share: float) -> None:
+    """Until the cap only successes end; of episodes begun one after the other those that go on count as failures."""
+    rng, episodes = np.random.default_rng(0), EpisodeRecorder(64)
+    elapsed, succeeds = np.zeros(64, np.int64), rng.random(64) < share
+    for _ in range(400):
+        episodes.steps, elapsed = episodes.steps + 64, elapsed + 1
+        for number in np.flatnonzero(succeeds & (elapsed == 30)):
+            episodes.append((episodes.steps, 30, 1.0, 1, 1))
+            elapsed[number], succeeds[number] = 0, rng.random() < share
+    assert episodes.solved(0.95)  # whatever the share
+    assert late_subgoals.settled(episodes, elapsed) == (share == 1.0)
