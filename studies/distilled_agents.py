@@ -3,9 +3,10 @@
     python -m studies.distilled_agents docs/results/distilled-agents.csv
 
 Two kinds of cells. ``plain`` and ``harsh``: an agent learns to choose in one of Figure 6's layouts, over options that
-were distilled elsewhere by ``studies.distilled`` (or planned there), until it has played ``STEPS``; in the harsh world
-a wrong key ends the episode, which is cut after 1.5 shortest paths. ``many``: an agent learns over the layouts that its
-options were distilled in, and plays 100 others without learning, beside uniform-random choice among the same options.
+were distilled elsewhere by ``studies.distilled`` (or planned there), until it has played ``STEPS``; the ensembles'
+seeds take turns. In the harsh world a wrong key ends the episode, which is cut after 1.5 shortest paths. ``many``: an
+agent learns over the layouts that its options were distilled in, and plays 100 others without learning, beside
+uniform-random choice among the same options.
 """
 
 from __future__ import annotations
@@ -37,8 +38,7 @@ from studies.distilled import FIRST, ensemble_of
 from studies.many_layouts import new_layouts
 
 LAYOUTS = range(300, 310)  # Figure 6's
-SEEDS = 5  # of ensembles: layout 300 + i has the options of seed i modulo so many
-STEPS, STEPS_OF_MANY = 40_000, 200_000
+STEPS, STEPS_OF_MANY = 20_000, 200_000
 STEP = 1  # of a cell
 UNIFORM = "_uniform"  # what columns of uniform-random choice end in
 WORLDS: dict[str, dict[str, Any]] = {
@@ -61,9 +61,8 @@ COLUMNS = (
 )
 
 
-def run_cell(work: Path, world: str, options: str, number: int) -> list[Row]:
-    """An agent learns in layout ``number``, or with the options of seed ``number`` in many layouts."""
-    seed = number if world == "many" else number % SEEDS
+def run_cell(work: Path, world: str, options: str, number: int, seed: int) -> list[Row]:
+    """An agent learns in layout ``number``, or in many layouts, over the options of an ensemble of this seed."""
     source = ensemble_of(work, "dbat", seed)
     changes = dict(WORLDS[world]) | ({} if world == "many" else {"layout_seed": number})
     if options == "planned":
@@ -147,10 +146,12 @@ def main() -> None:
         print("\n".join(tables(arguments.csv)))
         return
     jobs: dict[Cell, Callable[[], list[Row]]] = {
-        (world, options, str(number)): partial(run_cell, arguments.work, world, options, number)
+        (world, options, str(number)): partial(
+            run_cell, arguments.work, world, options, number, arguments.seeds[place % len(arguments.seeds)]
+        )
         for world in arguments.worlds.split(",")
-        for number in (arguments.seeds if world == "many" else LAYOUTS)
         for options in arguments.options.split(",")
+        for place, number in enumerate(arguments.seeds if world == "many" else LAYOUTS)
     }
     run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda _: (STEP,), arguments.workers)
 
