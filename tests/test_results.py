@@ -11,6 +11,8 @@ from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 from studies import (
     bandits,
     choosing,
+    distilled,
+    distilled_agents,
     figure6,
     finished,
     hypotheses,
@@ -28,6 +30,8 @@ from studies.cells import run_cells
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
+    "distilled": distilled.tables,
+    "distilled-agents": distilled_agents.tables,
     "figure3-ladders": ladders.tables,
     "figure4-ladders": ladder_options.tables,
     "figure6-doorkey": figure6.tables,
