@@ -1,4 +1,4 @@
-"""DoorKey: options distilled from the plans of 200 layouts, tried on 100 that nobody played; ten minutes of a core.
+"""DoorKey: options distilled from the plans of 300 layouts, tried on 100 that nobody played; ten minutes of a core.
 
 Shows the preset `distilled`. In a new layout its options need no model and no training:
 
