@@ -36,8 +36,11 @@ FIRST = 6000  # new layouts begin here; those from 5000 on were seen while setti
 PICKING = tuple(range(1000, 1050))  # layouts on which members are picked
 STEP = 1  # of a cell: options are looked at once
 GRID = {  # the first setting
-    **{"embedding": "grid", "layouts": "1000-1199", "option_batch": 256},
-    **{"steps": 160_000, "rate_steps": 160_000},
+    "embedding": "grid",
+    "layouts": "1000-1199",
+    "option_batch": 256,
+    "steps": 160_000,
+    "rate_steps": 160_000,
 }
 ENSEMBLES: dict[str, dict[str, Any]] = {"dbat": {}, "none": {"diversity": "none"}, "one": {"members": 1}}
 # A title, the ensemble, settings of the options.
