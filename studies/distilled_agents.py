@@ -61,15 +61,16 @@ COLUMNS = (
 )
 
 
-def run_cell(work: Path, world: str, options: str, number: int, seed: int) -> list[Row]:
+def run_cell(work: Path, world: str, options: str, number: int, seed: int, method: str = "dbat") -> list[Row]:
     """An agent learns in layout ``number``, or in many layouts, over the options of an ensemble of this seed."""
     source = ensemble_of(work, "dbat", seed)
     changes = dict(WORLDS[world]) | ({} if world == "many" else {"layout_seed": number})
     if options == "planned":
         config, practice = TrainMetaConfig(network="planned", **changes), None
     else:
+        practice = work / f"options-{method}-{seed}"
+        changes["embedding"] = open_artefact(practice, "options").config["embedding"]
         config = resolve(TrainMetaConfig, stage="train-meta", preset="distilled", options=changes)
-        practice = work / f"options-dbat-{seed}"
     out, begun = work / f"agent-{world}-{options}-{number}", time.process_time()
     train_meta(source.path, config, out, options=practice, seed=number, force=True, quiet=True)
     spent, agent = time.process_time() - begun, open_artefact(out, "meta")
@@ -139,6 +140,7 @@ def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "0-4")
     parser.add_argument("--work", type=Path, default=Path("runs/distilled"), help="where studies.distilled worked")
+    parser.add_argument("--method", default="dbat", help="of studies.distilled, whose options to take: dbat or grid")
     parser.add_argument("--worlds", default=",".join(WORLDS), help=f"of {', '.join(WORLDS)}")
     parser.add_argument("--options", default=",".join(TITLES), help=f"of {', '.join(TITLES)}")
     arguments = parser.parse_args()
@@ -147,7 +149,13 @@ def main() -> None:
         return
     jobs: dict[Cell, Callable[[], list[Row]]] = {
         (world, options, str(number)): partial(
-            run_cell, arguments.work, world, options, number, arguments.seeds[place % len(arguments.seeds)]
+            run_cell,
+            arguments.work,
+            world,
+            options,
+            number,
+            arguments.seeds[place % len(arguments.seeds)],
+            arguments.method,
         )
         for world in arguments.worlds.split(",")
         for options in arguments.options.split(",")
