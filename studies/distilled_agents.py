@@ -50,10 +50,13 @@ WORLDS: dict[str, dict[str, Any]] = {
     "harsh": {"steps": 50_000, "world": ("wrong_key=ends",), "cap": 1.5},
     "many": {"steps": STEPS_OF_MANY, "layouts": "1000-1199", "meta_network": "grid", "environments": 32},
 }
-TITLES = {
-    "distilled": "distilled elsewhere",
-    "uniform": "the same, uniform-random choice",
-    "planned": "planned there",
+# A title, the options of studies.distilled (None: planned in the agent's own layouts), who chooses.
+OPTIONS: dict[str, tuple[str, str | None, str]] = {
+    "distilled": ("distilled", "dbat", "ppo"),
+    "uniform": ("the same, uniform-random choice", "dbat", "random"),
+    "grid": ("distilled, grid, 200 layouts", "grid", "ppo"),
+    "uniform-grid": ("the same, uniform-random choice", "grid", "random"),
+    "planned": ("planned there", None, "ppo"),
 }
 KEYS = ("world", "options", "layout")
 COLUMNS = (
@@ -62,15 +65,15 @@ COLUMNS = (
 )
 
 
-def run_cell(work: Path, world: str, options: str, number: int, seed: int, method: str = "dbat") -> list[Row]:
+def run_cell(work: Path, world: str, options: str, number: int, seed: int) -> list[Row]:
     """An agent learns in layout ``number``, or in many layouts, over the options of an ensemble of this seed."""
     source = ensemble_of(work, "dbat", seed)
-    changes = dict(WORLDS[world]) | ({} if world == "many" else {"layout_seed": number})
-    if options == "planned":
+    _, distilled, who = OPTIONS[options]
+    changes = dict(WORLDS[world]) | ({} if world == "many" else {"layout_seed": number}) | {"chooser": who}
+    if distilled is None:
         config, practice = TrainMetaConfig(network="planned", **changes), None
     else:
-        practice = work / f"options-{method}-{seed}"
-        changes |= {"chooser": "random"} if options == "uniform" else {}
+        practice = work / f"options-{distilled}-{seed}"
         changes["embedding"] = open_artefact(practice, "options").config["embedding"]
         config = resolve(TrainMetaConfig, stage="train-meta", preset="distilled", options=changes)
     out, begun = work / f"agent-{world}-{options}-{number}", time.process_time()
@@ -91,8 +94,8 @@ def run_cell(work: Path, world: str, options: str, number: int, seed: int, metho
         loop = agent_of(agent, seed, 100, tuple(new_layouts(FIRST)))
         ways = shortest_ways(loop.engine)[:, -1:]
         choosers = {"": loop.chooser, UNIFORM: RandomChooser(rng_for(seed, "uniform-choice"))}
-        for name, chooser in choosers.items():
-            scores = play(loop, chooser, EPISODES).scores(ways)
+        for name, player in choosers.items():
+            scores = play(loop, player, EPISODES).scores(ways)
             numbers |= {f"{score}{name}": float(scores[score].mean()) for score in ("success", "within_2")}
     return [{"world": world, "options": options, "layout": number, "step": STEP, "seed": seed, **numbers}]
 
@@ -113,13 +116,13 @@ def tables(path: Path) -> Iterator[str]:
     yield "One new layout: environment steps there until 95 of the last 100 episodes are solved; then the last 100."
     yield ""
     rows = []
-    for world, options in ((world, options) for world in ("plain", "harsh") for options in TITLES):
+    for world, options in ((world, options) for world in ("plain", "harsh") for options in OPTIONS):
         if some := cells[world, options]:
             reached = np.array([row["steps_to_95"] for row in some])
             middle = float(np.median(reached))
             rows.append(
                 [
-                    f"{world}, {TITLES[options]}",
+                    f"{world}, {OPTIONS[options][0]}",
                     f"{np.isfinite(reached).sum()} of {len(some)}",
                     f"{middle:,.0f}" if math.isfinite(middle) else "never",
                     interval(np.array([row["success"] for row in some]), 2),
@@ -132,7 +135,7 @@ def tables(path: Path) -> Iterator[str]:
     yield "100 new layouts, without learning there: agent / uniform-random choice among the same options."
     yield ""
     rows = []
-    for options, title in TITLES.items():
+    for options, (title, _, _) in OPTIONS.items():
         if some := cells["many", options]:
             pairs = [
                 " / ".join(interval(np.array([row[f"{name}{who}"] for row in some]), 2) for who in ("", UNIFORM))
@@ -146,22 +149,15 @@ def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "0-4")
     parser.add_argument("--work", type=Path, default=Path("runs/distilled"), help="where studies.distilled worked")
-    parser.add_argument("--method", default="dbat", help="of studies.distilled, whose options to take: dbat or grid")
     parser.add_argument("--worlds", default=",".join(WORLDS), help=f"of {', '.join(WORLDS)}")
-    parser.add_argument("--options", default=",".join(TITLES), help=f"of {', '.join(TITLES)}")
+    parser.add_argument("--options", default=",".join(OPTIONS), help=f"of {', '.join(OPTIONS)}")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
         return
     jobs: dict[Cell, Callable[[], list[Row]]] = {
         (world, options, str(number)): partial(
-            run_cell,
-            arguments.work,
-            world,
-            options,
-            number,
-            arguments.seeds[place % len(arguments.seeds)],
-            arguments.method,
+            run_cell, arguments.work, world, options, number, arguments.seeds[place % len(arguments.seeds)]
         )
         for world in arguments.worlds.split(",")
         for options in arguments.options.split(",")
