@@ -117,7 +117,7 @@ def tables(path: Path) -> Iterator[str]:
                 interval(picked(within, method, STEP), 2),
                 interval(of_seeds(wrong, (method, STEP, WHERE[1])), 2),
                 interval(of_seeds(success, (method, STEP, WHERE[1])), 2),
-                f"{of_seeds(spent, (method, STEP, WHERE[1])).max() / 60:.1f}",
+                f"{minutes:.1f}" if (minutes := of_seeds(spent, (method, STEP, WHERE[1])).max() / 60) else "-",
                 str(len(within[method, STEP, WHERE[1]])),
             ]
             for method in methods
