@@ -71,11 +71,11 @@ COLUMNS = (*KEYS, *OF_OPTIONS, "steps_per_second", "states")
 WHERE = ("trained", "new")
 
 
-def new_layouts() -> list[int]:
-    """The first seeds from ``FIRST`` on whose grids nothing was learned on, and which differ from each other."""
+def new_layouts(first: int = FIRST) -> list[int]:
+    """The first seeds from there on whose grids nothing was learned on, and which differ from each other."""
     grids = {layout_of(seed).grid for seed in (*LEARNT, *layout_seeds(TRAINED))}
     new: list[int] = []
-    for seed in itertools.count(FIRST):
+    for seed in itertools.count(first):
         if (grid := layout_of(seed).grid) not in grids:
             grids.add(grid)
             new.append(seed)

@@ -13,6 +13,8 @@ from hypogoal.learners.episodes import EpisodeRecorder
 from studies import (
     bandits,
     choosing,
+    distilled,
+    distilled_agents,
     figure6,
     finished,
     hypotheses,
@@ -32,6 +34,8 @@ from studies.cells import difference, interval, run_cells
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
+    "distilled": distilled.tables,
+    "distilled-agents": distilled_agents.tables,
     "figure3-ladders": ladders.tables,
     "figure4-ladders": ladder_options.tables,
     "figure6-doorkey": figure6.tables,

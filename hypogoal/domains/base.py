@@ -210,8 +210,11 @@ class Engine(ABC):
         """Ids of all reachable states, one for each distinct image; None if unknown."""
         return None
 
-    def plan(self) -> Plan | None:
-        """The state each action leads to from each state; None if unknown."""
+    def plan(self, starts: NDArray[np.int64] | None = None) -> Plan | None:
+        """The state each action leads to from each state that can be reached; None if unknown.
+
+        From these ``starts``, ids (n,), or from where episodes begin.
+        """
         return None
 
     def shortest_path(self) -> int | None:

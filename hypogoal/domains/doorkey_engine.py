@@ -243,13 +243,17 @@ class DoorKeyEngine(Engine):
             "keys_held": held @ np.array([1, 2, 4]),
         }
 
-    def distances(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def distances(self, starts: NDArray[np.int64] | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Breadth-first search: ids of all states reachable from the starts, nearest first, and the steps to each.
+
+        ``starts`` are ids (n,), by default those of all layouts.
 
         The search stops at states in which the episode ends. It never drops a key: that leaves a few thousand states
         per layout instead of some ten million.
         """
-        rings, depth = [np.array([self._start(seed) for seed in self.layouts.seeds])], 0
+        if starts is None:
+            starts = np.array([self._start(seed) for seed in self.layouts.seeds])
+        rings, depth = [starts], 0
         seen, steps = np.zeros(self.n_states, np.bool_), [np.zeros(len(rings[0]), np.int64)]
         seen[rings[0]] = True
         while len(rings[-1]):
@@ -273,9 +277,9 @@ class DoorKeyEngine(Engine):
         _, first = np.unique(images, return_index=True)
         return ids[np.sort(first)]
 
-    def plan(self) -> Plan:
+    def plan(self, starts: NDArray[np.int64] | None = None) -> Plan:
         """The transitions between all states, except some ten million that only dropping a key leads to."""
-        ids, actions = self.distances()[0], SEARCHED
+        ids, actions = self.distances(starts)[0], SEARCHED
         final = self._final[ids]
         following = np.repeat(ids[:, None], len(actions), axis=1)
         each = np.broadcast_to(actions, following.shape)[~final]

@@ -27,9 +27,10 @@ class MetaConfig:
 
     meta_network: str = setting(
         "light",
-        "light, a small network on cells; or the paper's three convolutions",
-        source="paper: three convolutions",
-        choices=("light", "paper"),
+        "light, a small network on cells; grid or deep, as the options' embedding, for many layouts; or the paper's "
+        "three convolutions",
+        source="paper: three convolutions; the others: ours",
+        choices=("light", "grid", "deep", "paper"),
     )
     head: str = setting(
         "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")

@@ -2,21 +2,33 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hypogoal.dataset import Standard
-from hypogoal.options.networks import WIDTH, CellEmbedding, LightNetwork, NumberEmbedding
+from hypogoal.hypotheses.networks import AUTO
+from hypogoal.options.networks import DEEP, GRID, WIDTH, CellEmbedding, LightNetwork, NumberEmbedding, embedding_for
 
 
 class LightMetaNetwork(LightNetwork):
-    """Cells, or numbers where there is a ``standard`` of them, two dense layers, actor and critic."""
+    """Cells, or numbers where there is a ``standard`` of them, or an ``embedding``; two dense layers, actor, critic."""
 
-    def __init__(self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None):
-        cells = NumberEmbedding(observation_shape, standard) if standard else CellEmbedding(observation_shape)
-        super().__init__(cells)
+    def __init__(
+        self,
+        observation_shape: tuple[int, ...],
+        options: int,
+        standard: Standard | None = None,
+        embedding: str = AUTO,
+    ):
+        if embedding != AUTO:
+            super().__init__(embedding_for(observation_shape, standard, embedding, "meta_network"))
+        elif standard is not None:
+            super().__init__(NumberEmbedding(observation_shape, standard))
+        else:
+            super().__init__(CellEmbedding(observation_shape))
         self.outputs = nn.Linear(WIDTH, options + 1)
         _quiet_start(self.outputs)
 
@@ -144,5 +156,7 @@ class GaussianHead(Head):
 HEADS: dict[str, Callable[[int], Head]] = {"categorical": CategoricalHead, "gaussian": GaussianHead}
 NETWORKS: dict[str, Callable[[tuple[int, ...], int, Standard | None], nn.Module]] = {
     "light": LightMetaNetwork,
+    GRID: partial(LightMetaNetwork, embedding=GRID),
+    DEEP: partial(LightMetaNetwork, embedding=DEEP),
     "paper": PaperMetaNetwork,
 }

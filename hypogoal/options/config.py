@@ -18,18 +18,24 @@ class OptionConfig:
         "network=planned": (
             *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
             *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
-            *("exploration", "actions", "epsilon_steps", "epsilon_final", "epsilon_from", "recurrence"),
+            *("exploration", "actions", "epsilon_steps", "epsilon_final", "epsilon_from", "rate_steps", "recurrence"),
         ),
-        "network=light": ("recurrence",),
-        "network=paper": ("positives",),
+        "network=distilled": (
+            *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "positives", "experience"),
+            *("target_interval", "target_tau", "n_step", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
+            "recurrence",
+        ),
+        "network=light": ("rate_steps", "recurrence"),
+        "network=paper": ("positives", "rate_steps"),
     }
 
     network: str = setting(
         "light",
-        "Q-network: light, a small one on cells; paper, a conv-GRU; or planned: the shortest path, where an engine "
-        "knows what each action leads to",
-        source="paper, appendix; light, planned: ours",
-        choices=("light", "paper", "planned"),
+        "Q-network: light, a small one on cells; paper, a conv-GRU; or, where an engine knows what each action leads "
+        "to: planned, the shortest path; distilled, a light network that learns such paths in 'layouts' and is played "
+        "in others",
+        source="paper, appendix; the others: ours",
+        choices=("light", "paper", "planned", "distilled"),
         own=True,
     )
     recurrence: str = setting(
@@ -49,7 +55,8 @@ class OptionConfig:
     embedding: str = setting(
         "auto",
         "how the light network reads observations: cells, convolutions or numbers, whichever suits them; grid, cells "
-        "with convolutions over them, for many layouts; or a member network's layers, by name or as module:function",
+        "with convolutions over them, for many layouts; deep, more of them and attention; or a member network's "
+        "layers, by name or as module:function",
         source="ours",
     )
     experience: str = setting(
@@ -85,6 +92,9 @@ class OptionConfig:
     option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
     positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
     option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
+    rate_steps: int = setting(
+        60_000, "steps until Adam's step size has fallen to a twentieth; 0: it stays (distilled)", unit="steps", low=0
+    )
     target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
     target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
     n_step: int = setting(

@@ -30,6 +30,7 @@ from hypogoal.options.termination import ORACLE, Terminations
 COUNTERS = ("option_steps", "steps_since_positive")
 LEARNERS = {
     "light": "hypogoal.options.light:LightLearner",
+    "distilled": "hypogoal.options.distilled:DistilledLearner",
     "paper": "hypogoal.options.recurrent:RecurrentLearner",
     "planned": "hypogoal.options.planned:PlannedLearner",
 }
@@ -85,6 +86,7 @@ class Learner(Part, ABC):
     Attributes:
         FILE: what an artefact calls the file of its :meth:`state`.
         NEEDS: settings that must have this value.
+        ONCE: whether it learns in one run of ``train-options`` alone, and is only played afterwards.
         actions: the engine's actions that the policies choose among, int64 (A,).
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
@@ -96,6 +98,7 @@ class Learner(Part, ABC):
 
     FILE: ClassVar[str] = "options.safetensors"
     NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO, "policy_view": FULL, "policy_pixels": "all"}
+    ONCE: ClassVar[bool] = False
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "view", *COUNTERS)
 
     def __init__(

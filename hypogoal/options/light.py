@@ -29,6 +29,7 @@ from hypogoal.options.choosers import Ids
 from hypogoal.options.config import FULL, STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
 from hypogoal.options.networks import (
+    DEEP,
     GRID,
     LightQNetwork,
     PictureEmbedding,
@@ -234,7 +235,7 @@ class LightPolicies:
         shape, embedding = self.views[-1].shape if self.views else saved.shape, config.get("embedding", AUTO)
         standard = standard_in(weights, shape)
         make = partial(LightQNetwork, shape, saved.count, len(self.actions), standard, embedding)
-        custom = embedding not in (AUTO, GRID, *NETWORKS)
+        custom = embedding not in (AUTO, GRID, DEEP, *NETWORKS)
         self.network = load_fitting(make, weights, "options.safetensors", custom=custom)
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

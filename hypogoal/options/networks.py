@@ -17,7 +17,7 @@ from hypogoal.hypotheses.views import FullView
 from hypogoal.options.policy_views import Viewed
 
 CELL = 8  # pixels
-GRID = "grid"  # the embedding of this name
+GRID, DEEP = "grid", "deep"  # the embeddings of these names
 WIDTH = 128  # of dense layers
 SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
@@ -79,6 +79,36 @@ class GridEmbedding(CellEmbedding):
         for layer in self.layers:
             grid = grid + torch.relu(layer(grid))
         return grid.permute(0, 2, 3, 1).flatten(1)
+
+
+class DeepEmbedding(CellEmbedding):
+    """Whole cells with their places, ``LAYERS`` residual convolutions of 3 x 3, and what ``HEADS`` queries read there.
+
+    A query's weights over cells, a softmax, ask where something is; the mean over all cells is read, too. For options
+    distilled from plans: docs/results/distilled.md.
+    """
+
+    CHANNELS, LAYERS, HEADS, CONTRAST = 24, 6, 4, 10.0
+
+    def __init__(self, observation_shape: tuple[int, ...]):
+        super().__init__(observation_shape, self.CHANNELS)
+        self._cells = (observation_shape[0] // CELL, observation_shape[1] // CELL)
+        self.place = nn.Parameter(torch.zeros(1, self.CHANNELS, *self._cells))
+        self.layers = nn.ModuleList(nn.Conv2d(self.CHANNELS, self.CHANNELS, 3, padding=1) for _ in range(self.LAYERS))
+        self.query = nn.Linear(self.CHANNELS, self.HEADS)
+        self.features = self.CHANNELS * (self.HEADS + 1)
+        # With the usual small weights all cells look alike at first, and learning stands still for 200 updates.
+        with torch.no_grad():
+            self.conv.weight.mul_(self.CONTRAST)
+            self.query.weight.normal_()
+
+    def across(self, features: Tensor) -> Tensor:
+        grid = features.view(-1, *self._cells, self.CHANNELS).permute(0, 3, 1, 2) + self.place
+        for layer in self.layers:
+            grid = grid + torch.relu(layer(grid))
+        cells = grid.permute(0, 2, 3, 1).flatten(1, 2)
+        read = self.query(cells).softmax(1).transpose(1, 2) @ cells
+        return torch.cat([read.flatten(1), cells.mean(1)], 1)
 
 
 class PictureEmbedding(nn.Module):
@@ -145,15 +175,22 @@ def standard_in(weights: Mapping[str, Tensor], shape: tuple[int, ...]) -> Standa
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
 
 
-def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None, name: str = AUTO) -> Embedding:
-    """The embedding of this ``name``; ``auto`` is numbers where there is a ``standard``, else cells, or convolutions
-    where whole cells do not fill the image. One too small for these is a ``UserError``.
+def embedding_for(
+    observation_shape: tuple[int, ...],
+    standard: Standard | None = None,
+    name: str = AUTO,
+    setting: str = "embedding",
+) -> Embedding:
+    """The embedding of this ``name``, a ``setting``'s value; a ``UserError`` where the observations do not suit it.
+
+    ``auto`` is numbers where there is a ``standard``, else cells, or convolutions where whole cells do not fill the
+    image.
     """
-    if name == GRID:
+    if name in (GRID, DEEP):
         if standard is not None or any(side % CELL for side in observation_shape[:2]):
             what = f"only pictures that whole cells of {CELL} x {CELL} pixels fill have a grid"
-            raise UserError(what, f"embedding=grid, observations {observation_shape}", "Give --set embedding=auto.")
-        return GridEmbedding(observation_shape)
+            raise UserError(what, f"{setting}={name}, observations {observation_shape}", f"Leave {setting} out.")
+        return (GridEmbedding if name == GRID else DeepEmbedding)(observation_shape)
     if name != AUTO:
         return OwnEmbedding(name, observation_shape, standard)
     if standard is not None:

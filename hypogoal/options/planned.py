@@ -33,13 +33,7 @@ class PlannedLearner(Learner):
     """
 
     def build(self, config: OptionConfig, seed: int) -> None:
-        if type(self.terminations) is not Terminations:
-            what = "only options that end at a single positive prediction can be planned"
-            raise UserError(what, f"termination={config.termination}", "Give termination=learned.")
-        plan = self.engine.plan()
-        if plan is None:
-            what = "this domain does not know what each action leads to"
-            raise UserError(what, "network=planned", "Give --set network=light.")
+        plan = plan_of(self.engine, self.terminations, config)
         self.actions = plan.actions
         self._place = places_of(plan, self.engine)
         self._after = self._place[plan.following]
@@ -72,6 +66,18 @@ class PlannedLearner(Learner):
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         """There are none."""
+
+
+def plan_of(engine: Engine, terminations: Terminations, config: OptionConfig, starts: Ids | None = None) -> Plan:
+    """The engine's plan, from these states or where episodes begin; a ``UserError`` where options cannot be planned."""
+    if type(terminations) is not Terminations:
+        what = "only options that end at a single positive prediction can be planned"
+        raise UserError(what, f"termination={config.termination}", "Give termination=learned.")
+    plan = engine.plan() if starts is None else engine.plan(starts)  # a user's engine may take none
+    if plan is None:
+        what = "this domain does not know what each action leads to"
+        raise UserError(what, f"network={config.network}", "Give --set network=light.")
+    return plan
 
 
 def places_of(plan: Plan, engine: Engine) -> NDArray[np.int64]:

@@ -10,6 +10,7 @@ from typing import Any
 from hypogoal.cards import training
 from hypogoal.core.artefacts import Artefact, claim, open_artefact
 from hypogoal.core.compute import prepare
+from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.training import (
@@ -22,6 +23,7 @@ from hypogoal.meta.training import (
     write_trained,
 )
 from hypogoal.needs import play_needs
+from hypogoal.options.learner import load_learner
 from hypogoal.options.tables import Episodes
 
 FIXED = (  # as of the options trained before
@@ -52,6 +54,9 @@ def train_meta(
     practice = open_artefact(options, "options").whole() if options else None
     if practice:
         check_fit(practice, source, config, FIXED)
+    elif load_learner(config.network).ONCE:
+        what = "these options learn in train-options alone"
+        raise UserError(what, f"network={config.network}", "Train them there, then give --options.")
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])

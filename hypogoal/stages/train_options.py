@@ -6,6 +6,7 @@ from typing import Any
 from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.compute import prepare
+from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import (
@@ -19,6 +20,7 @@ from hypogoal.meta.training import (
     write_trained,
 )
 from hypogoal.needs import play_needs
+from hypogoal.options.learner import load_learner
 
 # As of the options trained before.
 FIXED = ("network", "recurrence", "embedding", "termination", "policy_view", "policy_pixels")
@@ -45,6 +47,9 @@ def train_options(
     source = open_artefact(ensemble, "ensemble").whole()
     practice = open_artefact(options, "options").whole() if options else None
     if practice:
+        if load_learner(config.network).ONCE:
+            what = "these options learn once and for all"
+            raise UserError(what, f"network={config.network}", "Train them anew, without --options.")
         check_fit(practice, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)

@@ -94,7 +94,7 @@ class RoomsEngine(Engine):
     def reachable(self) -> NDArray[np.int64]:
         return np.arange(self.n_states)
 
-    def plan(self) -> Plan:
+    def plan(self, starts: NDArray[np.int64] | None = None) -> Plan:
         ids, final = self.reachable(), self.reachable() >= DECKS
         following = np.repeat(ids[:, None], self.n_actions, axis=1)
         following[:DECKS] = ids[DECKS:].reshape(DECKS, self.n_actions)

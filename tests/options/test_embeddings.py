@@ -142,22 +142,35 @@ def test_the_grid_has_one_rule_for_all_places() -> None:
     torch.testing.assert_close(first[2:7, 2:7], second[3:8, 4:9])
 
 
+def test_the_deep_embedding_sees_all_cells_and_where_they_are() -> None:
+    """Spec H6: what it reads anywhere changes with any cell, and with the place of the same picture."""
+    torch.manual_seed(0)
+    embedding, images = embedding_for((80, 88, 3), name="deep"), torch.zeros(3, 80, 88, 3, dtype=torch.uint8)
+    tile = torch.randint(256, (8, 8, 3), dtype=torch.uint8)
+    images[1, 72:, :8], images[2, 32:40, 32:40] = tile, tile
+    plain, corner, middle = embedding(images)
+    assert len(plain) == embedding.features == 120
+    assert not torch.allclose(plain, corner, atol=1e-3) and not torch.allclose(corner, middle, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["grid", "deep"])
 @pytest.mark.parametrize(("shape", "standard"), [((84, 84, 3), None), ((16,), (np.zeros(16), np.ones(16)))])
-def test_what_is_no_grid_is_refused(shape: tuple[int, ...], standard: object) -> None:
+def test_what_is_no_grid_is_refused(shape: tuple[int, ...], standard: object, name: str) -> None:
     """Spec G2."""
-    with pytest.raises(UserError, match=r"fill have a grid: embedding=grid, observations .* Give --set embedding=auto"):
-        embedding_for(shape, standard, "grid")
+    with pytest.raises(UserError, match=rf"fill have a grid: embedding={name}, observations .* Leave embedding out"):
+        embedding_for(shape, standard, name)
 
 
-def test_options_with_a_grid_play_out_of_their_weights() -> None:
+@pytest.mark.parametrize("embedding", ["grid", "deep"])
+def test_options_with_a_grid_play_out_of_their_weights(embedding: str) -> None:
     """Spec D2, G2: the policies of an artefact prefer what the learner preferred."""
     engine = DoorKeyEngine(3, 4)
     rng = np.random.default_rng(0)
     for _ in range(10):
         engine.step(rng.integers(7, size=4))
-    learner = LightLearner(engine, oracle_terminations(engine, (0, 1)), OptionConfig(embedding="grid"), 0)
+    learner = LightLearner(engine, oracle_terminations(engine, (0, 1)), OptionConfig(embedding=embedding), 0)
     policies = make_policies(
-        {**LIGHT, "embedding": "grid"}, learner.state(), {"observation_shape": engine.observation_shape}
+        {**LIGHT, "embedding": embedding}, learner.state(), {"observation_shape": engine.observation_shape}
     )
     ids = np.arange(engine.n_states)
     for option in (0, 1):
