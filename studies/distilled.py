@@ -29,7 +29,7 @@ from hypogoal.meta.training import assemble
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Cell, Row, interval, parser_of, run_cells, table
+from studies.cells import Cell, Row, difference, interval, parser_of, run_cells, table
 from studies.many_layouts import ENSEMBLE_STEPS, KEYS, WHERE, new_layouts, of_seeds, picked, read, tried_out
 
 FIRST = 6000  # new layouts begin here; those from 5000 on were seen while settings were chosen
@@ -105,8 +105,8 @@ def tables(path: Path) -> Iterator[str]:
     within, wrong, success = (read(path, name) for name in ("within_2", "wrong_yes", "success"))
     spent = read(path, "cpu_seconds")
     methods = [method for method in METHODS if (method, STEP, WHERE[1]) in within]
-    yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals; Student's 95 %"
-    yield "interval over seeds. Picked: the member that is best on 50 layouts learned in."
+    yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals. Picked: the member"
+    yield "that is best on 50 layouts learned in."
     yield ""
     yield from table(
         ["options", "mean member", "picked member", "false positives", "any success", "CPU minutes", "seeds"],
@@ -158,7 +158,7 @@ def _differences(path: Path) -> Iterator[str]:
                 for method in (first, second) for where in WHERE}  # fmt: skip
         means, picks = ([of(some, method) for method in (first, second)] for of in (_means, _picks))
         name = f"{METHODS[first][0]} - {METHODS[second][0]}"
-        lines.append([name, interval(means[0] - means[1], 3), interval(picks[0] - picks[1], 3), str(len(seeds))])
+        lines.append([name, difference(means[0] - means[1], 3), difference(picks[0] - picks[1], 3), str(len(seeds))])
     yield from table(["difference", "mean member", "picked member", "seeds"], lines)
 
 

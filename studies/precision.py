@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies import ladders
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 from studies.ladders import LOOKS, Seeds, crossed, read
 
 UNTIL = 450
@@ -48,7 +48,7 @@ def tables(path: Path) -> Iterator[str]:
                 before = {seed: {step: published[method][seed][step] for step in float32[seed]} for seed in float32}
                 for name, measure in SCORES.items():
                     usual, new, other = map(measure, (float32, bf16, before))
-                    numbers = map(interval, (usual, new - usual, other - usual))
+                    numbers = (interval(usual), difference(new - usual), difference(other - usual))
                     rows.append([str(groups), method, name, str(len(usual)), *numbers])
     titles = ["N", "", "on unseen rooms", "seeds", "float32", "bf16 minus it", "float32 as published minus it"]
     yield from table(titles, rows)
