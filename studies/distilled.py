@@ -105,8 +105,8 @@ def tables(path: Path) -> Iterator[str]:
     within, wrong, success = (read(path, name) for name in ("within_2", "wrong_yes", "success"))
     spent = read(path, "cpu_seconds")
     methods = [method for method in METHODS if (method, STEP, WHERE[1]) in within]
-    yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals. Picked: the member"
-    yield "that is best on 50 layouts learned in."
+    yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals."
+    yield "Picked: the member that is best on 50 layouts learned in."
     yield ""
     yield from table(
         ["options", "mean member", "picked member", "false positives", "any success", "CPU minutes", "seeds"],
