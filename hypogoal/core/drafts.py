@@ -20,7 +20,7 @@ from typing import Any
 
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.errors import Complete, UserError
-from hypogoal.core.files import FRESH, parse_json, read_json, replace_text, sync
+from hypogoal.core.files import FRESH, open_file, parse_json, read_json, replace_text, sync
 from hypogoal.core.locks import is_there, remove_left_over, try_lock
 
 PARTIAL = ".partial"
@@ -74,7 +74,7 @@ def drafts_in(path: Path) -> dict[Path, bool]:
     """The outputs at or below a path that have a draft, and whether, as its lock says, a process works on it."""
     found = {}
     for folder in (draft_folder(path), *sorted(path.rglob(f".*{PARTIAL}"))):
-        with contextlib.suppress(OSError), (folder / LOCK).open("rb") as file:
+        with contextlib.suppress(UserError), open_file(folder / LOCK, "the lock is", "Remove it.") as file:
             if (folder / BEGUN).is_file():
                 found[folder.with_name(folder.name[1 : -len(PARTIAL)])] = try_lock(file, shared=True) is False
     return found
