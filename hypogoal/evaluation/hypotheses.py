@@ -13,7 +13,7 @@ from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judgement, Work
-from hypogoal.evaluation.numbers import Metrics, grouped
+from hypogoal.evaluation.numbers import Metrics, ensemble_title, grouped
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, drawing
 from hypogoal.evaluation.table import (
@@ -87,7 +87,7 @@ CAPTION = (
     "Balanced accuracy on held-out states of the best, mean and worst member, and the share of states on which two "
     "members disagree (mean over pairs); mean over ensemble seeds ± standard error."
 )
-ENSEMBLE = page.label("ensemble", "name", once=True)
+ENSEMBLE = page.label("ensemble", lambda entry: ensemble_title(str(entry["name"])), once=True)
 SCORES = tuple(page.number(which, which, page.spread, 3) for which in WHICH)
 SEEDS = page.number("seeds", "ensembles")
 DISAGREE = page.number("disagree", "disagreement_heldout", page.spread, 3)

@@ -259,7 +259,7 @@ def test_hypotheses_alone_are_told_in_the_terminal(run, tmp_path, capsys, monkey
     numbers = [f"{row[which]['mean']:.3f}" for which in ("best", "mean", "worst")]
     (line,) = (line for line in told.splitlines() if "open-red-door" in line)
     assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
-    assert "dbat, K=2" in told and "no diversity, K=2" in told
+    assert "D-BAT, 2 members" in told and "no diversity, 2 members" in told
     *lines, then, where = told.splitlines()
     assert max(map(len, lines)) <= 80 and where == str(tmp_path / "evaluation")
     assert then == f"next: hypogoal report {tmp_path}"
