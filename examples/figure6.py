@@ -29,6 +29,7 @@ METHODS = {
     "none-k3": "--diversity none --members 3",
     "one": "--diversity none --members 1",
 }
+PUBLISHED = "--set epsilon_steps=8000 --set update_interval=16"  # the page was run with these
 BASELINES = {"ppo-tuned": "--agent ppo --set setting=tuned", "dqn-tuned": "--agent dqn --set setting=tuned"}
 FEW_LAYOUTS, FEW_SEEDS = tuple(range(300, 305)), tuple(range(3000, 3005))
 PAPERS = {"ppo-paper": "--agent ppo --set setting=paper", "dqn-paper": "--agent dqn --set setting=paper"}
@@ -69,12 +70,13 @@ def figure6(
         yield Command(ensemble, f"train-ensemble @data {METHODS[method]} --seed {seed}", columns)
         of_seed = [agent for agent in agents if agent[1] == seed]
         for agent in of_seed:
-            yield on_layout(f"options/method-{method}", f"train-options @{ensemble}", method, agent, 40_000)
+            yield on_layout(f"options/method-{method}", f"train-options @{ensemble} {PUBLISHED}", method, agent, 40_000)
         for layout, _ in of_seed:
             command = f"train-meta @{ensemble} --options @options/method-{method}-layout-{layout}-seed-{seed}"
+            command = f"{command} {PUBLISHED}"
             yield on_layout(f"agent/method-{method}", command, method, (layout, seed), 1_460_000)
     for method, agent in product(told, agents):
-        command = f"train-meta @ensemble/method-{method}-seed-{agent[1]} --set termination=oracle"
+        command = f"train-meta @ensemble/method-{method}-seed-{agent[1]} --set termination=oracle {PUBLISHED}"
         yield on_layout(f"oracle/method-{method}", command, "oracle", agent)
     for baseline, agent in product(baselines, agents):
         command = f"train-baseline doorkey --data @data {BASELINES[baseline]}"

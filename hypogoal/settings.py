@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hypogoal.core.config import DOMAIN, as_dict, describe, from_values, load_preset, resolve
+from hypogoal.domains.doorkey_defaults import DEFAULTS, SOURCES
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import AuditConfig, TrainMetaConfig, TrainOptionsConfig
@@ -36,7 +37,9 @@ def options_of(stage: str) -> dict[str, dict[str, Any]]:
 def described(config_class: type, stage: str, domain: str, preset: str | None = None) -> list[dict[str, Any]]:
     """Every setting of a stage with the defaults of a domain and a preset, as :func:`hypogoal.core.config.describe`."""
     instead: list[tuple[Mapping[str, Any], str]] = []
-    if domain != DOMAIN:  # DoorKey's defaults are the classes' own; loading it would take time
+    if domain == DOMAIN:
+        instead.append((DEFAULTS.get(stage, {}), SOURCES.get(stage, "")))
+    else:
         from hypogoal.domains.base import load_domain
 
         loaded = load_domain(domain, given=True)

@@ -17,6 +17,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, joined, leave_out, require_classes
 from hypogoal.domains import doorkey_env as env
 from hypogoal.domains.base import Domain
+from hypogoal.domains.doorkey_defaults import DEFAULTS, SOURCES
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 
 
@@ -109,6 +110,7 @@ class DoorKeyDomain(Domain):
     env_id = "hypogoal/DoorKey-8x8-v0"
     many_layouts = True
     packed = 20  # 26 measured
+    defaults, sources = DEFAULTS, SOURCES
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:
         """An upper bound: layout 0 has some 1,640 states, others up to 2,500."""

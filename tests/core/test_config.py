@@ -12,7 +12,7 @@ import hypogoal
 from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import defaults_of
-from hypogoal.settings import TABLES
+from hypogoal.settings import TABLES, configuration, described
 from hypogoal.stages.sweep import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
@@ -121,6 +121,18 @@ def test_the_presets_resolve_for_every_stage(experiment: str, preset: str) -> No
         config_class, defaults = config_class_of(stage, experiment), defaults_of(experiment, stage)
         config = resolve(config_class, stage=stage, preset=preset, domain=experiment, defaults=defaults)
         assert from_values(type(config), as_dict(config), stage) == config
+
+
+@pytest.mark.parametrize("stage", ["train-options", "train-meta"])
+def test_what_was_published_keeps_its_settings(stage: str) -> None:
+    """Spec D3: DoorKey's own defaults end exploration early and update often; presets of published results do not."""
+    published = {"paper": (8_000, 4), "choosing": (8_000, 16), "demo": (8_000, 16), "many-layouts": (1_000_000, 16)}
+    for preset, settings in {None: (2_000, 8), "figure6": (2_000, 8), **published}.items():
+        config = configuration(stage, "doorkey", preset, [], {})
+        assert (config.epsilon_steps, config.update_interval) == settings
+    rows = {row["name"]: row for row in described(config_class_of(stage), stage, "doorkey")}
+    assert (rows["epsilon_steps"]["default"], rows["update_interval"]["default"]) == (2_000, 8)
+    assert defaults_of("doorkey", stage) == {"epsilon_steps": 2_000, "update_interval": 8}
 
 
 def test_the_paper_preset_has_the_papers_tables() -> None:
