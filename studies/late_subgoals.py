@@ -123,13 +123,24 @@ def tables(path: Path) -> Iterator[str]:
     agents = sorted({agent[1:] for agent in found}, key=lambda agent: (agent[0] not in CHOOSING, agent))
 
     def cell(setting: str, agent: tuple[int, int]) -> str:
-        if not (row := found.get((setting, *agent))):
-            return "-"
+        row = found[setting, *agent]
         steps = f"{int(row['steps_to_95']) / 1000:.0f}" if row["steps_to_95"] else "never"
         return f"{steps} ({float(row['seconds']):.0f})"
 
-    titles = ["layout, seed", *(f"{layout}, {seed}" for layout, seed in agents)]
-    yield from table(titles, ([name, *(cell(name, agent) for agent in agents)] for name in settings))
+    judged = [agent for agent in agents if agent[0] not in CHOOSING]
+    layouts, seeds = (sorted({agent[place] for agent in judged}) for place in (0, 1))
+    both = [name for name in settings if all((name, *agent) in found for agent in judged)]
+    yield from table(
+        ["", *map(str, layouts), "solved"],
+        (
+            [
+                f"{name}, seed {seed}",
+                *(cell(name, (layout, seed)) for layout in layouts),
+                f"{sum(bool(found[name, layout, seed]['steps_to_95']) for layout in layouts)} of {len(layouts)}",
+            ]
+            for seed, name in product(seeds, both)
+        ),
+    )
 
     def ratio(setting: str, quantity: str, *, chosen: bool) -> str:
         """Geometric mean over layouts with Student's interval; who never got there counts 150,000 steps."""
