@@ -31,6 +31,7 @@ from studies.cells import table
 
 AT, STEPS, SPAN = 40_000, 80_000, 10_000  # environment steps: of the shock, of a run, of a row
 MEMBERS, LOST = 3, 2
+FIRST = 300  # changes are chosen on layouts before it
 PAPER = (
     "environments=1 meta_network=paper meta_learning_rate=2.5e-4 head=gaussian gae_lambda=0.97 decisions=100 epochs=10"
     " meta_batch=64 advantage_floor=0"
@@ -115,23 +116,28 @@ def gather(run: Path) -> Iterator[dict[str, str | int | float]]:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """Solved in each span of steps, mean over agents, and how many agents end at .95."""
+    """Solved in each span of steps, mean over agents, and how many agents recover; layouts from 300 on come first."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] == "success"]
-    solved: dict[str, dict[int, list[float]]] = {}
+    solved: dict[tuple[bool, str], dict[int, list[float]]] = {}
     for row in rows:
-        solved.setdefault(row["method"], {}).setdefault(int(row["step"]), []).append(float(row["value"]))
+        chosen_on = int(row["layout"]) < FIRST
+        solved.setdefault((chosen_on, row["method"]), {}).setdefault(int(row["step"]), []).append(float(row["value"]))
     spans = range(AT, STEPS + 1, SPAN)
     titles = [f"{(step - SPAN) // 1000}-{step // 1000}k" for step in spans]
+    order = [*METHODS, *CHANGES, *dict.fromkeys(method for _, method in solved if method not in METHODS | CHANGES)]
     yield from table(
-        ["", *titles, "at .95 at the end"],
+        ["layouts", "", *titles, "recover"],
         (
             [
+                "210 to 213" if chosen_on else "300 to 304",
                 method,
                 *(f"{np.mean(of_method[step]):.2f}" for step in spans),
                 f"{sum(value >= 0.95 for value in of_method[STEPS])} of {len(of_method[STEPS])}",
             ]
-            for method, of_method in solved.items()
+            for (chosen_on, method), of_method in sorted(
+                solved.items(), key=lambda item: (item[0][0], order.index(item[0][1]))
+            )
         ),
     )
 
