@@ -121,7 +121,7 @@ class GaussianHead(Head):
     """The paper's Gaussian policy head: scores (N, O) are drawn, and remembered; the best offered is played.
 
     Its entropy is that of the drawn scores. It depends on their spread alone, so an entropy bonus cannot keep the
-    choice from becoming certain (``docs/results/shock-doorkey.md``).
+    choice from becoming certain.
     """
 
     NODES = 16  # of the quadrature; a test holds it against draws
