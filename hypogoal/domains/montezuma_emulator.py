@@ -193,7 +193,11 @@ class Emulator:
 
     def alive(self) -> bool:
         """Whether the agent is not dying."""
-        return self.read("dying") == 0 and not self.ale.game_over()
+        return self.read("dying") == 0 and not self.over()
+
+    def over(self) -> bool:
+        """Whether the game is over."""
+        return bool(self.ale.game_over())
 
     def screen_rgb(self) -> NDArray[np.uint8]:
         """The console's picture, uint8 (210, 160, 3)."""
