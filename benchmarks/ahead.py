@@ -4,8 +4,8 @@
 
 The ceiling is the emulator alone in one process: random actions with a stack at each step. Times are of a joint step,
 sixteen games at ladder 1L with oracle terminations and one update; start-up is left out. Neighbours that take a core
-slow down the pair most: compare the load average, and the CPU time of both processes, which says what the clock would
-say at best.
+slow down the pair most. So the share of the ceiling is also reckoned from CPU times, as of two cores that do nothing
+else: what one process does while the other waits, and the longer of what both do at once.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -26,10 +26,10 @@ timing.alone()
 
 from benchmarks.loop import quietly  # noqa: E402
 from benchmarks.montezuma import time_ceiling  # noqa: E402
-from hypogoal.core.workers import Companion  # noqa: E402
 from hypogoal.domains.montezuma_emulator import N_ACTIONS, Emulator  # noqa: E402
 from hypogoal.domains.montezuma_ladders import LADDERS  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
+from hypogoal.options.loop import OptionLoop  # noqa: E402
 from hypogoal.stages import train_options  # noqa: E402
 
 GAMES = 16
@@ -41,7 +41,7 @@ CANDIDATES = {
     "play_ahead, half the pixels": (HALF, AHEAD),
 }
 CEILING = "the emulator's ceiling"
-PARTS = ("wall", "cpu", "learning", "waiting", "second")  # ms of a joint step; the second process: CPU time
+PARTS = ("wall", "cpu", "learning", "second")  # ms of a joint step: by the clock; CPU; CPU of it; CPU of the second
 
 
 def second_process() -> float:
@@ -54,34 +54,34 @@ def second_process() -> float:
 def climbing(ensemble: Path, steps: int, folder: Path, *more: str) -> dict[str, float]:
     """Milliseconds of a joint step by ``PARTS``."""
     spent = dict.fromkeys(PARTS, 0.0)
-    train, learn, receive = train_options.train, LightLearner.learn, Companion.receive
+    train, learn = train_options.train, LightLearner.learn
 
-    def timed(part: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        def measured(*arguments: Any) -> Any:
-            begin = time.perf_counter()
-            answer = work(*arguments)
-            spent[part] += time.perf_counter() - begin
-            return answer
+    def learning(learner: LightLearner) -> Any:
+        begin = time.process_time()
+        numbers = learn(learner)
+        spent["learning"] += time.process_time() - begin
+        return numbers
 
-        return measured
-
-    def training(*arguments: Any) -> Any:
+    def training(loop: OptionLoop, *arguments: Any) -> Any:
+        loop.engine.snapshot()  # the second process has started
         begin, cpu, second = time.perf_counter(), time.process_time(), second_process() if AHEAD in more else 0.0
-        solved = train(*arguments)
+        solved = train(loop, *arguments)
         spent["wall"], spent["cpu"] = time.perf_counter() - begin, time.process_time() - cpu
         spent["second"] = second_process() - second if AHEAD in more else 0.0
         return solved
 
     settings = ("start=1L", "termination=oracle", "warm_up=100", f"environments={GAMES}", f"steps={steps}", *more)
-    patches = (
-        patch.object(train_options, "train", training),
-        patch.object(LightLearner, "learn", timed("learning", learn)),
-        patch.object(Companion, "receive", timed("waiting", receive)),
-    )
-    with patches[0], patches[1], patches[2]:
+    with patch.object(train_options, "train", training), patch.object(LightLearner, "learn", learning):
         out = folder / f"out-{time.monotonic_ns()}"
         quietly("train-options", ensemble, "--out", out, *(word for pair in settings for word in ("--set", pair)))
     return {part: 1e3 * seconds * GAMES / steps for part, seconds in spent.items()}
+
+
+def undisturbed(spent: Mapping[str, float]) -> float:
+    """Milliseconds of a joint step by the clock if each process had a core of its own."""
+    if not spent["second"]:
+        return spent["cpu"]
+    return spent["cpu"] - spent["learning"] + max(spent["learning"], spent["second"])
 
 
 def ceiling(steps: int) -> dict[str, float]:
@@ -117,13 +117,19 @@ def main() -> None:
     rows = []
     for name, repeated in measured.items():
         row: dict[str, Any] = {part: statistics.median(each[part] for each in repeated) for part in PARTS}
-        shares = [at_best["wall"] / each["wall"] for at_best, each in zip(measured[CEILING], repeated, strict=True)]
-        rows.append({"name": name, **row, "of_ceiling": statistics.median(shares), "shares": shares})
+        pairs = [*zip(measured[CEILING], repeated, strict=True)]
+        shares = {
+            "by_the_clock": [alone["wall"] / each["wall"] for alone, each in pairs],
+            "reckoned": [alone["cpu"] / undisturbed(each) for alone, each in pairs],
+        }
+        rows.append({"name": name, **row, **{share: statistics.median(each) for share, each in shares.items()}})
+        rows[-1]["repeats"] = shares
     loads = [*before, *os.getloadavg()]
     print(f"load average {loads[0]:.1f} before, {loads[3]:.1f} after; ms of a joint step, medians of {repeats}")
-    print(f"{'':30}" + "".join(f"{part:>10}" for part in PARTS) + f"{'of ceiling':>12}")
+    print(f"{'':30}" + "".join(f"{part:>10}" for part in PARTS) + "   of ceiling    reckoned")
     for row in rows:
-        print(f"{row['name']:30}" + "".join(f"{row[part]:10.2f}" for part in PARTS) + f"{row['of_ceiling']:12.2f}")
+        figures = "".join(f"{row[part]:10.2f}" for part in PARTS)
+        print(f"{row['name']:30}{figures}{row['by_the_clock']:13.2f}{row['reckoned']:12.2f}")
     timing.write(given.json, machine, {"loads": loads, "steps": steps, "repeats": repeats, "montezuma": rows})
 
 
