@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -163,6 +164,7 @@ def test_options_are_those_of_one_process_in_the_same_order(climbers: Path, monk
     changes = ("steps=400", "termination=oracle")
     usual = train(climbers, "usual", *changes, "play_ahead=false")
     ahead = train(climbers, "ahead", *changes)
+    wait_for(lambda: not multiprocessing.active_children())
     monkeypatch.setattr(montezuma, "AheadEngine", InOneProcess)
     plain = train(climbers, "plain", *changes)
     assert differences(plain, ahead) == []
