@@ -24,14 +24,6 @@ class Saved(NamedTuple):
     screen: NDArray[np.uint8]
 
 
-class Outcome(NamedTuple):
-    """What a step has come to, but for the frame."""
-
-    reward: float
-    over: bool
-    ram: bytes
-
-
 class Emulators:
     """The emulators in the second process; ``frames``: shared memory for a frame of each."""
 
@@ -39,7 +31,7 @@ class Emulators:
         self.emulators = [game.Emulator(seed + number) for number in range(count)]
         self.frames = _frames_in(frames, count)
 
-    def __call__(self, message: tuple[Mapping[int, Saved], list[int] | None]) -> list[Outcome] | list[Saved]:
+    def __call__(self, message: tuple[Mapping[int, Saved], list[int] | None]) -> list[game.Outcome] | list[Saved]:
         """Return to states, by emulator; then play the actions, or, where there are none, save all emulators."""
         from ale_py import ALEState
 
@@ -49,13 +41,10 @@ class Emulators:
             emulator.restore(game.Snapshot(ALEState(state), emulator.seen, screen))
         if actions is None:
             return [_saved(emulator.save()) for emulator in self.emulators]
-        return [self._play(number, action) for number, action in enumerate(actions)]
-
-    def _play(self, number: int, action: int) -> Outcome:
-        emulator = self.emulators[number]
-        reward = emulator.step(action)
-        self.frames[number] = emulator.seen[-1]
-        return Outcome(reward, emulator.over(), bytes(emulator.ram()))
+        outcomes = [emulator.play(action) for emulator, action in zip(self.emulators, actions, strict=True)]
+        for frame, emulator in zip(self.frames, self.emulators, strict=True):
+            frame[:] = emulator.seen[-1]
+        return outcomes
 
 
 class Away:
@@ -68,7 +57,7 @@ class Away:
     """
 
     seen: game.Frames
-    outcome: Outcome
+    outcome: game.Outcome
     saved: Saved
 
     def __init__(self, frame: NDArray[np.uint8]):
@@ -79,18 +68,10 @@ class Away:
         """See ``Emulator.restore``."""
         self.seen, self.restored = snapshot.seen, snapshot
 
-    def step(self, action: int) -> float:
-        """The reward of the step that was played."""
+    def play(self, action: int) -> game.Outcome:
+        """The outcome of the step that was played."""
         self.seen = (*self.seen[1:], self.frame.copy())
-        return self.outcome.reward
-
-    def over(self) -> bool:
-        """Whether the game is over."""
-        return self.outcome.over
-
-    def ram(self) -> bytes:
-        """The console's memory."""
-        return self.outcome.ram
+        return self.outcome
 
     def save(self) -> game.Snapshot:
         """The state that was saved."""

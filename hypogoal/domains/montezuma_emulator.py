@@ -72,6 +72,14 @@ class Position(NamedTuple):
     y: int
 
 
+class Outcome(NamedTuple):
+    """What a step has come to, but for the frame."""
+
+    reward: float
+    over: bool  # the game
+    ram: bytes  # (128,)
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """A state of the emulator and the frames before it, which the emulator does not keep."""
@@ -163,6 +171,10 @@ class Emulator:
             self.seen = (*self.seen[1:], self._shrink(self.screen))
         return reward
 
+    def play(self, action: int) -> Outcome:
+        """A :meth:`step`, and how things are after it."""
+        return Outcome(self.step(action), self.ale.game_over(), self.ram().tobytes())
+
     def _shrink(self, screen: NDArray[np.uint8]) -> NDArray[np.uint8]:
         small: Any = self._resize(screen, (SIDE, SIDE), interpolation=self._area)
         return small
@@ -193,11 +205,7 @@ class Emulator:
 
     def alive(self) -> bool:
         """Whether the agent is not dying."""
-        return self.read("dying") == 0 and not self.over()
-
-    def over(self) -> bool:
-        """Whether the game is over."""
-        return bool(self.ale.game_over())
+        return self.read("dying") == 0 and not self.ale.game_over()
 
     def screen_rgb(self) -> NDArray[np.uint8]:
         """The console's picture, uint8 (210, 160, 3)."""

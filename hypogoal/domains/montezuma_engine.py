@@ -80,8 +80,7 @@ class MontezumaEngine(TurnEngine):
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         emulator, state = self._emulators[number], self.n_states
-        reward = emulator.step(action)
-        over, ram = emulator.over(), bytes(emulator.ram())
+        reward, over, ram = emulator.play(action)
         alive = not over and ram[DYING] == 0
         self._keep(state, emulator.seen)
         self._positions += bytes((ram[ROOM], ram[X], ram[Y]))
