@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hypogoal.hypotheses.trial import StepCost
 
 BASE = 400e6  # a process with torch, before it does anything
-AHEAD = 150e6  # the process that plays ahead, without torch
+AHEAD = 100e6  # the process that plays ahead, without torch: 82 MB with sixteen games
 MEMBER = 8e6  # weights of a member with the user's network, which is not run
 WINDOWS = 6e6  # a member's cached windows (hypotheses.known_windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
