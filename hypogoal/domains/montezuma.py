@@ -20,6 +20,7 @@ from hypogoal.core.config import setting
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
+from hypogoal.domains.montezuma_ahead import AheadEngine
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observed_pixel, picture, pixel
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS
@@ -133,7 +134,7 @@ class MontezumaDomain(Domain):
     config_class = MontezumaConfig
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(ladder.name for ladder in LADDERS)
-    many_starts = True
+    many_starts = plays_ahead = True
     packed = 20  # 24 measured
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
@@ -228,14 +229,16 @@ class MontezumaDomain(Domain):
         max_steps: int = MAX_STEPS,
         *,
         start: str = LADDERS[0].name,
+        play_ahead: bool = False,
         **arguments: Any,
     ) -> MontezumaEngine:
-        """An engine of ``count`` games that begin at the ladder ``start``.
+        """An engine of ``count`` games that begin at the ladder ``start``, with ``play_ahead`` in a second process.
 
         The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``. Other
         arguments as for ``MontezumaEngine``.
         """
-        return MontezumaEngine(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
+        kind = AheadEngine if play_ahead else MontezumaEngine
+        return kind(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
 
     def task(self, world: Mapping[str, Any]) -> str:
         return "Climb down a ladder to its base; options begin at its top, and a lost life ends the episode."

@@ -56,15 +56,18 @@ class MontezumaEngine(TurnEngine):
         self.count, self.max_steps, self.end_at_death = count, max_steps, end_at_death
         self.memory: int = memory
         self.room = memory
-        self._emulators = [game.Emulator(seed + number) for number in range(count)]
-        ladders = map(ladder_named, start.split(","))
-        starts = [make_starts(self._emulators[0], ladder, start_states, seed) for ladder in ladders]
+        self._emulators = self._make_emulators(seed)
+        emulator, ladders = game.Emulator(seed), map(ladder_named, start.split(","))
+        starts = [make_starts(emulator, ladder, start_states, seed) for ladder in ladders]
         self.starts: list[Start] = [*chain(*starts)]
         self._rng = rng_for(seed, "start-of-episode")
         self._ring: list[game.Frames] = []  # four states' stacks share a frame in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
+
+    def _make_emulators(self, seed: int) -> list[Any]:
+        return [game.Emulator(seed + number) for number in range(self.count)]
 
     @property
     def n_states(self) -> int:
@@ -77,9 +80,7 @@ class MontezumaEngine(TurnEngine):
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         emulator, state = self._emulators[number], self.n_states
-        reward = emulator.step(action)
-        over = emulator.ale.game_over()
-        ram = emulator.ram().tobytes()
+        reward, over, ram = emulator.play(action)
         alive = not over and ram[DYING] == 0
         self._keep(state, emulator.seen)
         self._positions += bytes((ram[ROOM], ram[X], ram[Y]))

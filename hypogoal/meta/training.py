@@ -19,6 +19,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.core.workers import CORES, allowed
 from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
@@ -163,26 +164,34 @@ def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termin
 
 
 def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
-    """Spec D4, H6: an engine's arguments for where episodes begin; none where there is only one place and layout.
+    """Spec D4, H6: an engine's arguments: where episodes begin, and ``play_ahead``; none where nothing is chosen.
 
-    An unknown start, no start where the domain has several, or layouts where it has one is a ``UserError``.
+    An unknown start, no start where the domain has several, layouts where it has one, or ``play_ahead`` where nothing
+    can play ahead is a ``UserError``.
     """
-    layouts: dict[str, Any] = {}
+    more: dict[str, Any] = {}
+    if isinstance(config, TrainOptionsConfig) and config.play_ahead:
+        if not domain.plays_ahead:
+            what = "an engine of this domain plays in the process that learns"
+            raise UserError(what, f"{domain.name}, play_ahead=true", "Leave it out.")
+        if allowed(2) < 2:
+            raise UserError("play_ahead needs two cores, one is allowed here", f"{CORES}=1", "Leave it out.")
+        more["play_ahead"] = True
     if config.layouts.strip():
         if not domain.many_layouts:
             raise UserError(ONE_LAYOUT, f"{domain.name}, layouts={config.layouts}", "Leave it out.")
         seeds = layout_seeds(config.layouts, config.layout_seed)
-        layouts["layouts"] = Layouts(seeds, rng_for(seed, "layouts") if len(seeds) > 1 else None)
+        more["layouts"] = Layouts(seeds, rng_for(seed, "layouts") if len(seeds) > 1 else None)
     if not domain.starts:
         if config.start:
             raise UserError(f"{domain.name} has no named starts", f"start={config.start}", "Leave it out.")
-        return layouts
+        return more
     for start in config.start.split(",") if domain.many_starts else [config.start]:
         if start not in domain.starts:
             fault = "unknown start" if start else "where are episodes to begin?"
             raise UserError(fault, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
-    return {"start": config.start, "memory": memory, "seed": seed, **layouts}
+    return {"start": config.start, "memory": memory, "seed": seed, **more}
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:
