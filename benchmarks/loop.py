@@ -32,6 +32,7 @@ from hypogoal.cli import main as hypogoal  # noqa: E402
 
 LAYOUT = 100
 WANTED = {"train-meta": 15.0}
+HALF = "update_interval=16"  # the default of other domains
 WANTED_SHARE = 0.1  # of verdicts, at most
 CLIMBING = {"train-options at a ladder": (), "policy_pixels=half": ("policy_pixels=half",)}
 WANTED_OF_CEILING = dict.fromkeys(CLIMBING, 0.8)
@@ -66,10 +67,10 @@ def baseline(algorithm: str, steps: int) -> float:
     return per_step(steps, lambda: agent.learn(steps))
 
 
-def meta(ensemble: Path, steps: int, folder: Path, shares: list[float]) -> float:
-    """An environment step of ``train-meta`` on DoorKey, CPU seconds; adds the share of verdicts in them to ``shares``.
+def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: str) -> float:
+    """An environment step of ``train-meta`` on DoorKey with ``more`` settings, CPU seconds.
 
-    The loop alone: start-up and the measures at the end are not counted.
+    The share of verdicts in them goes to ``shares``. The loop alone: start-up and the measures at the end are not counted.
     """
     from hypogoal.meta import training
     from hypogoal.options.termination import Terminations
@@ -91,7 +92,7 @@ def meta(ensemble: Path, steps: int, folder: Path, shares: list[float]) -> float
         training.train(*given)
         played = time.process_time() - begin
 
-    changes = ("--set", "random_episodes=1", "--set", f"steps={steps}")
+    changes = (word for pair in ("random_episodes=1", f"steps={steps}", *more) for word in ("--set", pair))
     with patch.object(Terminations, "of", of), patch.object(train_meta, "train", train):
         out = folder / f"out-{time.monotonic_ns()}"
         quietly("train-meta", ensemble, "--layout-seed", LAYOUT, "--out", out, *changes)
@@ -145,6 +146,7 @@ def main() -> None:
                 "PPO, stable-baselines3 on MiniGrid": lambda: baseline("ppo", theirs),
                 "DQN, stable-baselines3 on MiniGrid": lambda: baseline("dqn", theirs),
                 "train-meta": lambda: meta(folder / "ensemble", ours, folder, shares),
+                "train-meta, half the updates": lambda: meta(folder / "ensemble", ours, folder, [], HALF),
             },
             repeats,
         )
