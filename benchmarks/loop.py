@@ -70,7 +70,7 @@ def baseline(algorithm: str, steps: int) -> float:
 def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: str) -> float:
     """An environment step of ``train-meta`` on DoorKey with ``more`` settings, CPU seconds.
 
-    The share of verdicts in them goes to ``shares``. The loop alone: start-up and the measures at the end are not counted.
+    The share of verdicts goes to ``shares``. The loop alone: start-up and the measures at the end are not counted.
     """
     from hypogoal.meta import training
     from hypogoal.options.termination import Terminations
