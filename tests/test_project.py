@@ -142,7 +142,7 @@ def test_versions_of_python_are_those_that_are_tested() -> None:
     told = {
         name for path in PACKAGE.rglob("*.py") for name in re.findall(r"hypogoal\[(\w+)\]", path.read_text("utf-8"))
     }
-    assert told == {"montezuma", "tensorboard"} and told <= PROJECT["optional-dependencies"].keys()
+    assert told == {"lerobot", "montezuma", "tensorboard"} and told <= PROJECT["optional-dependencies"].keys()
 
 
 def test_an_old_numpy_is_told_in_a_line(tmp_path: Path) -> None:

@@ -457,7 +457,7 @@ def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.Ca
         (save_minari(tmp_path / "d", stored="arrow"), label, "'arrow' is not read"),
         (save_minari(tmp_path / "e", 2), label, "2 episodes cannot be"),
         (save_minari(tmp_path / "f"), [*label, "--key", "x"], "no readable 'episode_0/observations/x'"),
-        (save_images(tmp_path / "g"), label, "not a Minari dataset"),
+        (save_images(tmp_path / "g"), label, "this is no recording"),
         (
             save_minari(tmp_path / "h"),
             ["--label", "right=test_import:fails"],
