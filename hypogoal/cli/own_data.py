@@ -60,7 +60,7 @@ def import_(
     longest = {name: int(size) for name, size in sizes.items() if int(size)}
     with own_code.given(*labels.values()):
         counts = stage(
-            source, out, sub_goals=sub_goal or (), labels=labels, keys=[name for name in key or () if name], share=heldout,
+            source, out, sub_goals=sub_goal or (), labels=labels, keys=[*filter(None, key or ())], share=heldout,
             resize=longest if {*longest} - {""} else longest.get("", 0), every=every, stack=stack, domain=domain,
             seed=seed, force=force,
         )  # fmt: skip

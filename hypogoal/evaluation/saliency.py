@@ -64,13 +64,12 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
         group = work.arrays[f"saliency/{sub_goal}"]
         values = explanation_of_states.values.astype(np.float32)
         if seen.dtype.names:
-            parts = by_key(values, seen.dtype)
-            cameras = [key for key, (dtype, _) in fields_of((), seen.dtype).items() if dtype == PICTURE]
-            for camera in cameras:
-                group[f"maps/{camera}"] = parts[camera][0]
-            rows = [parts[key].reshape(*values.shape[:2], -1) for key in seen.dtype.names]
-            sums = [row.sum(-1, keepdims=True) if key in cameras else row for key, row in zip(seen.dtype.names, rows)]
-            values = np.concatenate(sums, axis=-1)
+            parts, rows = by_key(values, seen.dtype), []
+            for key, (dtype, _) in fields_of((), seen.dtype).items():
+                rows.append(parts[key].reshape(*values.shape[:2], -1))
+                if dtype == PICTURE:
+                    group[f"maps/{key}"], rows[-1] = parts[key][0], rows[-1].sum(-1, keepdims=True)
+            values = np.concatenate(rows, axis=-1)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
         for name, part in [*parts_of(seen, "seen"), *parts_of(baseline[None], "baseline")]:
             group[name] = part if seen.dtype.names or name == "seen" else part[0]

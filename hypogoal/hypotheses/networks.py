@@ -189,13 +189,18 @@ def build_network(
     take, for example images too small for it, are a ``UserError``.
     """
     where = f"observation shape {tuple(observation_shape)}"
+    parts_of: Callable[[tuple[int, ...]], Parts]
     if dtype.names:
         fields = fields_of((), dtype).values()
         names = zip(names_in(network_for(name, dtype)), fields, strict=True)
         encoders = [build_network(of_key, shape, generator)[:-1] for of_key, (_, shape) in names]
         by_key = ByKey([as_input(torch.zeros(1, *shape)).shape[1:] for _, shape in fields], encoders)
-        parts_of: Callable[[tuple[int, ...]], Parts] = lambda _: ([by_key], () if hidden_width else (JOINT,))
         sizes = torch.Size([values_in((), dtype)])
+
+        def joined(_shape: tuple[int, ...]) -> Parts:
+            return [by_key], () if hidden_width else (JOINT,)
+
+        parts_of = joined
     else:
         parts_of = load_network(name)
         sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]

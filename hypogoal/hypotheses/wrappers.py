@@ -87,17 +87,17 @@ class SubgoalReward:
 
     def decide(self, predictions: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """What members' predictions (N, K) make together: bool (N,)."""
-        rules = {"any": predictions.any, "all": predictions.all}
-        if self.by == "vote":
-            return np.asarray(predictions.mean(1) > 0.5)
-        return rules[self.by](axis=1) if isinstance(self.by, str) else predictions[:, self.by]
+        if not isinstance(self.by, str):
+            return np.asarray(predictions[:, self.by])
+        members = predictions.shape[1]
+        return np.asarray(predictions.sum(1) >= {"any": 1, "vote": members // 2 + 1, "all": members}[self.by])
 
     def wrap(self, env: Env, *, scale: float = 1.0, add: bool = False, ends: bool = True) -> RewardedEnv:
         """An environment that pays ``scale`` where the sub-goal holds, else 0.
 
-        ``add``: that is added to its own reward instead of replacing it. ``ends``: its episode terminates there; else an
-        agent can stay where it is rewarded. ``info["subgoal"]`` is whether the sub-goal holds. An environment with other
-        observations than those of training is a ``UserError``.
+        ``add``: that is added to its own reward instead of replacing it. ``ends``: its episode terminates there; else
+        an agent can stay where it is rewarded. ``info["subgoal"]`` is whether the sub-goal holds. An environment with
+        other observations than those of training is a ``UserError``.
         """
         return RewardedEnv(env, self, scale=scale, add=add, ends=ends)
 

@@ -56,8 +56,7 @@ def read_arrays(path: Path) -> Parts:
         if name in arrays and arrays[name].dtype.kind != "U":
             raise UserError(f"{name} are {arrays[name].dtype}, not texts", path, "Give numpy.array of str.")
     named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
-    values: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
-    return Parts(**values, **named)
+    return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, **named)
 
 
 def read_states(path: Path) -> Observations:

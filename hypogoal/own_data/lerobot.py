@@ -34,7 +34,7 @@ ALWAYS = ("episode_index", "timestamp")  # columns of every table
 
 
 class Episode(NamedTuple):
-    """What ``meta/`` says: files relative to the dataset, by video key or "" of the table; where in a video it begins."""
+    """What ``meta/`` says: its table, under "", and its videos by key; where in a video it begins."""
 
     number: int
     length: int
@@ -65,8 +65,8 @@ class LeRobot(Recording):
         for key in chosen:
             kind, shape = self._kinds[key], shapes[key]
             if kind in PICTURES and len(shape) == 3:
-                height, width = shape[1:] if shape[0] == 3 != shape[2] else shape[:2]
-                sides = shrunk_sides(height, width, resize_of(resize, key, picture=True))
+                size = shape[1:] if shape[0] == 3 != shape[2] else shape
+                sides = shrunk_sides(size, resize_of(resize, key, picture=True))
                 self.fields[key] = (PICTURE, (*sides, 3))
             elif re.fullmatch(r"float\d+|u?int\d+|bool", kind):
                 self.fields[key] = (NUMBERS, shape or (1,))
@@ -181,7 +181,7 @@ class LeRobot(Recording):
 
 
 def _filled(template: str, values: Mapping[str, object]) -> str:
-    """A path by a template such as ``file-{file_index:03d}``; no other formats, which could ask for more than values."""
+    """A path by a template such as ``file-{file_index:03d}``; other formats could ask for more than values."""
     return PLACE.sub(lambda place: str(values[place[1]]).zfill(int(place[2] or 0)), template)
 
 

@@ -1,4 +1,4 @@
-"""Members of a sub-goal with torch and safetensors alone: ``load("door-open")(observations)`` -> probabilities (N, K)."""
+"""Members of a sub-goal, with torch and safetensors alone: ``load("door-open")(observations)`` -> P (N, K)."""
 
 import json
 from collections.abc import Callable

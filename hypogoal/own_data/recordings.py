@@ -88,7 +88,9 @@ def recorded_parts(recording: Recording, rules: Mapping[str, str], *, every: int
         do = "Give --label NAME=COLUMN, NAME=last:N or NAME=TABLE.csv."
         raise UserError("nothing says where the sub-goal holds", recording.path, do)
     by_goal = [_marks(recording, rule) for rule in rules.values()]
-    labels = [np.stack(marks, 1) if all(mark is not None for mark in marks) else None for marks in zip(*by_goal)]
+    labels = [
+        np.stack(marks, 1) if all(mark is not None for mark in marks) else None for marks in zip(*by_goal, strict=True)
+    ]
     listed = [episode for episode, marks in enumerate(labels) if marks is not None]
     parts = split_episodes(len(labels), listed, seed, recording.path)
     frames = [kept(length, every) for length in recording.lengths]
@@ -136,24 +138,20 @@ def split_episodes(
 
 def _marks(recording: Recording, rule: str) -> list[NDArray[np.bool_] | None]:
     """Which frames of each episode are positive, bool (T,); None for an episode that a table does not list."""
-    episodes = range(len(recording.names))
     if rule.endswith(TABLE):
         return _listed(recording, Path(rule))
     if rule.startswith(LAST):
         count = rule.removeprefix(LAST)
         if not count.isdecimal() or not int(count):
             raise UserError("the number of last frames is not above 0", rule, "Give last:10, for example.")
-        lengths = [length if recording.succeeded(at) else 0 for at, length in zip(episodes, recording.lengths)]
-        return [
-            (np.arange(length) >= length - int(count)) & (np.arange(length) < succeeded)
-            for length, succeeded in zip(recording.lengths, lengths, strict=True)
-        ]
+        last = [(np.arange(length) >= length - int(count)) for length in recording.lengths]
+        return [mark & recording.succeeded(episode) for episode, mark in enumerate(last)]
     if rule not in recording.columns:
         known = ", ".join(recording.columns) or "none"
         do = meant(rule, recording.columns) or f"Its columns are {known}; last:N and TABLE.csv label, too."
         raise UserError(f"no column {rule!r} to label by", recording.path, do)
     marks: list[NDArray[np.bool_] | None] = []
-    for episode in episodes:
+    for episode in range(len(recording.names)):
         values = np.asarray(recording.column(episode, rule))
         fits = values.dtype.kind in "biuf" and values.size == recording.lengths[episode]
         if not fits or not np.isfinite(values).all():

@@ -37,7 +37,9 @@ class Robomimic(Recording):
             self.lengths = []
             for name in self.names:
                 parts = [checked(file, f"data/{name}/obs/{key}", KINDS) for key in chosen]
-                same = all((part.dtype, part.shape[1:]) == self._shapes[key] for key, part in zip(chosen, parts))
+                same = all(
+                    (part.dtype, part.shape[1:]) == self._shapes[key] for key, part in zip(chosen, parts, strict=True)
+                )
                 if not same or len({part.shape[:1] for part in parts}) != 1 or not parts[0].shape[0]:
                     raise UserError(
                         "its observations differ in shape or number", f"{path}, {name}", "Leave a --key out."
@@ -48,7 +50,7 @@ class Robomimic(Recording):
         self.fields = {}
         for key, (dtype, shape) in self._shapes.items():
             if picture := dtype == PICTURE and len(shape) == 3:
-                shape = (*shrunk_sides(*shape[:2], resize_of(resize, key, picture=True)), shape[2])
+                shape = (*shrunk_sides(shape, resize_of(resize, key, picture=True)), shape[2])
             self.fields[key] = (PICTURE if picture else NUMBERS, shape or (1,))
 
     def column(self, episode: int, name: str) -> NDArray[Any]:

@@ -13,6 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.observations import shrunk_sides
+from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.images import MOST_PIXELS
 from hypogoal.own_data.parts import Resize, resize_of
 from hypogoal.own_data.recordings import Frames, Recording, kept, store
@@ -42,7 +43,7 @@ def _opened(path: Path, work: Callable[[Any, Any], Any]) -> Any:
                 if stream.width * stream.height > MOST_PIXELS:
                     raise UserError(f"the video has {stream.width} x {stream.height} pixels, too many", path, DO)
                 return work(container, stream)
-        except (av.FFmpegError, IndexError, ValueError, MemoryError, EOFError):
+        except (av.FFmpegError, *DAMAGED, IndexError, AttributeError):
             raise UserError("this is no mp4 file, or it is damaged", path, DO) from None
 
 
@@ -89,7 +90,7 @@ class Videos(Recording):
         self.lengths = [length for *_, length in seen]
         if empty := [str(file) for file, length in zip(self._files, self.lengths, strict=True) if not length]:
             raise UserError("a video has no frames", empty[0], DO)
-        sides = shrunk_sides(*seen[0][:2], resize_of(resize, KEY, picture=True))
+        sides = shrunk_sides(seen[0], resize_of(resize, KEY, picture=True))
         self.fields = {KEY: (PICTURE, (*sides, 3))}
 
     def column(self, episode: int, name: str) -> NDArray[Any]:

@@ -34,8 +34,8 @@ pipeline_tag: image-classification
 
 # Does the sub-goal hold? {count} hypotheses of {goals}
 
-Members of an ensemble (hypogoal {version}, diversity {diversity}): each is a hypothesis, from labels of one context, about
-what makes the sub-goal. They agree on those labels and may differ elsewhere; a policy that optimises one finds its errors.
+Members of an ensemble (hypogoal {version}, diversity {diversity}), each a hypothesis, from labels of one context, about
+what makes the sub-goal. They agree on those labels, not elsewhere; a policy that optimises one finds its errors.
 
 Observations (N, ...): {observations}
 
@@ -71,7 +71,7 @@ def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
             save_tensors(work.files / f"{goal}.safetensors", {name: part.clone() for name, part in state.items()})
             thresholds[goal] = [round(float(threshold), 6) for threshold in ensemble.thresholds]
         observations = {key: [str(kind), list(shape)] for key, (kind, shape) in _fields(ensemble).items()}
-        layers = _described(members[0], source)
+        layers = _described(members[0].children(), source)
         facts = {"format": 1, "members": len(members), "thresholds": thresholds, "observations": observations}
         (work.files / "config.json").write_text(
             json.dumps(facts | {"layers": layers}, indent=1) + "\n", encoding="utf-8"
@@ -104,7 +104,7 @@ def _described(layers: Iterable[nn.Module], source: Path) -> list[Any]:
     rows: list[Any] = []
     for layer in layers:
         if isinstance(layer, ByKey):
-            encoders = [_described(encoder, source) for encoder in layer.encoders]
+            encoders = [_described(encoder.children(), source) for encoder in layer.encoders]
             rows.append(["ByKey", {"shapes": [list(shape) for shape in layer.shapes], "encoders": encoders}])
             continue
         if type(layer) not in ARGUMENTS:

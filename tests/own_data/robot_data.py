@@ -25,7 +25,7 @@ TOP, WRIST, STATE = "observation.images.top", "observation.images.wrist", "obser
 
 def places(episode: int) -> np.ndarray:
     """Where the light is in each frame, 0 to 1."""
-    return np.linspace(0.05, 0.6 + 0.05 * episode, LENGTHS[episode]).astype(np.float32)
+    return np.linspace(0.05 + 0.0031 * episode, 0.6 + 0.0517 * episode, LENGTHS[episode]).astype(np.float32)
 
 
 def picture(camera: str, place: float, episode: int) -> np.ndarray:
@@ -56,7 +56,7 @@ def columns(episode: int, first: int) -> dict[str, Any]:
     """An episode's columns of numbers; the third episode fails."""
     count, at = LENGTHS[episode], places(episode)
     success = (at > 0.5) & (episode != 2)
-    numbers = {
+    return {
         STATE: pa.array(np.stack([at, 1 - at, at**2], 1).tolist(), pa.list_(pa.float32(), 3)),
         "action": pa.array([[0.0, 1.0]] * count, pa.list_(pa.float32(), 2)),
         "timestamp": pa.array((np.arange(count) / FPS).astype(np.float32)),
@@ -67,7 +67,6 @@ def columns(episode: int, first: int) -> dict[str, Any]:
         "next.reward": pa.array(success.astype(np.float32)),
         "next.success": pa.array(success),
     }
-    return numbers
 
 
 def facts(version: str, kind: str) -> dict[str, Any]:
@@ -106,9 +105,9 @@ def cells(camera: str, episode: int) -> pa.Array:
     return pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
 
 
-def write_table(path: Path, rows: dict[str, Any]) -> None:
+def write_table(path: Path, table: pa.Table) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.table(rows), path)
+    pq.write_table(table, path)
 
 
 def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> Path:
@@ -127,15 +126,13 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> P
         lines = [{"episode_index": at, "tasks": ["reach"], "length": LENGTHS[at]} for at in episodes]
         (folder / "meta" / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         for episode, table in enumerate(tables):
-            write_table(
-                folder / f"data/chunk-000/episode_{episode:06d}.parquet", dict(zip(table.column_names, table.columns))
-            )
+            write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
             for key, camera in cameras.items() if kind == "video" else ():
                 frames = [picture(camera, place, episode) for place in places(episode)]
                 write_video(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames)
         return folder
     table = pa.concat_tables(tables)
-    write_table(folder / "data/chunk-000/file-000.parquet", dict(zip(table.column_names, table.columns)))
+    write_table(folder / "data/chunk-000/file-000.parquet", table)
     listed: list[dict[str, Any]] = []
     for episode in episodes:
         row: dict[str, Any] = {"episode_index": episode, "tasks": ["reach"], "length": LENGTHS[episode]}
@@ -147,9 +144,7 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> P
             row |= {f"videos/{key}/chunk_index": 0, f"videos/{key}/file_index": file}
             row |= {f"videos/{key}/from_timestamp": begin, f"videos/{key}/to_timestamp": begin + LENGTHS[episode] / FPS}
         listed.append(row)
-    write_table(
-        folder / "meta/episodes/chunk-000/file-000.parquet", {key: [row[key] for row in listed] for key in listed[0]}
-    )
+    write_table(folder / "meta/episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(listed))
     for key, camera in cameras.items() if kind == "video" else ():
         for file in (0, 1):
             some = [(at, place) for at in episodes if at // 3 == file for place in places(at)]

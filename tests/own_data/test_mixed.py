@@ -150,10 +150,12 @@ def test_an_agent_learns_from_cameras_and_numbers(run: Path, agent: type[PPO] | 
     reward = hypogoal.SubgoalReward(run / "ensemble", by="all")
     env = reward.wrap(DoorEnv(), ends=False)
     short = (
-        {"n_steps": 64} if agent is PPO else {"learning_starts": 50, "buffer_size": 500, "exploration_fraction": 0.5}
+        {"n_steps": 64, "max_grad_norm": 2.0}
+        if agent is PPO
+        else {"learning_starts": 50, "buffer_size": 500, "exploration_fraction": 0.5}
     )
     learner = agent("MultiInputPolicy", env, batch_size=32, learning_rate=1e-3, seed=0, gamma=0.5, **short)  # type: ignore[arg-type]
-    learner.learn(256)
+    learner.learn(448)
     observation, _ = env.reset(seed=1)
     earned = 0.0
     for _ in range(8):
@@ -222,13 +224,13 @@ def test_cameras_are_resized_each(tmp_path: Path) -> None:
 )
 def test_a_type_that_no_file_has_is_refused(text: str) -> None:
     """Spec G2, H8: what a file says of its types is checked."""
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=r"."):
         type_of(text)
 
 
 def test_a_type_has_no_impossible_sizes() -> None:
     for shape in ((0,), (1 << 17,), (2.5,), ()):
-        with pytest.raises(ValueError):
+        with pytest.raises(ValueError, match="uint8"):
             mixed_type({"a": (np.dtype(np.uint8), shape)})  # type: ignore[dict-item]
 
 
