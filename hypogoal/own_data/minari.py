@@ -93,10 +93,9 @@ def _number(name: str) -> int:
 
 def _labels(labels: Sequence[Label], states: Source) -> NDArray[np.bool_]:
     """The functions' labels of each observation, bool (N, G)."""
-    by_key = isinstance(states, Mapping)
-    observations = (
-        [dict(zip(states, row, strict=True)) for row in zip(*states.values(), strict=True)] if by_key else states
-    )
+    observations: Any = states
+    if isinstance(states, Mapping):
+        observations = [dict(zip(states, row, strict=True)) for row in zip(*states.values(), strict=True)]
     truths = np.empty((len(observations), len(labels)), np.bool_)
     for column, label in enumerate(labels):
         with UsersCode(f"the label function {getattr(label, '__name__', column)}", label) as code:
