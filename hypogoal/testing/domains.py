@@ -324,8 +324,9 @@ class _Contract:
         from hypogoal.hypotheses.networks import build_network, network_for
 
         name = self.domain.defaults.get("train-ensemble", {}).get("network", EnsembleConfig().network)
-        name = network_for(name, self.domain.observation_dtype)
-        build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"))
+        dtype = self.domain.observation_dtype
+        name = network_for(name, dtype)
+        build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"), dtype=dtype)
         return f"member network {name!r} takes the observations"
 
     def never_reached(self, goal: str, always: bool) -> str:

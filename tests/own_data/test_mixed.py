@@ -147,15 +147,13 @@ def test_the_environments_dictionary_is_read_in_any_order(run: Path) -> None:
 @pytest.mark.parametrize("agent", [PPO, DQN])
 def test_an_agent_learns_from_cameras_and_numbers(run: Path, agent: type[PPO] | type[DQN]) -> None:
     """Spec D1, I6: stable-baselines3's MultiInputPolicy, rewarded by the members alone, opens the door."""
-    reward = hypogoal.SubgoalReward(run / "ensemble", by="all")
+    reward = hypogoal.SubgoalReward(run / "ensemble", by="any")
     env = reward.wrap(DoorEnv(), ends=False)
     short = (
-        {"n_steps": 64, "max_grad_norm": 2.0}
-        if agent is PPO
-        else {"learning_starts": 50, "buffer_size": 500, "exploration_fraction": 0.5}
+        {"n_steps": 64} if agent is PPO else {"learning_starts": 50, "buffer_size": 500, "exploration_fraction": 0.5}
     )
     learner = agent("MultiInputPolicy", env, batch_size=32, learning_rate=1e-3, seed=0, gamma=0.5, **short)  # type: ignore[arg-type]
-    learner.learn(448)
+    learner.learn(320)
     observation, _ = env.reset(seed=1)
     earned = 0.0
     for _ in range(8):
