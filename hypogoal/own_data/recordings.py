@@ -16,7 +16,7 @@ from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import PICTURE, Fields, Observations, mixed_type
+from hypogoal.dataset import Fields, Observations, mixed_type
 from hypogoal.domains.observations import shrunk_picture
 from hypogoal.own_data.parts import Parts, require_memory
 
@@ -24,30 +24,33 @@ SPLIT = (0.4, 0.4, 0.2)  # shares of episodes that are labelled, unlabelled and 
 LAST, TABLE = "last:", ".csv"  # how rules begin and end that are no columns
 COLUMNS = ("episode", "from", "to")  # of a table of positive frames; ``to`` is the first frame behind them
 SUCCESS = ("next.success", "success", "next.reward", "reward", "rewards")  # columns that say so, the first there is
-Frames = Mapping[str, Observations]  # by key, (rows, *shape) each, to be filled
 
 
 class Recording(ABC):
-    """Episodes of T frames each, whose frames are read last, each once."""
+    """Episodes of T frames each, whose observations are read last, each once."""
 
     path: Path
     names: Sequence[str]  # of the episodes
     lengths: Sequence[int]  # T of each
-    columns: Sequence[str]  # that can label frames
+    columns: Sequence[str] = ()  # that can label frames
     fields: Fields  # type and shape of what is read, by key, pictures as they will be stored
 
     @abstractmethod
     def column(self, episode: int, name: str) -> NDArray[Any]:
-        """A column's values for an episode's frames, (T,)."""
+        """A column's values for an episode's frames, (T, ...)."""
 
     @abstractmethod
-    def fill(self, frames: Mapping[int, Frames], every: int) -> None:
-        """Read the observations of episodes, the frames that :func:`kept` has of each, into their places."""
+    def fill(self, states: Mapping[int, Observations], every: int) -> None:
+        """Read the frames that :func:`kept` has of episodes into mixed ``states`` (rows,) of each."""
 
-    def succeeded(self, episode: int) -> bool:
-        """Whether the first of ``SUCCESS`` that there is, is above 0 anywhere in an episode; True without any."""
-        name = next((name for name in SUCCESS if name in self.columns), None)
-        return name is None or bool((self.column(episode, name) > 0).any())
+    def store(self, states: Observations, row: int, key: str, picture: NDArray[np.uint8], where: Path) -> None:
+        """Shrink a frame, uint8 (H, W, C), into its place; one of another size is a ``UserError``."""
+        wanted = self.fields[key][1]
+        small = shrunk_picture(picture, max(wanted[:2]))
+        if small.shape != wanted:
+            fault = f"a frame of {key} is {picture.dtype} {picture.shape}, which does not match the other frames"
+            raise UserError(fault, where, "Record it again, or leave that key out.")
+        states[key][row] = small
 
 
 def kept(length: int, every: int) -> NDArray[np.int64]:
@@ -56,25 +59,14 @@ def kept(length: int, every: int) -> NDArray[np.int64]:
 
 
 def chosen_keys(keys: Sequence[str], known: Sequence[str], path: Path) -> list[str]:
-    """The keys to read: all ``known`` ones if none are given; an unknown one is a ``UserError``."""
+    """The keys to read, all ``known`` ones if none are given; an unknown one is a ``UserError``."""
     for key in keys:
         if key not in known:
             do = meant(key, known) or f"It has {', '.join(known)}."
             raise UserError(f"no observation {key!r}", path, do)
-    if not (keys or known):
+    if not known:
         raise UserError("it has no observations", path, "Give a recording with some.")
     return sorted(set(keys or known))
-
-
-def store(places: Frames, key: str, row: int, picture: NDArray[Any], where: object) -> None:
-    """Shrink a frame, uint8 (H, W, C), into its place; of another size it is a ``UserError``."""
-    place = places[key]
-    longest = max(place.shape[1:3])
-    small = shrunk_picture(picture, longest) if max(picture.shape[:2]) > longest else picture
-    if small.shape != place.shape[1:] or small.dtype != PICTURE:
-        fault = f"a frame of {key} is {picture.dtype} {picture.shape}, which does not match the other frames"
-        raise UserError(fault, where, "Record it again, or leave that key out.")
-    place[row] = small
 
 
 def recorded_parts(recording: Recording, rules: Mapping[str, str], *, every: int = 1, seed: int = 0) -> Parts:
@@ -88,34 +80,27 @@ def recorded_parts(recording: Recording, rules: Mapping[str, str], *, every: int
         do = "Give --label NAME=COLUMN, NAME=last:N or NAME=TABLE.csv."
         raise UserError("nothing says where the sub-goal holds", recording.path, do)
     by_goal = [_marks(recording, rule) for rule in rules.values()]
-    labels = [
-        np.stack(marks, 1) if all(mark is not None for mark in marks) else None for marks in zip(*by_goal, strict=True)
-    ]
-    listed = [episode for episode, marks in enumerate(labels) if marks is not None]
-    parts = split_episodes(len(labels), listed, seed, recording.path)
+    listed = [episode for episode in range(len(recording.names)) if all(episode in marks for marks in by_goal)]
+    parts = split_episodes(len(recording.names), listed, seed, recording.path)
     frames = [kept(length, every) for length in recording.lengths]
-    ends = np.cumsum([len(frames[episode]) for part in parts for episode in part])
-    dtype = mixed_type(recording.fields)
-    only = next(iter(recording.fields.items())) if len(recording.fields) == 1 else None
+    order, dtype = np.concatenate(parts).tolist(), mixed_type(recording.fields)
+    ends = np.cumsum([len(frames[episode]) for episode in order])
     require_memory(int(ends[-1]) * dtype.itemsize, recording.path)
-    states = np.empty((ends[-1], *only[1][1]), only[1][0]) if only else np.empty(ends[-1], dtype)
-    places = dict(zip(np.concatenate(parts).tolist(), np.split(states, ends[:-1]), strict=True))
-    keys = recording.fields
-    recording.fill(
-        {episode: {key: rows if only else rows[key] for key in keys} for episode, rows in places.items()}, every
-    )
-    first, second = (sum(len(frames[episode]) for part in parts[:count] for episode in part) for count in (1, 2))
-
-    def of(part: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return np.concatenate([marks[frames[episode]] for episode in part if (marks := labels[episode]) is not None])
-
-    steps = [(recording.names[episode], int(frame)) for part in parts for episode in part for frame in frames[episode]]
-    begin = {"observations": 0, "unlabelled": first, "heldout_observations": second}
+    states: Any = np.empty(ends[-1], dtype)
+    recording.fill(dict(zip(order, np.split(states, ends[:-1]), strict=True)), every)
+    states = states[dtype.names[0]] if len(recording.fields) == 1 and dtype.names else states
+    labels = [
+        np.concatenate([np.stack([marks[episode] for marks in by_goal], 1)[frames[episode]] for episode in part])
+        for part in (parts[0], parts[2])
+    ]
+    names = [f"{recording.names[episode]}, frame {frame}" for episode in order for frame in frames[episode]]
+    first, second = len(labels[0]), len(states) - len(labels[1])
+    begins = {"observations": 0, "unlabelled": first, "heldout_observations": second}
 
     def name(field: str, row: int) -> str:
-        return "{}, frame {}".format(*steps[begin[field] + row])
+        return names[begins[field] + row]
 
-    split = states[:first], of(parts[0]), states[first:second], states[second:], of(parts[2])
+    split = states[:first], labels[0], states[first:second], states[second:], labels[1]
     return Parts(*split, sub_goals=tuple(rules), name=name)
 
 
@@ -125,70 +110,58 @@ def split_episodes(
     """The episodes that are labelled, unlabelled and held out; those that are not ``listed`` are unlabelled."""
     order = np.array(listed, dtype=np.int64)[rng_for(seed, "minari").permutation(len(listed))]
     others = np.setdiff1d(np.arange(count), order)
-    shares = np.array([SPLIT[0], SPLIT[1] * (not len(others)), SPLIT[2]])
-    needed = 2 if len(others) else 3
+    shares, needed = np.array([SPLIT[0], SPLIT[1] * (not len(others)), SPLIT[2]]), 2 if len(others) else 3
     if len(order) < needed:
         fault = f"{len(order)} episodes cannot be labelled, {'' if len(others) else 'unlabelled '}and held out"
         raise UserError(fault, where, f"Give {needed}, with labels.")
     ends = np.round(np.cumsum(shares)[:2] / shares.sum() * len(order)).astype(int)
-    low, high = (1, needed - 1), (len(order) - needed + 1, len(order) - 1)
-    labelled, unlabelled, heldout = np.split(order, np.clip(ends, low, high))
+    ends = np.clip(ends, (1, needed - 1), (len(order) - needed + 1, len(order) - 1))
+    labelled, unlabelled, heldout = np.split(order, ends)
     return labelled, np.concatenate([unlabelled, others]), heldout
 
 
-def _marks(recording: Recording, rule: str) -> list[NDArray[np.bool_] | None]:
-    """Which frames of each episode are positive, bool (T,); None for an episode that a table does not list."""
+def _marks(recording: Recording, rule: str) -> dict[int, NDArray[np.bool_]]:
+    """Which frames of each episode are positive, bool (T,); a table may leave episodes out."""
     if rule.endswith(TABLE):
         return _listed(recording, Path(rule))
+    lengths = dict(enumerate(recording.lengths))
     if rule.startswith(LAST):
-        count = rule.removeprefix(LAST)
-        if not count.isdecimal() or not int(count):
+        last = rule.removeprefix(LAST)
+        if not last.isdecimal() or not int(last):
             raise UserError("the number of last frames is not above 0", rule, "Give last:10, for example.")
-        last = [(np.arange(length) >= length - int(count)) for length in recording.lengths]
-        return [mark & recording.succeeded(episode) for episode, mark in enumerate(last)]
+        says = next((name for name in SUCCESS if name in recording.columns), "")
+        succeeded = {at: not says or bool((recording.column(at, says) > 0).any()) for at in lengths}
+        return {at: (np.arange(length) >= length - int(last)) & succeeded[at] for at, length in lengths.items()}
     if rule not in recording.columns:
-        known = ", ".join(recording.columns) or "none"
-        do = meant(rule, recording.columns) or f"Its columns are {known}; last:N and TABLE.csv label, too."
-        raise UserError(f"no column {rule!r} to label by", recording.path, do)
-    marks: list[NDArray[np.bool_] | None] = []
-    for episode in range(len(recording.names)):
-        values = np.asarray(recording.column(episode, rule))
-        fits = values.dtype.kind in "biuf" and values.size == recording.lengths[episode]
-        if not fits or not np.isfinite(values).all():
-            fault = f"the column {rule!r} of {recording.names[episode]} is not one number for each frame"
+        do = meant(rule, recording.columns) or f"Its columns are {', '.join(recording.columns) or 'none'}."
+        raise UserError(f"no column {rule!r} to label by", recording.path, f"{do} last:N and TABLE.csv label, too.")
+    marks = {at: recording.column(at, rule).reshape(-1) for at in lengths}
+    for at, values in marks.items():
+        if values.dtype.kind not in "biuf" or len(values) != lengths[at] or not np.isfinite(values).all():
+            fault = f"the column {rule!r} of {recording.names[at]} is not one number for each frame"
             raise UserError(fault, recording.path, "Give another.")
-        marks.append(values.reshape(-1) > 0)
-    return marks
+    return {at: values > 0 for at, values in marks.items()}
 
 
-def _listed(recording: Recording, table: Path) -> list[NDArray[np.bool_] | None]:
+def _listed(recording: Recording, table: Path) -> dict[int, NDArray[np.bool_]]:
     """Positive frames by a table: of each row those from ``from`` up to, not including, ``to``."""
     rows = csv.DictReader(io.StringIO(read_text(table, "the table of labels is", "Give a CSV file.")))
     if not {*COLUMNS} <= {*(rows.fieldnames or ())}:
-        raise UserError(
-            f"the table of labels lacks a column of {', '.join(COLUMNS)}", table, "Name them in its first line."
-        )
-    marks: list[NDArray[np.bool_] | None] = [None] * len(recording.names)
+        raise UserError(f"the table of labels lacks a column of {', '.join(COLUMNS)}", table, "Name them in line 1.")
+    marks: dict[int, NDArray[np.bool_]] = {}
     for number, row in enumerate(rows, 2):
         where, name = f"{table}, line {number}", str(row["episode"]).strip()
         if name not in recording.names:
-            raise UserError(
-                f"a label is of an unknown episode, {name!r}", where, f"Known are {_some(recording.names)}."
-            )
+            known = f"They are {recording.names[0]} to {recording.names[-1]}."
+            raise UserError(f"a label is of an unknown episode, {name!r}", where, known)
         episode = recording.names.index(name)
         length = recording.lengths[episode]
         try:
             first, end = int(row["from"]), int(row["to"])
+            if not 0 <= first <= end <= length:
+                raise ValueError(row)
         except (TypeError, ValueError):
-            raise UserError("a label has frames that are no integers", where, "Give from and to.") from None
-        if not 0 <= first <= end <= length:
-            fault = f"a label is of frames {first} up to {end}, episode {name} has {length}"
-            raise UserError(fault, where, "Give 0 <= from <= to <= its frames.")
-        mark = marks[episode]
-        marks[episode] = mark = np.zeros(length, np.bool_) if mark is None else mark
-        mark[first:end] = True
+            fault = f"a label is of frames {row['from']} up to {row['to']}, episode {name} has {length}"
+            raise UserError(fault, where, "Give integers, 0 <= from <= to <= its frames.") from None
+        marks.setdefault(episode, np.zeros(length, np.bool_))[first:end] = True
     return marks
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) < 6 else f"{', '.join(names[:3])}, ..., {names[-1]}"

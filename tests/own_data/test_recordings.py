@@ -245,11 +245,11 @@ def test_a_damaged_dataset_is_one_line(
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ("episode,from,to\n99,0,1\n", r"a label is of an unknown episode, '99': .*line 2. Known are 0, 1, 2, ..., 5."),
+        ("episode,from,to\n99,0,1\n", r"a label is of an unknown episode, '99': .*line 2. They are 0 to 5."),
         ("episode,from,to\n0,0,99\n", "a label is of frames 0 up to 99, episode 0 has 12"),
         ("episode,from,to\n0,5,2\n", "a label is of frames 5 up to 2"),
-        ("episode,from,to\n0,a,2\n", "frames that are no integers"),
-        ("episode,from,to\n0,1\n", "frames that are no integers"),
+        ("episode,from,to\n0,a,2\n", "a label is of frames a up to 2.* Give integers"),
+        ("episode,from,to\n0,1\n", "a label is of frames 1 up to None"),
         ("take,begin\n0,1\n", "lacks a column of episode, from, to"),
         ("episode,from,to\n0,1,2\n", "1 episodes cannot be labelled, and held out"),
     ],
