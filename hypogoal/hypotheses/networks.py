@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from math import prod
 from typing import Any, TypeAlias
@@ -28,6 +28,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
 from hypogoal.core.tensors import KEPT
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, values_in
+from hypogoal.hypotheses.load import ByKey
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
@@ -158,20 +159,6 @@ def _checked(name: str, function: Callable[..., Parts | nn.Module]) -> Callable[
         return [*parts]
 
     return checked
-
-
-class ByKey(nn.Module):
-    """An encoder for each key of mixed observations: :func:`as_input` (N, D) -> their outputs one after another."""
-
-    def __init__(self, shapes: Sequence[torch.Size], encoders: Iterable[nn.Module]):
-        super().__init__()
-        self.shapes, self.encoders = shapes, nn.ModuleList(encoders)
-
-    def forward(self, values: Tensor) -> Tensor:
-        """float32 (N, D) -> float32 (N, F)."""
-        parts = values.split([shape.numel() for shape in self.shapes], dim=1)
-        encoded = zip(self.encoders, parts, self.shapes, strict=True)
-        return torch.cat([encoder(part.reshape(-1, *shape)) for encoder, part, shape in encoded], dim=1)
 
 
 def build_network(

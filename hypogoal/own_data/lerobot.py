@@ -82,8 +82,8 @@ class LeRobot(Recording):
             lines = read_text(self.path / EPISODES.with_suffix(".jsonl"), "the list of episodes is", DO)
             rows = list(json_lines(lines.split("\n")))
         else:
-            files = sorted((self.path / EPISODES).glob("*/*.parquet"))
-            rows = [row for file in files for row in _table(file).to_pylist()]
+            lists = sorted((self.path / EPISODES).glob("*/*.parquet"))
+            rows = [row for file in lists for row in _table(file).to_pylist()]
         episodes = {}
         try:
             for row in rows:

@@ -1,7 +1,8 @@
 """An ensemble as a folder for a model hub, which torch and safetensors load without hypogoal (Spec I6)."""
 
+import inspect
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +13,18 @@ from hypogoal.core.drafts import draft, put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import fields_of
-from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.hypotheses.networks import ByKey, folded
+from hypogoal.hypotheses import load
+from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.views import FullView
-from hypogoal.own_data import load
 
-# What builds each layer again; BatchNorm is folded into convolutions.
-ARGUMENTS: dict[type[nn.Module], Sequence[str]] = {
-    nn.Conv2d: ("in_channels", "out_channels", "kernel_size", "stride", "padding", "dilation", "groups"),
-    nn.MaxPool2d: ("kernel_size", "stride", "padding"),
-    nn.AvgPool2d: ("kernel_size", "stride", "padding"),
-    nn.BatchNorm2d: ("num_features", "eps"),
-    nn.Linear: ("in_features", "out_features"),
-    nn.Flatten: ("start_dim", "end_dim"),
-    nn.ReLU: (),
-}
 CARD = """---
 library_name: hypogoal
-pipeline_tag: image-classification
 ---
 
-# Does the sub-goal hold? {count} hypotheses of {goals}
+# {count} hypotheses of {goals}
 
-Members of an ensemble (hypogoal {version}, diversity {diversity}), each a hypothesis, from labels of one context, about
-what makes the sub-goal. They agree on those labels, not elsewhere; a policy that optimises one finds its errors.
+Each member of this ensemble (hypogoal {version}, diversity {diversity}) is a hypothesis, from labels of one context,
+about what makes the sub-goal. They agree on those labels, not elsewhere; a policy that optimises one finds its errors.
 
 Observations (N, ...): {observations}
 
@@ -56,61 +45,46 @@ def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
     """
     artefact = open_artefact(source, "ensemble").whole()
     out = claim(out, kind="hub", inputs=[source], force=force)
-    config = artefact.config
-    goals = config["sub_goals"]
+    config, thresholds = artefact.config, {}
     with draft(out, {"kind": "hub"}, force=force) as work:
-        thresholds = {}
-        for goal in goals:
+        for goal in config["sub_goals"]:
             ensemble = read_ensemble(artefact.path, config, goal)
             if not isinstance(ensemble.view, FullView):
-                raise UserError(
-                    "members that see the agent's surroundings cannot be exported", source, "Train with view=full."
-                )
-            members = nn.ModuleList(map(_folded, ensemble.eval().members))
-            state = {**members.state_dict(), **{f"view.{name}": part for name, part in ensemble.view.named_buffers()}}
+                do = "Export those trained with view=full."
+                raise UserError("these members see the agent's surroundings, which only hypogoal cuts out", source, do)
+            members = nn.ModuleList(ensemble.members)
+            state = {**members.state_dict(), **dict(ensemble.view.named_buffers())}
             save_tensors(work.files / f"{goal}.safetensors", {name: part.clone() for name, part in state.items()})
             thresholds[goal] = [round(float(threshold), 6) for threshold in ensemble.thresholds]
-        observations = {key: [str(kind), list(shape)] for key, (kind, shape) in _fields(ensemble).items()}
         layers = _described(members[0].children(), source)
-        facts = {"format": 1, "members": len(members), "thresholds": thresholds, "observations": observations}
-        (work.files / "config.json").write_text(
-            json.dumps(facts | {"layers": layers}, indent=1) + "\n", encoding="utf-8"
-        )
-        (work.files / "load.py").write_text(Path(load.__file__).read_text(encoding="utf-8"), encoding="utf-8")
-        texts = [f"{f'`{key}` ' if key else ''}{kind} {tuple(shape)}" for key, (kind, shape) in observations.items()]
+        fields = fields_of(ensemble.observation_shape, ensemble.view.dtype)
+        observations = {key: [str(kind), list(shape)] for key, (kind, shape) in fields.items()}
+        facts = {"members": len(members), "thresholds": thresholds, "observations": observations, "layers": layers}
         card = CARD.format(
-            count=len(members), goals=", ".join(goals), first=goals[0], diversity=config["diversity"],
-            version=artefact.manifest["versions"]["hypogoal"], observations=", ".join(texts),
+            count=len(members), goals=", ".join(thresholds), first=next(iter(thresholds)), observations=observations,
+            diversity=config["diversity"], version=artefact.manifest["versions"]["hypogoal"],
         )  # fmt: skip
-        (work.files / "README.md").write_text(card, encoding="utf-8")
+        texts = {"config.json": json.dumps(facts, indent=1) + "\n", "README.md": card}
+        for name, text in (texts | {"load.py": Path(load.__file__).read_text(encoding="utf-8")}).items():
+            (work.files / name).write_text(text, encoding="utf-8")
         put_in_place(work.files, out)
 
 
-def _fields(ensemble: Ensemble) -> Any:
-    return fields_of(ensemble.observation_shape, ensemble.view.dtype)
-
-
-def _folded(network: nn.Module) -> nn.Sequential:
-    """A member with each BatchNorm folded into the convolution before it, in the encoders of keys, too."""
-    layers = folded(nn.Sequential(*network.children()))
-    for at, layer in enumerate(layers):
-        if isinstance(layer, ByKey):
-            layers[at] = ByKey(layer.shapes, map(_folded, layer.encoders))
-    return layers
-
-
 def _described(layers: Iterable[nn.Module], source: Path) -> list[Any]:
-    """Names and arguments of layers, for ``load.py``."""
+    """The names and arguments of layers, from which ``load.py`` builds them."""
     rows: list[Any] = []
     for layer in layers:
-        if isinstance(layer, ByKey):
+        kind = type(layer)
+        rest: dict[str, Any] = {}
+        if isinstance(layer, load.ByKey):
             encoders = [_described(encoder.children(), source) for encoder in layer.encoders]
-            rows.append(["ByKey", {"shapes": [list(shape) for shape in layer.shapes], "encoders": encoders}])
-            continue
-        if type(layer) not in ARGUMENTS:
-            fault = f"other programs cannot build the layer {type(layer).__name__}"
-            raise UserError(fault, source, "Train with a built-in network, such as doorkey.")
-        rest = {name: getattr(layer, name) for name in ARGUMENTS[type(layer)]}
-        bias = {"bias": layer.bias is not None} if isinstance(layer, nn.Conv2d | nn.Linear) else {}
-        rows.append([type(layer).__name__, rest | bias])
+            rest = {"shapes": [list(shape) for shape in layer.shapes], "encoders": encoders}
+        elif getattr(nn, kind.__name__, None) is not kind or [*layer.children()]:
+            fault = f"only hypogoal can build the layer {kind.__name__}"
+            raise UserError(fault, source, "Export members of a built-in network, such as doorkey.")
+        else:
+            arguments = {*inspect.signature(kind).parameters} & {*getattr(kind, "__constants__", ())}
+            rest = {name: getattr(layer, name) for name in sorted(arguments)}
+            rest |= {"bias": layer.bias is not None} if isinstance(layer, nn.Conv2d) else {}
+        rows.append([kind.__name__, rest])
     return rows

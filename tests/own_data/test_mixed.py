@@ -257,3 +257,24 @@ def test_a_folder_for_a_hub_loads_without_hypogoal(run: Path, tmp_path: Path) ->
     wanted = hypogoal.load_ensemble(run / "ensemble", GOAL).predict(seen)
     np.testing.assert_allclose(torch.load(tmp_path / "p.pt", weights_only=True).numpy(), wanted, atol=1e-5)
     assert main(["export", str(run / "ensemble"), "--out", str(hub), "--force"]) == 2
+
+
+def test_a_layer_that_others_cannot_build_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec G2, H6: of a network of the user's, for one key; nothing is written."""
+    (tmp_path / "half.py").write_text(
+        "from torch import nn\nclass Half(nn.Module):\n    def forward(self, x):\n        return x / 2\n"
+        "def half(channels):\n    return [Half(), nn.Conv2d(channels, 4, 8, 8), nn.ReLU()], (8,)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    np.savez(tmp_path / "own.npz", **arrays())
+    assert main(["import", str(tmp_path / "own.npz"), "--out", str(tmp_path / "d.h5"), "-q"]) == 0
+    words = ["--set", "network=wrist=half:half", "--set", "steps=2", "-q"]
+    assert main(["train-ensemble", str(tmp_path / "d.h5"), "--out", str(tmp_path / "e"), *words]) == 0
+    assert main(["export", str(tmp_path / "e"), "--out", str(tmp_path / "hub")]) == 2
+    assert "a file names code of its own as its network: half:half" in capsys.readouterr().err
+    monkeypatch.setenv("HYPOGOAL_TRUST", "half:half")
+    assert main(["export", str(tmp_path / "e"), "--out", str(tmp_path / "hub")]) == 2
+    assert "only hypogoal can build the layer Half" in capsys.readouterr().err
+    assert not (tmp_path / "hub").exists()

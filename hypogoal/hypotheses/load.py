@@ -1,7 +1,7 @@
 """Members of a sub-goal, with torch and safetensors alone: ``load("door-open")(observations)`` -> P (N, K)."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,11 @@ DEVIATIONS = 10.0  # numbers are clipped this far from their mean
 
 
 class ByKey(torch.nn.Module):
-    """An encoder for each key; what it gets are the inputs of all keys in a row, (N, D)."""
+    """An encoder for each key of mixed observations: inputs of all keys in a row, (N, D) -> their outputs (N, F)."""
 
-    def __init__(self, shapes: list[list[int]], encoders: list[Any]):
+    def __init__(self, shapes: Sequence[Sequence[int]], encoders: Iterable[torch.nn.Module]):
         super().__init__()
-        self.shapes, self.encoders = shapes, torch.nn.ModuleList(map(built, encoders))
+        self.shapes, self.encoders = shapes, torch.nn.ModuleList(encoders)
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
         """Encode each key's part."""
@@ -27,9 +27,12 @@ class ByKey(torch.nn.Module):
 
 
 def built(layers: list[Any]) -> torch.nn.Sequential:
-    """A network from names and arguments of its layers."""
+    """A network from the names and arguments of its layers."""
     return torch.nn.Sequential(
-        *(ByKey(**rest) if kind == "ByKey" else getattr(torch.nn, kind)(**rest) for kind, rest in layers)
+        *(
+            ByKey(rest["shapes"], map(built, rest["encoders"])) if kind == "ByKey" else getattr(torch.nn, kind)(**rest)
+            for kind, rest in layers
+        )
     )
 
 
@@ -37,7 +40,7 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
     """A function from observations (N, ...), or such arrays by key, to members' probabilities, float32 (N, K)."""
     config = json.loads((HERE / "config.json").read_text(encoding="utf-8"))
     state = load_file(HERE / f"{sub_goal}.safetensors")
-    standard = {name: state.pop(f"view.{name}") for name in ("mean", "deviation") if f"view.{name}" in state}
+    standard = [state.pop(name).flatten() for name in ("mean", "deviation") if name in state]
     members = torch.nn.ModuleList(built(config["layers"]) for _ in range(config["members"]))
     members.load_state_dict(state)
     members.eval()
@@ -49,13 +52,12 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
             if kind == "uint8":
                 values = values / 255
             else:
-                size = torch.Size(shape).numel()
-                mean, deviation = (standard[name].flatten()[place : place + size].view(shape) for name in standard)
-                values, place = ((values - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS), place + size
+                place += (size := torch.Size(shape).numel())
+                mean, deviation = (part[place - size : place].view(shape) for part in standard)
+                values = ((values - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS)
             values = values.permute(0, 3, 1, 2) if values.ndim == 4 else values
             rows.append(values.flatten(1) if key else values)
-        inputs = torch.cat(rows, dim=1)
         with torch.no_grad():
-            return torch.stack([member(inputs).softmax(-1)[:, 1] for member in members], dim=1)
+            return torch.stack([member(torch.cat(rows, dim=1)).softmax(-1)[:, 1] for member in members], dim=1)
 
     return predict
