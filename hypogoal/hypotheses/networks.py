@@ -176,25 +176,18 @@ def build_network(
     take, for example images too small for it, are a ``UserError``.
     """
     where = f"observation shape {tuple(observation_shape)}"
-    parts_of: Callable[[tuple[int, ...]], Parts]
+    parts_of = None if dtype.names else load_network(name)
     if dtype.names:
         fields = fields_of((), dtype).values()
         names = zip(names_in(network_for(name, dtype)), fields, strict=True)
         encoders = [build_network(of_key, shape, generator)[:-1] for of_key, (_, shape) in names]
         by_key = ByKey([as_input(torch.zeros(1, *shape)).shape[1:] for _, shape in fields], encoders)
-        sizes = torch.Size([values_in((), dtype)])
-
-        def joined(_shape: tuple[int, ...]) -> Parts:
-            return [by_key], () if hidden_width else (JOINT,)
-
-        parts_of = joined
-    else:
-        parts_of = load_network(name)
-        sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]
+        joined: Parts = [by_key], () if hidden_width else (JOINT,)
+    sizes = (values_in((), dtype),) if dtype.names else as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
         torch.manual_seed(seed)
-        layers, hidden = parts_of(observation_shape)
+        layers, hidden = parts_of(observation_shape) if parts_of else joined
         features = _features(layers, *sizes)
         if features is None:
             channels = observation_shape[-1]

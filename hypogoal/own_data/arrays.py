@@ -35,17 +35,12 @@ def read_arrays(path: Path) -> Parts:
 
     Missing, damaged or misnamed arrays, ones larger than memory, and pickled Python objects are a ``UserError``.
     """
-    arrays: dict[str, Any] = {}
-    for name, values in (_folder(path) if path.is_dir() else _file(path, others=False)).items():
+    arrays: dict[str, Any] = dict(_folder(path) if path.is_dir() else _file(path, others=False))
+    for name in [name for name in arrays if "/" in name]:
         base, _, key = name.partition("/")
-        if key:
-            arrays.setdefault(base, {})
-        if bool(key) != isinstance(arrays.get(base), dict):
+        if isinstance(arrays.setdefault(base, {}), np.ndarray):
             raise UserError(f"{base!r} is one array and several by key", path, "Give either.")
-        if key:
-            arrays[base][key] = values
-        else:
-            arrays[base] = values
+        arrays[base][key] = arrays.pop(name)
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
         do = f"Give arrays called {', '.join(NEEDED)}, and {' and '.join(OPTIONAL)} where there are some."

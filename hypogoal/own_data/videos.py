@@ -18,7 +18,7 @@ from hypogoal.domains.observations import shrunk_sides
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.images import MOST_PIXELS
 from hypogoal.own_data.parts import Resize, resize_of
-from hypogoal.own_data.recordings import Recording, kept
+from hypogoal.own_data.recordings import Recording, chosen_keys, kept
 
 DO = "Record or download it again."
 KEY, SUFFIX = "video", ".mp4"
@@ -71,17 +71,18 @@ def read_frames(
 class Videos(Recording):
     """A folder of mp4 files, an episode each, named by the file."""
 
-    def __init__(self, path: Path, resize: Resize = 0):
+    def __init__(self, path: Path, keys: Sequence[str] = (), resize: Resize = 0):
         self.path = path
+        chosen_keys(keys, [KEY], path)
         self._files = sorted(path.glob(f"[!.]*{SUFFIX}"))
         self.names = [file.stem for file in self._files]
         self._times: list[list[float]] = []
         for file in self._files:
             with _opened(file) as (container, stream):
-                times = [packet.pts * packet.time_base for packet in container.demux(stream) if packet.pts is not None]
-                if not times:
+                shown = [part for part in container.demux(stream) if part.pts is not None and not part.is_discard]
+                if not shown:
                     raise UserError("the video has no frames", file, DO)
-                self._times.append(sorted(map(float, times)))
+                self._times.append(sorted(float(packet.pts * packet.time_base) for packet in shown))
                 size = stream.height, stream.width
         self.lengths = [len(times) for times in self._times]
         self.fields = {KEY: (PICTURE, (*shrunk_sides(size, resize_of(resize, KEY, picture=True)), 3))}

@@ -82,7 +82,7 @@ def recording_of(source: Path, keys: Sequence[str], resize: Resize) -> Recording
         return LeRobot(source, keys, resize)
     if source.suffix in (".h5", ".hdf5"):
         return Robomimic(source, keys, resize)
-    return Videos(source, resize) if any(source.glob(f"*{SUFFIX}")) else None
+    return Videos(source, keys, resize) if any(source.glob(f"*{SUFFIX}")) else None
 
 
 def _too_small(domain: str, states: Collected) -> list[str]:

@@ -275,6 +275,7 @@ def test_labels_that_fit_no_frame_are_one_line(
         ("v3.0-image", [*LABEL, "--key", "observation.stat"], "no observation 'observation.stat'.*observation.state"),
         ("demo.hdf5", ["--label", "a=actions"], "no column 'actions' to label by"),
         ("demo.hdf5", ["--label", "a=rewards", "--key", "joint"], "no observation 'joint'"),
+        ("takes", ["--label", "a=last:3", "--key", "top"], "no observation 'top'.*It has video"),
         ("takes", ["--label", "a=rewards"], "no column 'rewards' to label by.*Its columns are none"),
         ("v3.0-image", [*LABEL, "--resize", "big"], "--resize needs a number of pixels"),
     ],
