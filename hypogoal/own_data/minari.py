@@ -45,12 +45,10 @@ def read_minari(folder: Path, labels: Sequence[Label], *, keys: Sequence[str] = 
     by_key = [{key: np.concatenate([of[i] for i in part]) for key, (_, of) in read.items()} for part in parts]
     labelled, unlabelled, heldout = (some if len(keys) > 1 else next(iter(some.values())) for some in by_key)
 
+    steps = [[f"{names[i]}, step {step}" for i in part for step in range(len(episodes[i]))] for part in parts]
+
     def name(field: str, row: int) -> str:
-        part = parts[("observations", "unlabelled", "heldout_observations").index(field)]
-        ends_of_episodes = np.cumsum([len(episodes[i]) for i in part])
-        place = int(np.searchsorted(ends_of_episodes, row, side="right"))
-        step = row - int(ends_of_episodes[place]) + len(episodes[part[place]])
-        return f"{names[part[place]]}, step {step}"
+        return steps[("observations", "unlabelled", "heldout_observations").index(field)][row]
 
     return Parts(labelled, _labels(labels, labelled), unlabelled, heldout, _labels(labels, heldout), name=name)
 
@@ -58,7 +56,9 @@ def read_minari(folder: Path, labels: Sequence[Label], *, keys: Sequence[str] = 
 def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list[str], list[NDArray[Any]]]:
     """The names of the episodes, and the observations of each."""
     with open_hdf5(path, "the dataset", DO) as file:
-        names = sorted((name for name in members(file) if name.startswith("episode_")), key=_number)
+        names = sorted(
+            (name for name in members(file) if name.startswith("episode_")), key=lambda name: (len(name), name)
+        )
         place = f"observations/{key}" if key else "observations"
         if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
             keys = ", ".join(members(find(file, f"{names[0]}/observations")))
@@ -84,11 +84,6 @@ def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:
         return shape if (box["type"], box["dtype"]) == ("Box", "uint8") and len(shape) in (2, 3) else None
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-
-
-def _number(name: str) -> int:
-    tail = name.removeprefix("episode_")
-    return int(tail) if tail.isdecimal() else -1
 
 
 def _labels(labels: Sequence[Label], states: Source) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -15,10 +16,13 @@ from stable_baselines3 import DQN, PPO
 
 import hypogoal
 from hypogoal.cli import main
+from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import mixed_type, open_dataset, packed, type_of, type_text
 from hypogoal.domains.gymnasium_engine import reader_of
+from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, network_for
+from hypogoal.hypotheses.training import fit
 from hypogoal.hypotheses.views import full_view
 from tests.own_data.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
 
@@ -110,6 +114,40 @@ def test_other_settings_train_too(run: Path, tmp_path: Path, more: str) -> None:
     few = [word for pair in ("steps=2", "members=2", "hidden_width=8", more) for word in ("--set", pair)]
     assert main(["train-ensemble", str(run / "data.h5"), "--out", str(tmp_path / "e"), "-q", *few]) == 0
     assert hypogoal.load_ensemble(tmp_path / "e", GOAL).predict(states(3)[0]).shape == (3, 2)
+
+
+class Broken(Exception):
+    """The training stops here."""
+
+
+class Breaking(Checkpoints):
+    """Checkpoints after the third step, and a break after the fifth."""
+
+    steps = 0
+
+    def offer(self, state: Callable[[], State]) -> None:
+        self.steps += 1
+        if self.steps == 3:
+            self.save(state())
+        if self.steps == 5:
+            raise Broken
+
+
+@pytest.mark.parametrize("encoder", ["separate", "shared"])
+def test_a_break_leaves_no_trace(tmp_path: Path, encoder: str) -> None:
+    """Spec G1: weights, BatchNorm of each key's encoder, and what standardises the numbers."""
+    (seen, labels), (others, _) = states(40), states(20, 1)
+    config = EnsembleConfig(members=2, steps=8, encoder=encoder, batch_size=16)
+
+    def trained(checkpoints: Checkpoints | None) -> dict[str, torch.Tensor]:
+        return fit(packed(seen), labels, packed(others), config, 0, checkpoints=checkpoints).state()
+
+    unbroken = trained(None)
+    with pytest.raises(Broken):
+        trained(Breaking(tmp_path / "e.safetensors"))
+    resumed = trained(Checkpoints(tmp_path / "e.safetensors"))
+    assert resumed.keys() == unbroken.keys() and {"view.mean", "view.deviation"} <= resumed.keys()
+    assert all(torch.equal(resumed[name], value) for name, value in unbroken.items())
 
 
 def test_attributions_are_by_key_and_complete(run: Path) -> None:
