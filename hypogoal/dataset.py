@@ -136,15 +136,13 @@ def type_of(text: object) -> np.dtype[Any]:
 def packed(parts: Mapping[str, Any], dtype: np.dtype[Any] | None = None) -> Observations:
     """Mixed observations (N,) from arrays (N, ...) by key, all that ``dtype`` has if given; else a ``ValueError``."""
     arrays = {key: np.asarray(values) for key, values in parts.items()}
-    if dtype is None:
-        dtype = mixed_type({key: (values.dtype, values.shape[1:]) for key, values in arrays.items()})
-    if {*arrays} != {*(dtype.names or ())} or len({len(values) for values in arrays.values()}) != 1:
-        raise ValueError("keys or lengths differ")
-    states = np.empty(len(next(iter(arrays.values()))), dtype)
-    for key, (kind, shape) in fields_of((), dtype).items():
-        values = arrays[key].astype(NUMBERS) if kind == NUMBERS and arrays[key].dtype.kind in "iufb" else arrays[key]
-        if (values.dtype, values.shape[1:]) != (kind, shape):
-            raise ValueError(f"{key} is {values.dtype} {values.shape}")
+    arrays = {key: values.astype(NUMBERS) if values.dtype == np.float64 else values for key, values in arrays.items()}
+    found = mixed_type({key: (values.dtype, values.shape[1:]) for key, values in arrays.items()})
+    lengths = {len(values) for values in arrays.values()}
+    if len(lengths) > 1 or (dtype is not None and found != dtype):
+        raise ValueError(f"{type_text(found)}, of lengths {lengths}")
+    states = np.empty(lengths.pop(), found)
+    for key, values in arrays.items():
         states[key] = values
     return states
 

@@ -118,8 +118,8 @@ def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
         except (ValueError, KeyError, TypeError):
             do = "Give a Dict of pictures and numbers, with keys that can be file names."
             raise UserError("the entries of the observations cannot be read by their keys", space, do) from None
-        doubt = next((entry.doubt for entry in entries.values() if entry.doubt), "")
-        return Reader(space, (), dtype, doubt=doubt, parts=tuple(entries.items()))
+        doubts = (entry.doubt for entry in entries.values() if entry.doubt)
+        return Reader(space, (), dtype, doubt=next(doubts, ""), parts=tuple(entries.items()))
     parts, doubt = list(_parts(space)), ""
     for name, part in parts:
         if not isinstance(part, spaces.Box):
