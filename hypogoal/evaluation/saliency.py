@@ -63,7 +63,9 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
         explanation_of_states = attributed(ensemble, seen, baseline)
         group = work.arrays[f"saliency/{sub_goal}"]
         values = explanation_of_states.values.astype(np.float32)
-        if seen.dtype.names:
+        if not seen.dtype.names:
+            group["baseline"] = baseline
+        else:
             parts, rows = by_key(values, seen.dtype), []
             for key, (dtype, _) in fields_of((), seen.dtype).items():
                 rows.append(parts[key].reshape(*values.shape[:2], -1))
@@ -71,8 +73,8 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
                     group[f"maps/{key}"], rows[-1] = parts[key][0], rows[-1].sum(-1, keepdims=True)
             values = np.concatenate(rows, axis=-1)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
-        for name, part in [*parts_of(seen, "seen"), *parts_of(baseline[None], "baseline")]:
-            group[name] = part if seen.dtype.names or name == "seen" else part[0]
+        for name, part in parts_of(seen, "seen"):
+            group[name] = part
         if not pictures:
             group["features"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
         states = explanation(explanation_of_states, explained)
