@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ DO, AGAIN = "Give the folder of a LeRobotDataset in format v2.1 or v3.0.", "Down
 PICTURES = VIDEO, IMAGE = ("video", "image")  # types of features
 PLACE = re.compile(r"\{(\w+)(?::0(\d)d)?\}")  # in a template of paths; other formats could ask for more than values
 OWNER, TIME = "episode_index", "timestamp"  # columns of every table
+Frames: TypeAlias = Mapping[int, NDArray[np.int64]]  # by episode
 
 
 class Episode(NamedTuple):
@@ -91,22 +92,19 @@ class LeRobot(Recording):
                 begins = {key: 0.0 if self._old else float(row[f"videos/{key}/from_timestamp"]) for key in videos}
                 if number < 0 or number in episodes or length < 1 or not all(map(math.isfinite, begins.values())):
                     raise ValueError(row)
-                places = {}
-                for key in ("", *videos):
-                    head, parts = f"videos/{key}" if key else "data", ("chunk_index", "file_index")
-                    new = {} if self._old else {part: int(row[f"{head}/{part}"]) for part in parts}
-                    places[key] = {"video_key": key, OWNER: number, "episode_chunk": number // self._chunk, **new}
-                files = {key: self._filled(key, place) for key, place in places.items()}
+                files = {}
+                for key, head in [("", "data"), *((key, f"videos/{key}") for key in videos)]:
+                    old = number // self._chunk, number
+                    chunk, file = old if self._old else (int(row[f"{head}/{part}_index"]) for part in ("chunk", "file"))
+                    values = {"video_key": key, "chunk_index": chunk, "file_index": file}
+                    values |= {"episode_chunk": chunk, "episode_index": file}  # the names of v2.1
+                    files[key] = _filled(self._templates[bool(key)], values)
                 episodes[number] = Episode(number, length, files, begins)
         except (KeyError, TypeError, ValueError, OverflowError):
             raise UserError("the list of episodes is malformed", self.path / EPISODES, DO) from None
         if not episodes:
             raise UserError("the list of episodes is empty", self.path / EPISODES, DO)
         return list(episodes.values())
-
-    def _filled(self, key: str, values: Mapping[str, object]) -> str:
-        """The path of a table, or of a video, by the template."""
-        return PLACE.sub(lambda place: str(values[place[1]]).zfill(int(place[2] or 0)), self._templates[bool(key)])
 
     def _file(self, episode: int, key: str = "") -> Path:
         """The table of an episode, or its video."""
@@ -145,24 +143,24 @@ class LeRobot(Recording):
             for episode in frames:
                 by_file.setdefault(self._file(episode, key if kind == VIDEO else ""), []).append(episode)
             for file, episodes in by_file.items():
-                if kind == VIDEO:
-                    self._read_video(file, key, {episode: frames[episode] for episode in episodes}, states)
+                some = {episode: frames[episode] for episode in episodes}
+                if kind in PICTURES:
+                    (self._read_video if kind == VIDEO else self._read_images)(file, key, some, states)
                     continue
-                table = _table(file, [OWNER, key]) if kind == IMAGE else None
-                owners = np.array(table[OWNER].to_pylist()) if table else None
-                for episode in episodes:
-                    if table is not None and owners is not None:
-                        for row, at in enumerate(self._rows(episode, owners, file)[frames[episode]].tolist()):
-                            self.store(states[episode], row, key, _decoded(table[key][at].as_py(), file), file)
-                        continue
-                    values = self.column(episode, key)[frames[episode]]
+                for episode, numbers in some.items():
+                    values = self.column(episode, key)[numbers]
                     if values[0].size != math.prod(shape):
                         raise UserError(f"{key} has the shape {values.shape[1:]}, not {shape}", file, AGAIN)
                     states[episode][key] = values.reshape(-1, *shape)
 
-    def _read_video(
-        self, file: Path, key: str, frames: Mapping[int, NDArray[np.int64]], states: Mapping[int, Observations]
-    ) -> None:
+    def _read_images(self, file: Path, key: str, frames: Frames, states: Mapping[int, Observations]) -> None:
+        table = _table(file, [OWNER, key])
+        owners = np.array(table[OWNER].to_pylist())
+        for episode, numbers in frames.items():
+            for row, at in enumerate(self._rows(episode, owners, file)[numbers].tolist()):
+                self.store(states[episode], row, key, _decoded(table[key][at].as_py(), file), file)
+
+    def _read_video(self, file: Path, key: str, frames: Frames, states: Mapping[int, Observations]) -> None:
         begins = {episode: self._episodes[episode].begins[key] for episode in frames}
         order = sorted(frames, key=begins.__getitem__)
         times = [begins[episode] + self.column(episode, TIME)[frames[episode]] for episode in order]
@@ -173,6 +171,11 @@ class LeRobot(Recording):
             self.store(states[episode], row, key, picture, file)
 
         read_frames(file, np.concatenate(times).tolist(), 0.5 / self._fps, keep)
+
+
+def _filled(template: str, values: Mapping[str, object]) -> str:
+    """A path by its template."""
+    return PLACE.sub(lambda place: str(values[place[1]]).zfill(int(place[2] or 0)), template)
 
 
 def _decoded(cell: Any, file: Path) -> NDArray[np.uint8]:

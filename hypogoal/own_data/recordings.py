@@ -35,9 +35,9 @@ class Recording(ABC):
     columns: Sequence[str] = ()  # that can label frames
     fields: Fields  # type and shape of what is read, by key, pictures as they will be stored
 
-    @abstractmethod
     def column(self, episode: int, name: str) -> NDArray[Any]:
-        """A column's values for an episode's frames, (T, ...)."""
+        """The values of one of ``columns`` for an episode's frames, (T, ...)."""
+        raise NotImplementedError
 
     @abstractmethod
     def fill(self, states: Mapping[int, Observations], every: int) -> None:

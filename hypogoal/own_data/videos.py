@@ -87,9 +87,6 @@ class Videos(Recording):
         self.lengths = [len(times) for times in self._times]
         self.fields = {KEY: (PICTURE, (*shrunk_sides(size, resize_of(resize, KEY, picture=True)), 3))}
 
-    def column(self, episode: int, name: str) -> NDArray[Any]:
-        raise NotImplementedError(name)
-
     def fill(self, states: Mapping[int, Observations], every: int) -> None:
         for episode, rows in states.items():
             file, times = self._files[episode], self._times[episode]
