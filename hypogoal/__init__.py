@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from hypogoal.api import train_ensemble, train_meta, train_options  # isort: skip
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium_domain import GymnasiumDomain
-    from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
+    from hypogoal.hypotheses.wrappers import SubgoalReward
 
 _LAZY = {
     "GymnasiumDomain": "hypogoal.domains.gymnasium_domain",
     "UserError": "hypogoal.core.errors",
 }
 __all__ = [
-    "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "SubgoalTermination", "UserError", "__version__",
-    "collect", "compare", "evaluate", "load_ensemble", "load_options", "train_ensemble", "train_meta", "train_options",
+    "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "UserError", "__version__", "collect",
+    "compare", "evaluate", "load_ensemble", "load_options", "train_ensemble", "train_meta", "train_options",
 ]  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from hypogoal.core.terminal import printable, say
 from hypogoal.domains.base import BUILT_IN, REGISTERED, Domain, load_domain
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
+from hypogoal.hypotheses.wrappers import SubgoalReward, ensemble_at
 from hypogoal.inspection import describe_path, lines, numbers_in, outcome
 from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
@@ -29,7 +29,7 @@ from hypogoal.options.initiation import Narrowed
 from hypogoal.options.learner import make_policies
 from hypogoal.options.termination import rule_of
 
-__all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
+__all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "load_ensemble", "load_options"]
 Place = str | os.PathLike[str]
 OPTIONS = ("preset", "seed", "device", "force", "resume", "quiet")  # arguments that are no settings
 
@@ -142,8 +142,7 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
     >>> ensemble.predictions(observations).dtype
     dtype('bool')
     """
-    artefact = open_artefact(Path(path), "ensemble").whole()
-    return read_ensemble(artefact.path, artefact.config, sub_goal)
+    return ensemble_at(Path(path), sub_goal)
 
 
 def load_options(path: str | Path, ensemble: str | Path | None = None) -> Options:

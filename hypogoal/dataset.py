@@ -43,9 +43,12 @@ RARE = 0.05  # warn below this share of a class
 BLOCK = 8  # states of a sample that are read together
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
-# Observations are pictures, bytes (H, W, C), or numbers of any shape, which networks see standardised.
+KINDS = "ufV"  # NumPy's letters of types of observations
+# Observations are pictures, bytes (H, W, C), or numbers of any shape, which networks see standardised, or several of
+# both by key: then of shape (), and of a structured type with a field for each key (:func:`mixed_type`).
 PICTURE, NUMBERS = np.dtype(np.uint8), np.dtype(np.float32)
-Observations: TypeAlias = NDArray[Any]  # of either type
+Observations: TypeAlias = NDArray[Any]  # of any of these types
+Fields: TypeAlias = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]  # type and shape, by key
 Standard: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]  # mean and deviation of numbers
 DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
 MOST_ROWS = 20_000  # states from which mean and deviation are computed
@@ -56,7 +59,7 @@ class States:
     """States with their true labels.
 
     Attributes:
-        observations: uint8 or float32 (N, *observation_shape).
+        observations: uint8 or float32 (N, *observation_shape), or mixed (N,).
         labels: bool (N, G), one column per sub-goal; (N,) for a single sub-goal.
         origins: int (N,) arrays by name, where each state comes from (layout_seed, agent_x, ...).
     """
@@ -92,6 +95,66 @@ class Unmet(UserError):
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
     """16 bytes that identify an observation among those of its shape and type, together with its labels."""
     return blake2b(observation.tobytes() + labels, digest_size=16).digest()
+
+
+def fields_of(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Fields:
+    """Type and shape of an observation's parts by key; of one that is not mixed, its only part's, without a key."""
+    return {key: (dtype[key].base, dtype[key].shape) for key in dtype.names} if dtype.names else {"": (dtype, shape)}
+
+
+def values_in(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """How many values an observation has, bytes of pictures and numbers."""
+    return sum(prod(size) for _, size in fields_of(shape, dtype).values())
+
+
+def mixed_type(fields: Fields) -> np.dtype[Any]:
+    """The type of observations with these parts, sorted by key; malformed ones are a ``ValueError``."""
+    sizes = [size for _, shape in fields.values() for size in (len(shape), *shape)]
+    if not plain_names(list(fields)) or not all(type(size) is int and 0 < size <= MAX_SIDE for size in sizes):
+        raise ValueError(fields)
+    return np.dtype([(key, dtype.str, shape) for key, (dtype, shape) in sorted(fields.items())])
+
+
+def type_text(dtype: np.dtype[Any]) -> str:
+    """An observation's type as files keep it: ``uint8``, ``float32``, or JSON of ``{key: [type, shape]}``."""
+    parts = {key: [str(kind), list(shape)] for key, (kind, shape) in fields_of((), dtype).items()}
+    return json.dumps(parts) if dtype.names else str(dtype)
+
+
+def type_of(text: object) -> np.dtype[Any]:
+    """The type that :func:`type_text` wrote; anything else is a ``ValueError``."""
+    plain = {str(dtype): dtype for dtype in (PICTURE, NUMBERS)}
+    if text in plain:
+        return plain[str(text)]
+    try:
+        parts = json.loads(text) if isinstance(text, str) else {}
+        return mixed_type({key: (plain[kind], tuple(shape)) for key, (kind, shape) in parts.items()})
+    except (TypeError, KeyError, AttributeError, RecursionError):
+        raise ValueError(text) from None
+
+
+def packed(parts: Mapping[str, Any], dtype: np.dtype[Any] | None = None) -> Observations:
+    """Mixed observations (N,) from arrays (N, ...) by key, all that ``dtype`` has if given; else a ``ValueError``."""
+    arrays = {key: np.asarray(values) for key, values in parts.items()}
+    arrays = {key: values.astype(NUMBERS) if values.dtype == np.float64 else values for key, values in arrays.items()}
+    found = mixed_type({key: (values.dtype, values.shape[1:]) for key, values in arrays.items()})
+    lengths = {len(values) for values in arrays.values()}
+    if len(lengths) > 1 or (dtype is not None and found != dtype):
+        raise ValueError(f"{type_text(found)}, of lengths {lengths}")
+    states = np.empty(lengths.pop(), found)
+    for key, values in arrays.items():
+        states[key] = values
+    return states
+
+
+def numbers_of(observations: Observations) -> NDArray[np.float32]:
+    """All numbers of observations (N, ...), in a row each, float32 (N, D)."""
+    rows = [
+        (observations[key] if key else observations).reshape(len(observations), prod(shape))
+        for key, (dtype, shape) in fields_of(observations.shape[1:], observations.dtype).items()
+        if dtype == NUMBERS
+    ]
+    return rows[0] if len(rows) == 1 else np.concatenate([np.zeros((len(observations), 0), NUMBERS), *rows], axis=1)
 
 
 def standard_of(shape: tuple[int, ...], *observations: Observations) -> Standard:
@@ -188,7 +251,7 @@ def write_dataset(
         hdf5.set_attribute(file, "domain", domain)
         hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
         hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
-        hdf5.set_attribute(file, "observation_dtype", str(collected.unlabelled.observations.dtype))
+        hdf5.set_attribute(file, "observation_dtype", type_text(collected.unlabelled.observations.dtype))
         hdf5.set_attribute(file, "config", json.dumps(dict(config)))
         hdf5.set_attribute(file, "seed", seed)
         hdf5.set_attribute(file, "inputs", json.dumps(list(inputs)))
@@ -263,21 +326,30 @@ class Dataset:
             raise UserError("the data file is not complete", path, RECOLLECT)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
         self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
-        dtype = self.attributes["observation_dtype"] or str(PICTURE)  # early files do not say
-        self.observation_dtype = NUMBERS if dtype == str(NUMBERS) else PICTURE
+        try:
+            self.observation_dtype = type_of(self.attributes["observation_dtype"] or str(PICTURE))  # early files: none
+        except ValueError:
+            raise foreign from None
         self.config: dict[str, Any] = self._json("config", dict)
         self.inputs: list[Any] = self._json("inputs", list) if self.attributes["inputs"] else []
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
         names = plain_names(self.sub_goals)
-        supported = dtype == str(self.observation_dtype)
-        if not (sizes and names and supported and self.observation_shape and isinstance(self.domain, str)):
+        fits = bool(self.observation_shape) != bool(self.observation_dtype.names)
+        if not (sizes and names and fits and isinstance(self.domain, str)):
             raise foreign
         self.observation_bytes = prod(self.observation_shape) * self.observation_dtype.itemsize  # of one observation
 
     def features(self) -> list[str]:
-        """The names of an observation's numbers, in order; ``x0``, ``x1``, ... if the file has no names."""
+        """The names of an observation's numbers, in order; ``x0``, ``x1``, ... if the file has no names.
+
+        Of a mixed observation ``key[0]``, ``key[1]``, ..., and a picture's key alone.
+        """
         count = prod(self.observation_shape)
+        if self.observation_dtype.names:
+            fields = fields_of((), self.observation_dtype).items()
+            rows = [(key, prod(shape) if dtype == NUMBERS else 1) for key, (dtype, shape) in fields]
+            return [f"{key}[{place}]" if size > 1 else key for key, size in rows for place in range(size)]
         with self._file() as file:
             if hdf5.find(file, "features") is None:
                 return [f"x{number}" for number in range(count)]
@@ -350,17 +422,17 @@ class Dataset:
 
     def _observations(self, file: Any, base: str, rows: slice | NDArray[np.int64] | None = None) -> Observations:
         name, dtype = f"{base}/observations", self.observation_dtype
-        data = hdf5.checked(file, name, "uf")
+        data = hdf5.checked(file, name, KINDS)
         if data.shape[1:] != self.observation_shape or data.dtype != dtype:
             raise hdf5.Foreign(f"{name!r} is {data.dtype} {data.shape}, not {dtype} (N, {self.observation_shape})")
-        values = hdf5.read_array(file, name, "uf", rows)
-        if dtype == NUMBERS and not np.isfinite(values).all():
+        values = hdf5.read_array(file, name, KINDS, rows)
+        if not np.isfinite(numbers_of(values)).all():
             raise hdf5.Foreign(f"{name!r} has numbers that are not finite")
         return values
 
     @staticmethod
     def _count(file: Any, base: str) -> int:
-        shape = hdf5.checked(file, f"{base}/observations", "uf").shape
+        shape = hdf5.checked(file, f"{base}/observations", KINDS).shape
         if not shape:
             raise hdf5.Foreign(f"{base}/observations is a single number")
         return int(shape[0])

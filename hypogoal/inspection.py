@@ -30,7 +30,7 @@ from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
-from hypogoal.dataset import PICTURE, SPLITS, open_dataset
+from hypogoal.dataset import PICTURE, SPLITS, open_dataset, type_text
 from hypogoal.domains.base import installed_domain
 
 # The numbers of logs and their titles, in the order in which they are shown.
@@ -49,7 +49,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         details = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        details |= {"observation_dtype": str(dataset.observation_dtype)}
+        details |= {"observation_dtype": type_text(dataset.observation_dtype)}
         return {"kind": "data", "path": str(path), "counts": dataset.counts(), **details, "config": dataset.config}
     artefact = open_artefact(path)
     keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
@@ -165,7 +165,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
         raise UserError("contact sheets need a data file", path, "Give the .h5 file of the states.")
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
-        actual = f"{dataset.observation_dtype} {dataset.observation_shape}"
+        actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
         do = advice("Read them as arrays", "export", path, "--out", f"{path.stem}.npz")
         raise UserError("the states are not pictures", actual, do)
     check_parent(folder / "labelled")

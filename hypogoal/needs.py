@@ -16,7 +16,7 @@ import numpy as np
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import Needs, available
-from hypogoal.dataset import PICTURE, open_dataset
+from hypogoal.dataset import NUMBERS, PICTURE, fields_of, open_dataset, values_in
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
@@ -64,7 +64,7 @@ def ensemble_needs(
     states, free = DATA * count * dataset.observation_bytes, available() or inf
     cost = weights_only(config.members * member_bytes(config.network, shape, dtype))
     if device == "cpu" and count > 1 and workers * (BASE + states + cost.memory) < free:
-        some = min(config.batch_size, max(1, SAMPLE_NUMBERS // np.prod(shape, dtype=int)))
+        some = min(config.batch_size, max(1, SAMPLE_NUMBERS // values_in(shape, dtype)))
         parts = [(data, f"labelled/{goals[0]}"), *((path, "unlabelled") for path in unlabelled)]
         cost = step_cost(np.concatenate([open_dataset(path).sample(part, some) for path, part in parts]), config)
 
@@ -72,11 +72,17 @@ def ensemble_needs(
     fitting = int(min((free / workers - process) / max(1.0, cost.memory_each), config.batch_size))
     ways = [f"--set batch_size={fitting}"] if 2 <= fitting < config.batch_size else []
     ways += ["--set workers=1"] if workers > 1 else []
-    ways += [f"pictures of {LARGE} pixels (import them with --resize {LARGE})"] if max(shape[:2]) > LARGE else []
+    if longest_side(shape, dtype) > LARGE:
+        ways += [f"pictures of {LARGE} pixels (import them with --resize {LARGE})"]
     memory = workers * (process + config.batch_size * cost.memory_each)
     seconds = len(goals) * steps * (cost.seconds + config.batch_size * cost.seconds_each) / workers
     smaller = f"Try {' or '.join(ways or ['fewer or smaller states'])}."
     return Needs(memory, ensemble_disk(len(goals), cost.weights), seconds, smaller)
+
+
+def longest_side(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Of an observation's pictures, in pixels; 0 without any."""
+    return max((max(size[:2]) for kind, size in fields_of(shape, dtype).values() if kind == PICTURE), default=0)
 
 
 def weights_only(weights: float) -> StepCost:
@@ -92,12 +98,14 @@ def ensemble_process(states: float, config: EnsembleConfig, shape: tuple[int, ..
 
     A network of the user's is not run.
     """
-    from hypogoal.hypotheses.networks import NETWORKS, network_for
+    from hypogoal.hypotheses.networks import NETWORKS, names_in, network_for
     from hypogoal.hypotheses.trial import step_cost
 
     cost = weights_only(config.members * member_bytes(config.network, shape, dtype))
-    if network_for(config.network, dtype) in NETWORKS:
-        noise = np.random.default_rng(0).integers(0, 256, (4, *shape)).astype(dtype)
+    if NETWORKS.keys() >= {*names_in(network_for(config.network, dtype))}:
+        noise = np.zeros((4, *shape), dtype)
+        if not dtype.names:
+            noise[:] = np.random.default_rng(0).integers(0, 256, noise.shape)
         cost = step_cost(noise, config, seconds=0.0)
     memory = BASE + DATA * states + cost.memory + config.batch_size * cost.memory_each
     return Needs(memory, ensemble_disk(1, cost.weights))
@@ -112,12 +120,13 @@ def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
     import torch
 
     from hypogoal.core.seeding import torch_generator
-    from hypogoal.hypotheses.networks import NETWORKS, build_network, network_for
+    from hypogoal.hypotheses.networks import NETWORKS, build_network, names_in, network_for
 
     name = network_for(network, dtype)
     try:
         with torch.device("meta"):
-            built = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
+            known = NETWORKS.keys() >= {*names_in(name)}
+            built = build_network(name, shape, torch_generator(0, "needs"), dtype=dtype) if known else None
     except UserError:
         built = None
     return float(sum(weights.nbytes for weights in built.parameters())) if built else MEMBER
@@ -190,6 +199,7 @@ def judging(states: float, shape: tuple[int, ...], dtype: np.dtype[Any]) -> floa
     from hypogoal.hypotheses.deep_lift import AT_ONCE, INSIDE
     from hypogoal.hypotheses.networks import at_once
 
-    some, explained = at_once(AT_ONCE, shape), at_once(EXPLAINED, (INSIDE, *shape))
-    inside = np.prod(shape) * (some * PASSED + explained * PASSED * INSIDE) if dtype == PICTURE else 0.0
+    numbers = values_in(shape, dtype)
+    some, explained = at_once(AT_ONCE, (numbers,)), at_once(EXPLAINED, (INSIDE, numbers))
+    inside = numbers * (some * PASSED + explained * PASSED * INSIDE) if dtype != NUMBERS else 0.0
     return 1.5 * states + float(inside)

@@ -103,9 +103,9 @@ class Framed(CorridorEnv):
 
 
 class Mixed(CorridorEnv):
-    """Its image has company."""
+    """Its image has company, without a key."""
 
-    observation_space = spaces.Dict(image=spaces.Box(0, 255, SHAPE, np.uint8), cell=spaces.Discrete(LENGTH))  # type: ignore[assignment]
+    observation_space = spaces.Tuple((spaces.Box(0, 255, SHAPE, np.uint8), spaces.Discrete(LENGTH)))  # type: ignore[assignment]
 
 
 class Steered(CorridorEnv):

@@ -25,70 +25,87 @@ if TYPE_CHECKING:
 
 @cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
-    source: Annotated[Path, Argument(help="A .npz file, or a folder of .npy files, of images or of a Minari dataset.")],
+    source: Annotated[Path, Argument(help="Arrays, images, or episodes (Minari, LeRobot, robomimic, mp4 files).")],
     out: cli.Out,
     sub_goal: Annotated[
         list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
     ] = None,
     label: Annotated[
-        list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Minari: a function that labels.")
+        list[str] | None,
+        Option(metavar="NAME=RULE", help="Episodes: a column, last:N frames, FILE.csv; Minari: MODULE:FUNCTION."),
     ] = None,
-    key: Annotated[str, Option(help="Which part to take, if a Minari dataset has dictionaries.")] = "",
+    key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
+    every: Annotated[int, Option(min=1, help="Episodes: take every N-th frame.")] = 1,
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
-    resize: Annotated[int, Option(min=0, help="Most pixels on the longer side of pictures; 0: unchanged.")] = 0,
+    resize: Annotated[
+        list[str] | None, Option(metavar="[KEY=]N", help="Most pixels on the longer side of pictures, or of a key's.")
+    ] = None,
     stack: Annotated[bool, Option("--stack", help="Axes of frames and colours become channels.")] = False,
     domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
     seed: cli.Seed = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Make a data file of your arrays, images or Minari data."""
+    """Make a data file of your arrays, images or recorded episodes."""
     from hypogoal.core import own_code
     from hypogoal.stages.import_data import import_data as stage
 
     labels = dict(text.partition("=")[::2] for text in label or ())
     if not all(name and function for name, function in labels.items()):
-        do = "For example --label won=mine:won."
-        raise UserError("--label needs name=module:function", " ".join(label or ()), do)
+        do = "For example --label won=next.success, or of Minari --label won=mine:won."
+        raise UserError("--label needs NAME=RULE", " ".join(label or ()), do)
+    sizes = dict(text.rpartition("=")[::2] for text in resize or ())
+    if not all(size.isdecimal() and int(size) <= MOST_INTEGER for size in sizes.values()):
+        raise UserError("--resize needs a number of pixels", " ".join(resize or ()), "Give --resize 128 or KEY=128.")
+    longest = {name: int(size) for name, size in sizes.items() if int(size)}
     with own_code.given(*labels.values()):
         counts = stage(
-            source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, resize=resize, stack=stack,
-            domain=domain, seed=seed, force=force,
+            source, out, sub_goals=sub_goal or (), labels=labels, keys=[*filter(None, key or ())], share=heldout,
+            resize=longest if {*longest} - {""} else longest.get("", 0), every=every, stack=stack, domain=domain,
+            seed=seed, force=force,
         )  # fmt: skip
-    _print_observations(out, resize, quiet)
+    _print_observations(out, bool(longest), quiet)
     cli.print_counts(counts, quiet)
     cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
     give(out)
 
 
-def _print_observations(data: Path, resize: int, quiet: bool) -> None:
+def _print_observations(data: Path, resized: bool, quiet: bool) -> None:
     """Say how states were read, as pictures or numbers; of large pictures, how to import them smaller."""
-    from hypogoal.dataset import PICTURE, open_dataset
-    from hypogoal.needs import LARGE
+    from hypogoal.dataset import PICTURE, fields_of, open_dataset
+    from hypogoal.needs import LARGE, longest_side
 
     dataset = open_dataset(data)
-    sizes = " x ".join(map(str, dataset.observation_shape))
-    pictures = dataset.observation_dtype == PICTURE
-    if not quiet:
-        say(f"taken for {'pictures' if pictures else 'numbers'}, {sizes} {dataset.observation_dtype}")
-    if pictures and max(dataset.observation_shape[:2]) > LARGE and not resize:
-        say(f"hypogoal: pictures of {sizes} need much memory and time; add --resize {LARGE} --force", err=True)
+    for key, (dtype, shape) in fields_of(dataset.observation_shape, dataset.observation_dtype).items():
+        sizes = " x ".join(map(str, shape))
+        if not quiet:
+            kind = "pictures" if dtype == PICTURE else "numbers"
+            say(f"{f'{key}: ' if key else ''}taken for {kind}, {sizes} {dtype}")
+        if longest_side(shape, dtype) > LARGE and not resized:
+            say(f"hypogoal: pictures of {sizes} need much memory and time; add --resize {LARGE} --force", err=True)
 
 
 @cli.command(cli.OWN, "export data/doorkey.h5 --out states.npz")
 def export(
-    source: Annotated[Path, Argument(help="A data file, or the folder of a meta artefact.")],
-    out: Annotated[Path, Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
+    source: Annotated[Path, Argument(help="A data file, or the folder of a meta or an ensemble artefact.")],
+    out: Annotated[Path, Option("--out", help="The .npz file, or the folder; a Minari dataset's is NAME-v0.")],
     episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
     seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Seed of the agent's choices.")] = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Write states or an agent's episodes for other software.
+    """Write states, an agent's episodes or an ensemble for other software.
 
     States as NumPy arrays, episodes as a Minari dataset. 'import' reads both.
+    Ensembles as a folder that torch and safetensors load without hypogoal.
     """
-    if source.is_dir():
+    from hypogoal.core.artefacts import open_artefact
+
+    if source.is_dir() and open_artefact(source, ("meta", "ensemble")).kind == "ensemble":
+        from hypogoal.stages.export_ensemble import export_ensemble
+
+        export_ensemble(source, out, force=force)
+    elif source.is_dir():
         from hypogoal.stages.export_episodes import export_episodes
 
         steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)

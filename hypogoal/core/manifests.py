@@ -87,8 +87,8 @@ WANTED: Schema = {
 SETTINGS: Schema = {
     "sub_goals": plain_names,
     "members": _size,
-    "observation_shape": lambda value: isinstance(value, list) and bool(value) and all(map(_size, value)),
-    "observation_dtype": lambda value: value in ("uint8", "float32"),
+    "observation_shape": lambda value: isinstance(value, list) and all(map(_size, value)),
+    "observation_dtype": is_text,
     "domain_config": lambda value: isinstance(value, dict),
     "mask_reached": lambda value: isinstance(value, bool),
     **dict.fromkeys(("crop_height", "crop_width"), _size),

@@ -101,7 +101,7 @@ class Engine(ABC):
     Attributes:
         n_actions: primitive actions are 0 .. n_actions - 1.
         count: environments (E).
-        observation_shape, observation_dtype: uint8 (H, W, C) for pictures, or float32 of any shape.
+        observation_shape, observation_dtype: uint8 (H, W, C) for pictures, or float32 of any shape, or mixed.
         standard: mean and deviation with which agents standardise float32 observations; set in training.
         max_steps: steps after which an episode is truncated.
         ids: int64 (E,), the current state of each environment.
@@ -470,6 +470,13 @@ def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
         fault = f"gave the reward {step.rewards[number]} in environment {number}"
         UsersCode("the engine's step", engine, "step").refuse(fault, "Give finite numbers.")
     return step
+
+
+def require_one_kind(engine: Engine) -> None:
+    """Refuse (``UserError``) mixed observations: options and agents see pictures or numbers."""
+    if keys := engine.observation_dtype.names:
+        do = "Reward another library's agent by the members: hypogoal.SubgoalReward (docs/library.md)."
+        raise UserError("agents see pictures or numbers, not both", ", ".join(keys), do)
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest, mixed_type
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 from hypogoal.domains.observations import Reading, reading_of, resized_picture
 
@@ -49,7 +49,8 @@ class Reader(NamedTuple):
     """Reads observations of a space as arrays of one shape and type, see ``dataset.Observations``.
 
     ``features`` names the numbers of a non-image observation; ``key`` is that of the only entry of a dictionary, a
-    picture. ``doubt`` is a warning that numbers may be meant as a picture.
+    picture. ``parts`` read the entries of a dictionary with pictures and others, by key. ``doubt`` is a warning that
+    numbers may be meant as a picture.
     """
 
     space: spaces.Space[Any]
@@ -58,10 +59,18 @@ class Reader(NamedTuple):
     features: tuple[str, ...] = ()
     key: str = ""
     doubt: str = ""
+    parts: tuple[tuple[str, Any], ...] = ()  # each with its Reader
 
     def read(self, env: gymnasium.Env, observation: Any, method: str = "step") -> Any:
         """A copy (*shape) of an observation that ``method`` returned; ``UserError`` if it does not fit its space."""
         code = UsersCode("the environment", env, method)
+        if self.parts:
+            mixed = np.empty((), self.dtype)
+            for key, part in self.parts:
+                with code:
+                    value = observation[key]
+                mixed[key] = part.read(env, value, method)
+            return mixed
         with code:
             if self.key:
                 observation = observation[self.key]
@@ -80,24 +89,51 @@ class Reader(NamedTuple):
 
 
 def reader_of(env: gymnasium.Env) -> Reader:
-    """A reader of an environment's observations; a ``UserError`` if they are no numbers, or mix pictures with others.
+    """A reader of an environment's observations; a ``UserError`` if they are neither pictures nor numbers.
 
     Pictures are a ``Box`` of uint8 (H, W, C) or (H, W), or a ``Dict`` of just that. Any other ``Box`` is float32, see
     ``hypogoal.domains.observations``. Other spaces that Gymnasium's ``flatten`` accepts, such as dictionaries, become
-    float32 (D,) in its order.
+    float32 (D,) in its order. A ``Dict`` with pictures and others, each under a key of its own, is mixed.
     """
     with UsersCode("the environment", env, failed="has no spaces:"):
         space = env.observation_space
+    return _reader(space)
+
+
+def _reading(space: spaces.Box) -> Reading:
+    return reading_of(space.shape, space.dtype, float(np.max(space.high, initial=0)))
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    """Whether this is a picture, or refused because it may be."""
+    return isinstance(space, spaces.Box) and (_reading(space).dtype == PICTURE or bool(_reading(space).fault))
+
+
+def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
+    """A reader of a space, or of a dictionary's entry ``key``."""
+    if isinstance(space, spaces.Dict) and len(space.spaces) > 1 and any(map(_is_picture, space.spaces.values())):
+        entries = {name: _reader(part, str(name)) for name, part in space.spaces.items()}
+        try:
+            dtype = mixed_type({name: (entry.dtype, entry.shape) for name, entry in entries.items()})
+        except (ValueError, KeyError, TypeError):
+            do = "Give a Dict of pictures and numbers, with keys that can be file names."
+            raise UserError("the entries of the observations cannot be read by their keys", space, do) from None
+        doubts = (entry.doubt for entry in entries.values() if entry.doubt)
+        return Reader(space, (), dtype, doubt=next(doubts, ""), parts=tuple(entries.items()))
     parts, doubt = list(_parts(space)), ""
     for name, part in parts:
         if not isinstance(part, spaces.Box):
             continue
-        reading = reading_of(part.shape, part.dtype, float(np.max(part.high, initial=0)))
+        reading = _reading(part)
         if reading.dtype == PICTURE or reading.fault:
             if len(parts) > 1 or not isinstance(space, spaces.Box | spaces.Dict):
-                do = "Wrap it in gymnasium.wrappers.FilterObservation, and keep the picture alone, or all but pictures."
+                do = "Give a Dict with each picture under a key of its own, beside those of numbers."
                 raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
             if reading.fault:
+                if key:
+                    made = reading.picture.expression() if reading.picture else "uint8 (H, W, C)"
+                    do = f"Under that key give {made} of pictures, x.reshape(-1) of numbers."
+                    raise UserError(f"observations {reading.fault}", f"{key}, {part.dtype} {part.shape}", do)
                 raise UserError(f"observations {reading.fault}", f"{part.dtype} {part.shape}", _wrapped(reading, name))
             return Reader(part, reading.shape, PICTURE, key=name)
         doubt = doubt or reading.doubt

@@ -112,9 +112,14 @@ def _arrangement(shape: tuple[int, ...], cast: str) -> Arrangement | None:
 
 def shrunk_picture(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     """A picture uint8 (H, W, C) scaled down so that its longer side has at most ``longest`` pixels."""
-    height, width = picture.shape[:2]
-    scale = min(1.0, longest / max(height, width))
-    return resized_picture(picture, max(1, round(height * scale)), max(1, round(width * scale)))
+    return resized_picture(picture, *shrunk_sides(picture.shape, longest))
+
+
+def shrunk_sides(shape: tuple[int, ...], longest: int) -> tuple[int, int]:
+    """Height and width of a picture scaled down so that the longer side has at most ``longest`` pixels; 0: as it is."""
+    height, width = shape[:2]
+    scale = min(1.0, (longest or max(height, width)) / max(height, width))
+    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def resized_picture(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.dataset import Observations, States, open_dataset
+from hypogoal.dataset import Observations, States, fields_of, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
 from hypogoal.evaluation.run import Contents
@@ -98,7 +98,8 @@ class Judgement:
         ``kinds`` and ``places``.
         """
         split, index = self.split, np.array([index for index, _ in picked], dtype=np.int64)
-        group["observations"] = split.observations[index]
+        for name, part in parts_of(split.observations[index], "observations"):
+            group[name] = part
         group["probabilities"] = self.judged.probabilities[index]
         group["verdicts"] = self.judged.predictions[index]
         group["labels"] = split.labels[index]
@@ -106,6 +107,12 @@ class Judgement:
         group["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
         group["kinds"] = fixed(json.dumps([kind for _, kind in picked]))
         group["places"] = fixed(json.dumps([place_of(split.origins, state) for state in index]))
+
+
+def parts_of(observations: Observations, name: str) -> Iterator[tuple[str, Observations]]:
+    """Observations (n, ...) under their name; mixed ones by key, ``name/key``."""
+    for key in fields_of(observations.shape[1:], observations.dtype):
+        yield (f"{name}/{key}", observations[key]) if key else (name, observations)
 
 
 def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hypogoal.core.hdf5 import fixed
-from hypogoal.dataset import PICTURE, open_dataset
+from hypogoal.dataset import PICTURE, fields_of, open_dataset
 from hypogoal.evaluation import page
-from hypogoal.evaluation.judging import Judgement, Work
+from hypogoal.evaluation.judging import Judgement, Work, parts_of
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
 from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
@@ -38,7 +38,8 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
 
     ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
     what members saw, ``seen`` uint8 (n, h, w, C), against ``baseline``. Where they are no pictures, of states spread
-    over the held-out ones, with ``features``' names.
+    over the held-out ones, with ``features``' names. Of mixed ones a picture's attributions are added up, and
+    ``maps/KEY`` has them pixel by pixel, float32 (K, H, W, C), of one state.
     """
     if judgement.number != work.shown:
         return ()
@@ -48,19 +49,32 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     labels, probabilities, predictions = split.labels[among], judged.probabilities[among], judged.predictions[among]
     pictures = split.observations.dtype == PICTURE
     spread = np.linspace(0, len(among) - 1, min(len(among), AVERAGED)).astype(np.int64).tolist()
-    explained = pick_to_explain(probabilities, predictions, labels) if pictures else [(at, SPREAD) for at in spread]
+    explained = pick_to_explain(probabilities, predictions, labels)
+    if not pictures:
+        first = explained[:1] if split.observations.dtype.names else []
+        explained = first + [(at, SPREAD) for at in spread]
     picked = [(int(among[index]), kind) for index, kind in explained]
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
     if explained:
-        from hypogoal.hypotheses.deep_lift import attributed, explanation
+        from hypogoal.hypotheses.deep_lift import attributed, by_key, explanation
 
         ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
         explanation_of_states = attributed(ensemble, seen, baseline)
         group = work.arrays[f"saliency/{sub_goal}"]
         values = explanation_of_states.values.astype(np.float32)
+        if not seen.dtype.names:
+            group["baseline"] = baseline
+        else:
+            parts, rows = by_key(values, seen.dtype), []
+            for key, (dtype, _) in fields_of((), seen.dtype).items():
+                rows.append(parts[key].reshape(*values.shape[:2], -1))
+                if dtype == PICTURE:
+                    group[f"maps/{key}"], rows[-1] = parts[key][0], rows[-1].sum(-1, keepdims=True)
+            values = np.concatenate(rows, axis=-1)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
-        group["seen"], group["baseline"] = seen, baseline
+        for name, part in parts_of(seen, "seen"):
+            group[name] = part
         if not pictures:
             group["features"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
         states = explanation(explanation_of_states, explained)
@@ -164,6 +178,25 @@ def feature_figures(material: Material) -> Iterator[Drawn]:
         values = np.abs(arrays["attributions"]).mean(0)
         plot = bars_of_features(values.reshape(len(values), -1), page.texts(arrays["features"]))
         yield Drawn(f"features-{goal}", f"What members go by: {goal}", plot, caption, heading=goal)
+        cameras = [name.removeprefix("maps/") for name in arrays if name.startswith("maps/")]
+        if cameras:
+            maps = attributions_of_cameras(arrays, cameras)
+            yield Drawn(f"cameras-{goal}", f"Where members look: {goal}", maps, f"Attributions in one state. {COLOURS}")
+
+
+def attributions_of_cameras(arrays: Mapping[str, NDArray[Any]], cameras: Sequence[str]) -> Figure:
+    """A row per camera of mixed observations: its picture in one state, and what each member goes by in it."""
+    columns = 1 + len(arrays["probabilities"][0])
+    figure, places = grid_of_pictures(len(cameras), columns, KEY)
+    state = {name: arrays[name][0] for name in ("probabilities", "verdicts", "labels")}
+    for row, camera in enumerate(cameras):
+        picture, grey = arrays[f"observations/{camera}"][0], brightness(arrays[f"seen/{camera}"][:1])[0] / 255
+        show_picture(places[row * columns], picture, camera)
+        for member, values in enumerate(arrays[f"maps/{camera}"]):
+            title = "" if row else _said(state, member)
+            show_picture(places[row * columns + 1 + member], attribution_image(flat(values), grey), title)
+    _key(figure, places)
+    return figure
 
 
 def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:

@@ -15,11 +15,11 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Observations, require_classes
+from hypogoal.dataset import Observations, require_classes, values_in
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.networks import as_input, at_once
+from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
 
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
 LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
@@ -78,12 +78,13 @@ class TrainingStates:
         self._grey, self._jitter, self._context = grey, jitter, context
         tables = device.type == "cpu" and not (grey or jitter)  # changed images have changed patches
         self._tables = patches.make_tables(images, trunk or network) if tables else None
-        self._images = torch.from_numpy(images).to(device) if self._tables is None else None
+        self._dtype, self._shape = images.dtype, (values_in(images.shape[1:], images.dtype),)
+        self._images = as_tensor(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
         self._trunk, self._features = trunk, None
         self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # trained by all networks
         if trunk is not None and frozen and not (grey or jitter):
-            size = at_once(EVALUATED_AT_ONCE, images.shape[1:])
+            size = at_once(EVALUATED_AT_ONCE, self._shape)
             chunks = [np.arange(at, min(at + size, len(images))) for at in range(0, len(images), size)]
             with torch.no_grad():
                 self._features = torch.cat([_forward(trunk, self._inputs([chunk]), [len(chunk)]) for chunk in chunks])
@@ -128,7 +129,7 @@ class TrainingStates:
         They can be differentiated. In training mode BatchNorm uses the batch's statistics and leaves its running ones
         alone, so a gradient includes a state's effect on the others of its batch.
         """
-        inputs = as_input(torch.from_numpy(self._labelled[states]).to(self.device))
+        inputs = as_input(as_tensor(self._labelled[states]).to(self.device), self._dtype)
         if self._jitter:
             inputs = inputs[:, :, self._jitter : -self._jitter, self._jitter : -self._jitter]
         inputs = inputs.requires_grad_()
@@ -158,7 +159,7 @@ class TrainingStates:
         if self._jitter:
             images = _cut(images, self._jitter, changes)
         if changes is None or not self._grey:
-            return as_input(images)
+            return as_input(images, self._dtype)
         maps = torch.from_numpy(grey_maps(len(states), changes)).to(self.device)
         return maps.gather(1, images.flatten(start_dim=1).long()).view(images.shape).permute(0, 3, 1, 2)
 
@@ -174,7 +175,7 @@ class TrainingStates:
         for network in networks:
             network.eval()
         with torch.no_grad():
-            size = at_once(EVALUATED_AT_ONCE, self._labelled.shape[1:])
+            size = at_once(EVALUATED_AT_ONCE, self._shape)
             chunks = [self.forward(networks, states[at : at + size]).logits for at in range(0, len(states), size)]
         return torch.stack([torch.cat([chunk[member][0] for chunk in chunks]) for member in range(len(networks))])
 

@@ -27,7 +27,7 @@ class EnsembleConfig:
     network: str = setting(
         "auto",
         "member network: doorkey, montezuma, montezuma-crop, tiles, mlp, or module:function; auto: doorkey for "
-        "pictures, mlp for other observations",
+        "pictures, mlp for other observations; of cameras and numbers by key: front=tiles,state=mlp",
         source="the paper's appendix",
     )
     encoder: str = setting(

@@ -14,6 +14,7 @@ import copy
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.dataset import PICTURE, Observations
-from hypogoal.hypotheses.networks import as_input, at_once
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of
+from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
 
 DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
 STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 class Attributions:
     """Attributions of every member on n states."""
 
-    values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), in log-odds
+    values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), of mixed ones (n, K, D), in log-odds
     log_odds: NDArray[np.float64]  # (n, K)
     baseline_log_odds: NDArray[np.float64]  # (K,)
     method: str = DEEP_LIFT
@@ -58,8 +59,25 @@ def mean_state(observations: Observations) -> Observations:
     most of the attribution, and black things (a pit, an open door) none. Against the mean state, only differences from
     the usual get any.
     """
+    if observations.dtype.names:
+        states = np.zeros((), observations.dtype)
+        for key in observations.dtype.names:
+            states[key] = mean_state(observations[key])
+        return states
     mean = observations.mean(axis=0, dtype=np.float64)
     return (mean.round() if observations.dtype == PICTURE else mean).astype(observations.dtype)
+
+
+def by_key(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Attributions (..., D) of mixed observations as float32 with a field for each key."""
+    fields, place = fields_of((), dtype), 0
+    parts = np.empty(values.shape[:-1], [(key, NUMBERS, shape) for key, (_, shape) in fields.items()])
+    for key, (_, shape) in fields.items():
+        sizes = as_input(torch.zeros(1, *shape)).shape[1:]
+        part = torch.from_numpy(values[..., place : place + prod(shape)]).reshape(-1, *sizes)
+        parts[key] = _as_observations(part).numpy().reshape(*values.shape[:-1], *shape)
+        place += prod(shape)
+    return parts
 
 
 def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -> list[dict[str, Any]]:
@@ -100,7 +118,7 @@ def attributed(ensemble: Ensemble, observations: Observations, baseline: Observa
     ``observations`` are the members' view of a few states (n, ...), compared with ``baseline`` (...).
     """
     method = method_of(ensemble.members[0])
-    inputs, reference = as_input(torch.from_numpy(observations)), as_input(torch.from_numpy(baseline[None]))
+    inputs, reference = (as_input(as_tensor(some), some.dtype) for some in (observations, baseline[None]))
     parts = [(_deep_lift if method == DEEP_LIFT else _integrated)(each, inputs, reference) for each in ensemble.members]
     values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*parts, strict=True))
     return Attributions(values, log_odds, baselines[0], method)

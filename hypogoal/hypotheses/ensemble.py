@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,21 +16,23 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
-from hypogoal.dataset import NUMBERS, Observations
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, packed, type_of, type_text, values_in
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
 from hypogoal.hypotheses.networks import (
     NETWORKS,
     as_input,
+    as_tensor,
     at_once,
     build_network,
     folded,
+    names_in,
     network_for,
     redrawn,
     reordered,
 )
-from hypogoal.hypotheses.views import AgentView, FullView
+from hypogoal.hypotheses.views import AgentView, FullView, standard_shape
 
 THRESHOLD = 0.5  # of the probability, unless another is set
 IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many
@@ -83,7 +86,8 @@ class Ensemble(nn.Module):
         self.trunk: nn.Sequential | None = None
         self.frozen = encoder == "frozen"
         count = members if encoder == "separate" else 1
-        networks = [build_network(network, self.view.shape, generator, hidden_width) for _ in range(count)]
+        settings = network, self.view.shape, generator, hidden_width, self.view.dtype
+        networks = [build_network(*settings) for _ in range(count)]
         heads: list[nn.Sequential] = []
         if encoder == "separate":
             self.members: nn.ModuleList | tuple[nn.Sequential, ...] = nn.ModuleList(networks)
@@ -102,7 +106,7 @@ class Ensemble(nn.Module):
         self.train()
 
     def __repr__(self) -> str:
-        observations = f"observations {self.view.dtype} {self.observation_shape}"
+        observations = f"observations {type_text(self.view.dtype)} {self.observation_shape}"
         return f"Ensemble({len(self)} members, network {self.network!r}, {observations})"
 
     def __len__(self) -> int:
@@ -134,8 +138,14 @@ class Ensemble(nn.Module):
     def see(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> Any:
         """The members' view of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
 
-        For observations other than pictures: float32 (N, *shape), standardised.
+        For observations other than pictures: float32 (N, *shape), standardised; mixed ones (N,), their numbers so.
         """
+        if self.view.dtype.names and isinstance(observations, Mapping):
+            try:
+                observations = packed(observations, self.view.dtype)
+            except ValueError as error:
+                do = f"Give arrays (N, ...) by key: {type_text(self.view.dtype)}."
+                raise UserError(NO_OBSERVATIONS, error, do) from None
         try:
             observations = np.asarray(observations)
         except ValueError:  # of different shapes
@@ -144,7 +154,7 @@ class Ensemble(nn.Module):
             observations = observations.astype(NUMBERS)
         if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
             kind = f"{observations.dtype} {observations.shape}"
-            expected = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
+            expected = f"{type_text(self.view.dtype)} (N, {', '.join(map(str, self.observation_shape))})"
             raise UserError(NO_OBSERVATIONS, kind, f"Give {expected}.")
         if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
             kind = "none" if positions is None else f"{positions.dtype} {positions.shape}"
@@ -164,7 +174,8 @@ class Ensemble(nn.Module):
         """Every member's probability that the sub-goal holds.
 
         Args:
-            observations: uint8 (N, H, W, C), or float32 of any shape, as in training; or a list of N.
+            observations: uint8 (N, H, W, C), or float32 of any shape, as in training; or a list of N. Mixed ones: a
+                dictionary of such arrays.
             positions: int64 (N, 3) of room, x, y; only if ``needs_positions``.
 
         Returns:
@@ -204,15 +215,17 @@ class Ensemble(nn.Module):
 
         The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
         (N, K, *the shape of the view; (H, W, C) for pictures) in log-odds: a state's sum is its log-odds minus the
-        baseline's. ``UserError`` as for :meth:`predict`, or without states.
+        baseline's. Of mixed observations (N, K), with a field for each key. ``UserError`` as for :meth:`predict`, or
+        without states.
         """
-        from hypogoal.hypotheses.deep_lift import AT_ONCE, attributed, mean_state
+        from hypogoal.hypotheses.deep_lift import AT_ONCE, attributed, by_key, mean_state
 
         if not (len(observations) and len(against)):
             raise UserError("attributions need states, and others to compare with", None, "Give one or more of each.")
         seen, baseline, fixed = self.see(observations), mean_state(self.see(against)), copy.deepcopy(self).cpu().eval()
         parts = (seen[start : start + AT_ONCE] for start in range(0, len(seen), AT_ONCE))
-        return np.concatenate([attributed(fixed, part, baseline).values.astype(np.float32) for part in parts])
+        values = np.concatenate([attributed(fixed, part, baseline).values.astype(np.float32) for part in parts])
+        return by_key(values, self.view.dtype) if self.view.dtype.names else values
 
     def _logits(self, observations: Observations) -> Tensor:
         """Logits (K, N, 2); computes each distinct patch once if that pays."""
@@ -225,10 +238,11 @@ class Ensemble(nn.Module):
                 return _logits(trunk, heads, batch)
         if len(observations) >= FOLD_FROM:
             trunk, heads = trunk and folded(trunk), tuple(folded(head) for head in heads)
-        chunk = at_once(IMAGES_AT_ONCE, observations.shape[1:]) if device.type == "cpu" else len(observations)
+        size = (values_in(observations.shape[1:], observations.dtype),)
+        chunk = at_once(IMAGES_AT_ONCE, size) if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
-            inputs = as_input(torch.from_numpy(observations[start : start + chunk]).to(device))
+            inputs = as_input(as_tensor(observations[start : start + chunk]).to(device), observations.dtype)
             logits.append(_logits(trunk, heads, inputs))
         return torch.cat(logits, dim=1)
 
@@ -260,7 +274,7 @@ class Ensemble(nn.Module):
         def make() -> Ensemble:
             return cls(network, observation_shape, members, torch.Generator(), view, **settings)
 
-        return load_fitting(make, state, where, custom=network not in NETWORKS).eval()
+        return load_fitting(make, state, where, custom=not NETWORKS.keys() >= {*names_in(network)}).eval()
 
 
 def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:
@@ -301,11 +315,15 @@ def _view(
     observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
 ) -> FullView | AgentView:
     """The view that the settings ask for, without its weights; early ensembles have no such settings and see all."""
-    if config.get("observation_dtype") == str(NUMBERS):
+    dtype = type_of(config.get("observation_dtype", str(PICTURE)))
+    if dtype != PICTURE:
+        size = standard_shape(observation_shape, dtype)
+        if not prod(size):
+            return FullView(observation_shape, None, dtype)
         mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
-        if mean.shape != observation_shape:  # a damaged manifest may ask for terabytes
+        if mean.shape != size:  # a damaged manifest may ask for terabytes
             raise ValueError(observation_shape)
-        return FullView(observation_shape, (mean, deviation))
+        return FullView(observation_shape, (mean, deviation), dtype)
     if config.get("view", "full") == "full":
         return FullView(observation_shape)
     localiser: Localiser = LearnedLocaliser(observation_shape)

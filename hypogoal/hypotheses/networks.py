@@ -27,10 +27,12 @@ from torch.nn.utils import fuse_conv_bn_eval
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
 from hypogoal.core.tensors import KEPT
-from hypogoal.dataset import NUMBERS, PICTURE
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, values_in
+from hypogoal.hypotheses.load import ByKey
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
+JOINT = 256  # units of the dense layer that joins the keys of mixed observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
 ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
@@ -92,8 +94,24 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
 
 
 def network_for(name: str, dtype: np.dtype[Any]) -> str:
-    """Resolve ``auto`` by the type of observations; any other name stays."""
-    return {PICTURE: "doorkey", NUMBERS: "mlp"}[dtype] if name == AUTO else name
+    """Resolve ``auto`` by the type of observations; any other name stays.
+
+    Of mixed observations the names by key, ``front=doorkey,state=mlp``. A name without a key is for all pictures; a
+    key that they lack is a ``UserError``.
+    """
+    if not dtype.names:
+        return {PICTURE: "doorkey", NUMBERS: "mlp"}[dtype] if name == AUTO else name
+    named = dict(part.strip().rpartition("=")[::2] for part in name.split(","))
+    if unknown := {*named} - {"", *dtype.names}:
+        raise UserError("no such key in the observations", ", ".join(unknown), f"Known are {', '.join(dtype.names)}.")
+    general = {PICTURE: named.get("", AUTO), NUMBERS: AUTO}
+    kinds = {key: dtype[key].base for key in dtype.names}
+    return ",".join(f"{key}={network_for(named.get(key, general[kind]), kind)}" for key, kind in kinds.items())
+
+
+def names_in(network: str) -> list[str]:
+    """The names of networks in a setting, which may have one for each key."""
+    return [part.strip().rpartition("=")[2] for part in network.split(",")]
 
 
 def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
@@ -144,21 +162,32 @@ def _checked(name: str, function: Callable[..., Parts | nn.Module]) -> Callable[
 
 
 def build_network(
-    name: str, observation_shape: tuple[int, ...], generator: torch.Generator, hidden_width: int = 0
+    name: str,
+    observation_shape: tuple[int, ...],
+    generator: torch.Generator,
+    hidden_width: int = 0,
+    dtype: np.dtype[Any] = PICTURE,
 ) -> nn.Sequential:
     """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
     ``generator`` draws the initial weights (PyTorch's default distributions); ``hidden_width`` above 0 adds a layer of
-    that width before the last. An unknown network (see :func:`load_network`), or observations that it does not take,
-    for example images too small for it, are a ``UserError``.
+    that width before the last. Of mixed observations, of type ``dtype``, each key has its network without the last
+    layer; a dense layer joins them. An unknown network (see :func:`load_network`), or observations that it does not
+    take, for example images too small for it, are a ``UserError``.
     """
-    parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
-    sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]
+    parts_of = None if dtype.names else load_network(name)
+    if dtype.names:
+        fields = fields_of((), dtype).values()
+        names = zip(names_in(network_for(name, dtype)), fields, strict=True)
+        encoders = [build_network(of_key, shape, generator)[:-1] for of_key, (_, shape) in names]
+        by_key = ByKey([as_input(torch.zeros(1, *shape)).shape[1:] for _, shape in fields], encoders)
+        joined: Parts = [by_key], () if hidden_width else (JOINT,)
+    sizes = (values_in((), dtype),) if dtype.names else as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
         torch.manual_seed(seed)
-        layers, hidden = parts_of(observation_shape)
+        layers, hidden = parts_of(observation_shape) if parts_of else joined
         features = _features(layers, *sizes)
         if features is None:
             channels = observation_shape[-1]
@@ -220,11 +249,28 @@ def folded(network: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*layers).eval()
 
 
-def as_input(observations: Tensor) -> Tensor:
+def as_tensor(observations: Observations) -> Tensor:
+    """Observations (N, ...) in the same memory; mixed ones as their bytes, uint8 (N, B), for :func:`as_input`."""
+    if observations.dtype.names:
+        observations = observations.view(np.uint8).reshape(len(observations), observations.dtype.itemsize)
+    return torch.from_numpy(observations)
+
+
+def as_input(observations: Tensor, dtype: np.dtype[Any] = PICTURE) -> Tensor:
     """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
 
-    Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too.
+    Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too. Mixed ones
+    of type ``dtype``, as bytes, become float32 (N, D), the inputs of all keys in a row.
     """
+    if dtype.names:
+        rows = []
+        for key, (kind, shape) in fields_of((), dtype).items():
+            at = dtype.fields[key][1]  # type: ignore[index]
+            part = observations[:, at : at + dtype[key].itemsize].clone(memory_format=torch.contiguous_format)
+            rows.append(
+                as_input((part.view(torch.float32) if kind == NUMBERS else part).reshape(-1, *shape)).flatten(1)
+            )
+        return torch.cat(rows, dim=1)
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 PAPER = "0.5"
 CERTAIN = 1e-12  # probabilities are clipped this far from 0 and 1
+ENOUGH, NEXT, LEAST = 0.05, 0.75, 0.5  # of thresholds that fall, see :func:`fallen`
 Probabilities = NDArray[np.float32]  # (states,), one member's
 Rule = Callable[[Probabilities, Probabilities, Probabilities], np.floating]
 
@@ -21,6 +22,16 @@ def log_odds_of(probabilities: NDArray[Any]) -> NDArray[np.float64]:
     """The log-odds of probabilities (...,), always finite."""
     exact = probabilities.astype(np.float64).clip(CERTAIN, 1 - CERTAIN)
     return np.asarray(np.log(exact) - np.log1p(-exact))
+
+
+def fallen(
+    thresholds: NDArray[np.float32], first: NDArray[np.float32], highest: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Thresholds (K,), log-odds, where less than ``ENOUGH`` was reached: ``NEXT`` of the highest log-odds met.
+
+    They never fall below ``LEAST`` of what they were at ``first``, nor rise.
+    """
+    return np.minimum(thresholds, np.maximum(LEAST * first, NEXT * highest))
 
 
 def _unlabelled_q95(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:

@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
 from hypogoal.core.seeding import torch_generator
-from hypogoal.dataset import NUMBERS, Observations, standard_of
+from hypogoal.dataset import PICTURE, Observations
 from hypogoal.diversity import OBJECTIVES
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import Round
-from hypogoal.hypotheses.views import FullView, cut_windows
+from hypogoal.hypotheses.views import FullView, cut_windows, full_view
 
 SECONDS = 0.3  # after which no larger batch is tried
 LEARNING = 3  # numbers per trained weight: its gradient and two of Adam's
@@ -41,14 +41,14 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     Batches grow from two states until ``seconds`` are over; the result is a line through the first and the last.
     D-BAT replaces a user's objective, which is not called. States that the network does not take are a ``UserError``.
     """
-    pictures = states.dtype != NUMBERS
+    pictures = states.dtype == PICTURE
     cut, margin = pictures and config.view == "agent-crop", config.jitter
     if cut:  # from the middle, wherever the agent is
         size = config.crop_height + 2 * margin, config.crop_width + 2 * margin
         states = cut_windows(states, np.tile(np.divide(states.shape[1:3], 2), (len(states), 1)), *size)
     shape = (config.crop_height, config.crop_width, *states.shape[3:]) if cut else states.shape[1:]
-    view = FullView(shape, None if pictures else standard_of(shape, states))
-    states = states if pictures else view.see(states)
+    view = FullView(shape) if pictures else full_view(states, states)
+    states = view.see(states)
     objective = config.diversity if config.diversity in OBJECTIVES else "dbat"
     trained = 1 if config.schedule == "sequential" else config.members  # at once
     sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, Standard, standard_of, standardised
+from hypogoal.dataset import (
+    NUMBERS,
+    PICTURE,
+    Observations,
+    Standard,
+    fields_of,
+    numbers_of,
+    standard_of,
+    standardised,
+)
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.localisers import AgentPixels, LearnedLocaliser, Localiser, RamLocaliser, fit_localiser
 
@@ -42,29 +52,55 @@ NO_ORIGINS = StateOrigins()
 
 
 class FullView(nn.Module):
-    """All of an observation: a picture as it is, the paper's view; numbers standardised by ``standard``."""
+    """All of an observation: a picture as it is, the paper's view; numbers standardised by ``standard``.
+
+    Of a mixed observation, of type ``dtype``, ``standard`` is that of all its numbers, (D,).
+    """
 
     needs_positions = False
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, observation_shape: tuple[int, ...], standard: Standard | None = None):
+    def __init__(
+        self, observation_shape: tuple[int, ...], standard: Standard | None = None, dtype: np.dtype[Any] | None = None
+    ):
         super().__init__()
-        self.shape, self.dtype = observation_shape, NUMBERS if standard else PICTURE
+        self.shape, self.dtype = observation_shape, (NUMBERS if standard else PICTURE) if dtype is None else dtype
         for name, values in zip(("mean", "deviation"), standard or (), strict=False):
             self.register_buffer(name, torch.from_numpy(values.copy()))
 
     @property
     def standard(self) -> Standard | None:
         """Mean and deviation (*shape) of numbers; None for pictures."""
-        return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if self.dtype == NUMBERS else None
+        return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if "mean" in self._buffers else None
 
     def see(
         self, observations: Observations, positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> Observations:
         """The observations (N, *shape)."""
         assert not margin, "a full view has no margin"
-        return standardised(observations, *self.standard) if self.standard else observations
+        if self.standard is None or not self.dtype.names:
+            return standardised(observations, *self.standard) if self.standard else observations
+        seen, numbers, place = observations.copy(), standardised(numbers_of(observations), *self.standard), 0
+        for key, (dtype, shape) in fields_of((), self.dtype).items():
+            if dtype == NUMBERS:
+                seen[key] = numbers[:, place : place + prod(shape)].reshape(-1, *shape)
+                place += prod(shape)
+        return seen
+
+
+def full_view(like: Observations, *observations: Observations) -> FullView:
+    """All of observations ``like`` these, their numbers standardised by mean and deviation of ``observations``."""
+    shape, dtype = like.shape[1:], like.dtype
+    size = standard_shape(shape, dtype)
+    rows = (numbers_of(some).reshape(len(some), *size) for some in observations)
+    return FullView(shape, standard_of(size, *rows) if prod(size) else None, dtype)
+
+
+def standard_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
+    """The shape of an observation's standard: that of numbers, else (D,), how many numbers it has."""
+    sizes = [prod(size) for kind, size in fields_of(shape, dtype).values() if kind == NUMBERS]
+    return shape if dtype == NUMBERS else (sum(sizes),)
 
 
 class AgentView(nn.Module):
@@ -148,11 +184,11 @@ def view_of(
 ) -> FullView | AgentView:
     """The members' view; ``fitted`` trains its localiser and computes its standard, else these are to be loaded."""
     shape = observations.shape[1:]
-    if observations.dtype == NUMBERS:
+    if observations.dtype != PICTURE:
         for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
             if (chosen := getattr(config, name)) != value:
                 raise UserError("these observations are not pictures", f"{name}={chosen}", f"Set {name}={value}.")
-        return FullView(shape, standard_of(shape, *([observations, unlabelled] if fitted else [])))
+        return full_view(observations, *([observations, unlabelled] if fitted else []))
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")

@@ -21,7 +21,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.core.workers import CORES, allowed
 from hypogoal.dataset import PICTURE, Standard, standard_of
-from hypogoal.domains.base import Domain, Engine, Layouts
+from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
 from hypogoal.options.choosers import load_chooser
@@ -69,6 +69,7 @@ def assemble(
     cut(engine, config.cap)
     rules = [] if config.termination == ORACLE else [rule_of(config.termination)[0]]
     parts: list[type[Part]] = [learner, chooser, *views, *rules]
+    require_one_kind(engine)
     for part in parts:
         part.refuse(config, engine)
     if engine.observation_dtype != PICTURE:

@@ -21,6 +21,7 @@ from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.thresholds import ENOUGH, fallen
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.parts import Part, load_part
 
@@ -171,7 +172,6 @@ class Patience(Terminations):
     LENGTH = "STEPS"
 
     CHANGING = (*Terminations.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
-    ENOUGH, NEXT, LEAST = 0.05, 0.75, 0.5
 
     def __init__(self, *arguments: Any, **more: Any):
         super().__init__(*arguments, **more)
@@ -199,9 +199,9 @@ class Patience(Terminations):
         np.add.at(self._reaches, options, reached)
         np.maximum.at(self._highest, options, self._best[environments])
         due = self._steps >= self.length
-        content = self._reaches >= self.ENOUGH * self._executions
-        less = np.maximum(self.LEAST * self._first, self.NEXT * self._highest)
-        self.thresholds = np.where(due & ~content, np.minimum(self.thresholds, less), self.thresholds)
+        content = self._reaches >= ENOUGH * self._executions
+        less = fallen(self.thresholds, self._first, self._highest)
+        self.thresholds = np.where(due & ~content, less, self.thresholds)
         for counted in (self._steps, self._executions, self._reaches):
             counted[due] = 0
         self._highest[due] = -np.inf

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
-from hypogoal.dataset import NUMBERS, Dataset, Observations
+from hypogoal.dataset import NUMBERS, Dataset, Observations, fields_of
 from hypogoal.own_data.parts import Parts, as_observations, require_memory
 
 NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
 NAMES = ("sub_goals", "features")
 KNOWN = (*NEEDED, *OPTIONAL, *NAMES)
+STATES = ("observations", "unlabelled", "heldout_observations")
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # other methods make gigabytes of a kilobyte
 ENCRYPTED = 1  # a flag of an entry
 DAMAGED = (
@@ -30,11 +31,16 @@ DAMAGED = (
 
 def read_arrays(path: Path) -> Parts:
     """Arrays by name, of a ``.npz`` file or a folder of ``.npy`` files: ``NEEDED``, perhaps ``OPTIONAL``, ``sub_goals``
-    (G texts) and ``features``.
+    (G texts) and ``features``. Mixed observations have an array for each key: ``observations/front``.
 
     Missing, damaged or misnamed arrays, ones larger than memory, and pickled Python objects are a ``UserError``.
     """
-    arrays = _folder(path) if path.is_dir() else _file(path, others=False)
+    arrays: dict[str, Any] = dict(_folder(path) if path.is_dir() else _file(path, others=False))
+    for name in [name for name in arrays if "/" in name]:
+        base, _, key = name.partition("/")
+        if isinstance(arrays.setdefault(base, {}), np.ndarray):
+            raise UserError(f"{base!r} is one array and several by key", path, "Give either.")
+        arrays[base][key] = arrays.pop(name)
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
         do = f"Give arrays called {', '.join(NEEDED)}, and {' and '.join(OPTIONAL)} where there are some."
@@ -45,8 +51,7 @@ def read_arrays(path: Path) -> Parts:
         if name in arrays and arrays[name].dtype.kind != "U":
             raise UserError(f"{name} are {arrays[name].dtype}, not texts", path, "Give numpy.array of str.")
     named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
-    values: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
-    return Parts(**values, **named)
+    return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, **named)
 
 
 def read_states(path: Path) -> Observations:
@@ -68,14 +73,22 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
             if not np.array_equal(first.setdefault(split, states.observations), states.observations):
                 raise UserError("its sub-goals do not share their states", dataset.path, "Read it with h5py instead.")
             labels.append(states.labels)
-    arrays: dict[str, Any] = {
+    states = {
         "observations": first["labelled"],
-        "labels": np.stack(columns["labelled"], axis=1),
         "unlabelled": dataset.unlabelled(),
         "heldout_observations": first["heldout"],
+    }
+    keys = fields_of(dataset.observation_shape, dataset.observation_dtype)
+    arrays: dict[str, Any] = {
+        "labels": np.stack(columns["labelled"], axis=1),
         "heldout_labels": np.stack(columns["heldout"], axis=1),
         "sub_goals": np.array(dataset.sub_goals),
         **({"features": np.array(dataset.features())} if dataset.observation_dtype == NUMBERS else {}),
+        **{
+            f"{name}/{key}" if key else name: some[key] if key else some
+            for name, some in states.items()
+            for key in keys
+        },
     }
     with path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -98,16 +111,16 @@ def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
             with np.load(raw, allow_pickle=False) as arrays:
                 if not others:
                     _require_known(arrays.files, path)
-                return {name: arrays[name] for name in arrays.files if name in KNOWN}
+                return {name: arrays[name] for name in arrays.files if _known(name)}
         except DAMAGED as error:
             raise _damaged(path, error) from None
 
 
 def _folder(path: Path) -> dict[str, NDArray[Any]]:
     arrays = {}
-    _require_known(sorted(file.stem for file in path.glob("*.npy")), path)
-    files = {name: path / f"{name}.npy" for name in KNOWN}
-    existing = {name: file for name, file in files.items() if file.is_file()}
+    files = [*path.glob("*.npy"), *(file for name in STATES for file in (path / name).glob("*.npy"))]
+    existing = {file.relative_to(path).with_suffix("").as_posix(): file for file in sorted(files) if file.is_file()}
+    _require_known(existing, path)
     require_memory(sum(file.stat().st_size for file in existing.values()), path)
     for name, file in existing.items():
         try:
@@ -120,9 +133,15 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
 def _require_known(names: Iterable[str], path: Path) -> None:
     """Refuse (``UserError``) a misspelt name: held-out states would be left out silently."""
     for name in names:
-        if name not in KNOWN:
+        if not _known(name):
             do = meant(name, KNOWN) or f"Known are {', '.join(KNOWN)}; leave it out."
             raise UserError(f"unknown array {name!r}", path, do)
+
+
+def _known(name: str) -> bool:
+    """Whether a file may hold this array; of states there may be several, by key."""
+    base, _, key = name.partition("/")
+    return name in KNOWN or (base in STATES and bool(key))
 
 
 def _damaged(path: Path, error: Exception) -> UserError:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +13,23 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import checked, create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
-from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE, write_observations
 from hypogoal.domains.recorded_play import MINARI
 from hypogoal.meta.episodes import Episode
-from hypogoal.own_data.parts import Parts, require_memory
+from hypogoal.own_data.parts import Parts, Source, require_memory
+from hypogoal.own_data.recordings import split_episodes
 
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
 MINARI_VERSION = "0.5.4"  # its layout is written
-SPLIT = (0.4, 0.4, 0.2)  # shares of episodes that are labelled, unlabelled and held out
 
-Label = Callable[[NDArray[Any]], bool]  # from an observation to whether the sub-goal holds
+Label = Callable[[Any], bool]  # from an observation, by key if it has several, to whether the sub-goal holds
 
 
-def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: int = 0) -> Parts:
+def read_minari(folder: Path, labels: Sequence[Label], *, keys: Sequence[str] = (), seed: int = 0) -> Parts:
     """The observations of a dataset; each whole episode is labelled, unlabelled or held out, drawn by ``seed``.
 
-    ``folder`` contains ``data/``; ``key`` selects a part of observations that are dictionaries. A missing dataset,
+    ``folder`` contains ``data/``; ``keys`` select parts of observations that are dictionaries. A missing dataset,
     another storage format, too few episodes, and a label function that fails are a ``UserError``.
     """
     if not labels:
@@ -39,21 +38,17 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
     stored = metadata.get("data_format", "hdf5") if isinstance(metadata, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
-    names, episodes = _episodes(folder / MINARI, key, _picture_shape(metadata.get("observation_space"), key))
-    if len(episodes) < 3:
-        raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
-    order = rng_for(seed, "minari").permutation(len(episodes))
-    ends = np.round(np.cumsum(SPLIT)[:2] / sum(SPLIT) * len(episodes)).astype(int)
-    ends = np.clip(ends, (1, 2), (len(episodes) - 2, len(episodes) - 1))
-    parts = np.split(order, ends)
-    labelled, unlabelled, heldout = (np.concatenate([episodes[i] for i in part]) for part in parts)
+    space = metadata.get("observation_space")
+    read = {key: _episodes(folder / MINARI, key, _picture_shape(space, key)) for key in keys or ("",)}
+    names, episodes = next(iter(read.values()))
+    parts = split_episodes(len(names), range(len(names)), seed, folder)
+    by_key = [{key: np.concatenate([of[i] for i in part]) for key, (_, of) in read.items()} for part in parts]
+    labelled, unlabelled, heldout = (some if len(keys) > 1 else next(iter(some.values())) for some in by_key)
+
+    steps = [[f"{names[i]}, step {step}" for i in part for step in range(len(episodes[i]))] for part in parts]
 
     def name(field: str, row: int) -> str:
-        part = parts[("observations", "unlabelled", "heldout_observations").index(field)]
-        ends_of_episodes = np.cumsum([len(episodes[i]) for i in part])
-        place = int(np.searchsorted(ends_of_episodes, row, side="right"))
-        step = row - int(ends_of_episodes[place]) + len(episodes[part[place]])
-        return f"{names[part[place]]}, step {step}"
+        return steps[("observations", "unlabelled", "heldout_observations").index(field)][row]
 
     return Parts(labelled, _labels(labels, labelled), unlabelled, heldout, _labels(labels, heldout), name=name)
 
@@ -61,7 +56,9 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
 def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list[str], list[NDArray[Any]]]:
     """The names of the episodes, and the observations of each."""
     with open_hdf5(path, "the dataset", DO) as file:
-        names = sorted((name for name in members(file) if name.startswith("episode_")), key=_number)
+        names = sorted(
+            (name for name in members(file) if name.startswith("episode_")), key=lambda name: (len(name), name)
+        )
         place = f"observations/{key}" if key else "observations"
         if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
             keys = ", ".join(members(find(file, f"{names[0]}/observations")))
@@ -89,13 +86,11 @@ def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:
         return None
 
 
-def _number(name: str) -> int:
-    tail = name.removeprefix("episode_")
-    return int(tail) if tail.isdecimal() else -1
-
-
-def _labels(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.bool_]:
+def _labels(labels: Sequence[Label], states: Source) -> NDArray[np.bool_]:
     """The functions' labels of each observation, bool (N, G)."""
+    observations: Any = states
+    if isinstance(states, Mapping):
+        observations = [dict(zip(states, row, strict=True)) for row in zip(*states.values(), strict=True)]
     truths = np.empty((len(observations), len(labels)), np.bool_)
     for column, label in enumerate(labels):
         with UsersCode(f"the label function {getattr(label, '__name__', column)}", label) as code:

@@ -1,10 +1,10 @@
 """Users' states, checked and split into the sets of a data file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,17 @@ from hypogoal.dataset import (
     hard_to_judge,
     hard_to_learn,
     leave_out,
+    packed,
     require_classes,
     require_names,
+    type_text,
 )
 from hypogoal.domains.observations import Reading, reading_of, shrunk_picture
 from hypogoal.own_data.supervision import contradictions, looks_of, near_duplicates, require_own_pictures
 
+# Pictures (N, H, W, C) or (N, H, W), or numbers (N, *shape); such arrays by key; or mixed observations (N,).
+Source: TypeAlias = NDArray[Any] | Mapping[str, NDArray[Any]]
+Resize: TypeAlias = int | Mapping[str, int]  # most pixels on the longer side, 0: any; or by key, "" for other pictures
 COPIES = 4  # of the states, in memory at once while they are compared and written
 
 
@@ -33,10 +38,10 @@ COPIES = 4  # of the states, in memory at once while they are compared and writt
 class Parts:
     """States as read, unchecked. Without held-out states, a share of the labelled ones will be held out."""
 
-    observations: NDArray[Any]  # labelled: pictures (N, H, W, C) or (N, H, W), or numbers (N, *shape)
+    observations: Source  # labelled
     labels: NDArray[Any]  # (N,) or (N, G)
-    unlabelled: NDArray[Any]  # (M, ...)
-    heldout_observations: NDArray[Any] | None = None  # as ``observations``
+    unlabelled: Source  # (M, ...)
+    heldout_observations: Source | None = None
     heldout_labels: NDArray[Any] | None = None
     sub_goals: tuple[str, ...] = ()  # their names, if the source has them
     features: tuple[str, ...] = ()  # names of the numbers
@@ -44,7 +49,13 @@ class Parts:
 
 
 def collected_of(
-    parts: Parts, sub_goals: Sequence[str], *, share: float = 0.2, seed: int = 0, resize: int = 0, stack: bool = False
+    parts: Parts,
+    sub_goals: Sequence[str],
+    *,
+    share: float = 0.2,
+    seed: int = 0,
+    resize: Resize = 0,
+    stack: bool = False,
 ) -> tuple[Collected, list[str]]:
     """The states in the form of a data file, and lines that warn of what is allowed but may surprise.
 
@@ -54,8 +65,8 @@ def collected_of(
     """
     warned: list[str] = []
     images = as_observations(parts.observations, "the labelled observations", resize=resize, stack=stack)
-    if doubt := _reading(parts.observations).doubt:
-        warned.append(doubt)
+    sources = parts.observations.values() if isinstance(parts.observations, Mapping) else [parts.observations]
+    warned += [doubt for source in sources if not source.dtype.names and (doubt := _reading(source).doubt)]
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
         counts = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
         raise UserError("the number of feature names is wrong", counts, "Give one for each.")
@@ -134,13 +145,40 @@ def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, role: str,
 
 
 def as_observations(
-    values: NDArray[Any], subject: str, like: NDArray[Any] | None = None, *, resize: int = 0, stack: bool = False
+    values: Source, subject: str, like: NDArray[Any] | None = None, *, resize: Resize = 0, stack: bool = False
 ) -> NDArray[Any]:
     """Pictures uint8 (N, H, W, C) or numbers float32 (N, *shape), told apart by ``hypogoal.domains.observations``.
 
-    ``stack``: axes of frames and colours become channels. ``resize``: at most so many pixels on the longer side. Values
-    that are neither, an empty array, and a shape or type that differs from ``like`` are a ``UserError``.
+    Arrays by key become mixed observations. ``stack``: axes of frames and colours become channels. ``resize``: at most
+    so many pixels on the longer side. Values that are neither, an empty array, and a shape or type that differs from
+    ``like`` are a ``UserError``.
     """
+    if isinstance(values, Mapping):
+        parts = {}
+        for key, part in values.items():
+            size = resize_of(resize, key, picture=part.dtype == PICTURE and part.ndim > 2)
+            parts[key] = as_observations(part, f"{subject} {key!r}", resize=size, stack=stack)
+        try:
+            values = packed(parts)
+        except ValueError as error:
+            do = "Give as many states of each key, and keys that can be file names."
+            raise UserError(f"{subject} do not fit together", error, do) from None
+    elif not values.dtype.names:
+        values = _of_one_kind(values, subject, resize_of(resize, "", picture=True), stack)
+    if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
+        difference = f"{type_text(values.dtype)} {values.shape[1:]}, not {type_text(like.dtype)} {like.shape[1:]}"
+        raise UserError(f"{subject} differ in shape or type from the labelled ones", difference)
+    return np.ascontiguousarray(values)
+
+
+def resize_of(resize: Resize, key: str, *, picture: bool) -> int:
+    """What ``resize`` says of a key; what it says of all others holds for pictures only."""
+    by_key = resize if isinstance(resize, Mapping) else {"": resize}
+    return by_key.get(key, by_key.get("", 0) if picture else 0)
+
+
+def _of_one_kind(values: NDArray[Any], subject: str, resize: int, stack: bool) -> NDArray[Any]:
+    """Pictures or numbers, see :func:`as_observations`."""
     actual = f"{values.dtype} {values.shape}"
     if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
         do = "Give images (N, height, width, channels), or numbers (N, ...)."
@@ -164,10 +202,7 @@ def as_observations(
         values = values.astype(NUMBERS, copy=False)
         if not np.isfinite(values).all():
             raise UserError(f"{subject} have numbers that are not finite", actual, "Give finite ones.")
-    if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
-        difference = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
-        raise UserError(f"{subject} differ in shape or type from the labelled ones", difference)
-    return np.ascontiguousarray(values)
+    return values
 
 
 def _reading(values: NDArray[Any]) -> Reading:

@@ -1,5 +1,6 @@
 """Stages with settings, by name: what commands and the functions of :mod:`hypogoal.api` share."""
 
+import re
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +26,9 @@ def make(
     domain = source if isinstance(source, str) else domain_of(source, stage)
     inherited = inherited_of(stage, rest["options"]) if rest.get("options") else {}
     config = configuration(stage, domain, preset, (), settings, by_user=by_user, inherited=inherited)
-    values = [part for value in settings.values() for part in (value.split(",") if isinstance(value, str) else ())]
+    values = [
+        part for value in settings.values() for part in (re.split("[,=]", value) if isinstance(value, str) else ())
+    ]
     trusted = [value for value in defaults_of(domain, stage, given=by_user).values() if isinstance(value, str)]
     first: Any = source
     if stage == "collect":

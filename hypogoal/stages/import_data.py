@@ -15,8 +15,12 @@ from hypogoal.dataset import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays, write_arrays
 from hypogoal.own_data.images import read_images
+from hypogoal.own_data.lerobot import INFO, LeRobot
 from hypogoal.own_data.minari import MINARI, read_minari
-from hypogoal.own_data.parts import collected_of
+from hypogoal.own_data.parts import Resize, collected_of, resize_of
+from hypogoal.own_data.recordings import Recording, recorded_parts
+from hypogoal.own_data.robomimic import Robomimic
+from hypogoal.own_data.videos import SUFFIX, Videos
 
 LABELS = "hypogoal.labels"  # entry points of label functions
 
@@ -27,9 +31,10 @@ def import_data(
     *,
     sub_goals: Sequence[str] = (),
     labels: Mapping[str, str] | None = None,
-    key: str = "",
+    keys: Sequence[str] = (),
     share: float = 0.2,
-    resize: int = 0,
+    resize: Resize = 0,
+    every: int = 1,
     stack: bool = False,
     domain: str = IMPORTED,
     seed: int = 0,
@@ -37,21 +42,26 @@ def import_data(
 ) -> dict[str, Any]:
     """Write the states of ``source`` into the data file ``out``; returns numbers of states and positives.
 
-    ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
-    ``sub_goals`` are names in the order of the labels' columns. For a Minari dataset, ``labels`` maps sub-goals to
-    ``module:function``, from an observation to a truth value, and ``key`` selects a part of a dictionary. Without
-    held-out states a ``share`` of the labelled ones is held out by ``seed``. ``resize``: at most so many pixels on the
-    longer side of pictures; 0: unchanged. ``stack``: axes of frames and colours become channels. ``domain`` is for
-    later stages. Errors: see ``hypogoal.own_data``.
+    ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or episodes: a folder with a Minari
+    dataset, a LeRobotDataset or mp4 files, or an HDF5 file of robomimic's. ``sub_goals`` are names in the order of the
+    labels' columns. For episodes ``labels`` maps sub-goals to what labels them: in a Minari dataset
+    ``module:function``, from an observation to a truth value, else see :func:`recorded_parts`; ``keys`` select parts of
+    observations, and ``every`` n-th frame is taken. Without held-out states a ``share`` of the labelled ones is held
+    out by ``seed``. ``resize``: at most so many pixels on the longer side of pictures; 0: unchanged. ``stack``: axes of
+    frames and colours become channels. ``domain`` is for later stages. Errors: see ``hypogoal.own_data``.
     """
+    rules = labels or {}
     claim(out, kind=DATA, inputs=[source], force=force)
     if (source / MINARI).exists():
-        functions = [load_own(name, "label function", LABELS, {}) for name in (labels or {}).values()]
-        parts, sub_goals = read_minari(source, functions, key=key, seed=seed), tuple(labels or ())
-    elif labels or key:
-        raise UserError("not a Minari dataset", source, "--label and --key are for the folder of one.")
+        functions = [load_own(name, "label function", LABELS, {}) for name in rules.values()]
+        parts, sub_goals = read_minari(source, functions, keys=keys, seed=seed), tuple(rules)
+    elif (recording := recording_of(source, keys, resize)) is not None:
+        parts, sub_goals = recorded_parts(recording, rules, every=every, seed=seed), ()
+    elif rules or keys or every > 1:
+        do = "--label, --key and --every are for Minari, LeRobot and robomimic datasets, and folders of mp4 files."
+        raise UserError("this is no recording", source, do)
     elif (source / "positive").is_dir() or (source / "negative").is_dir():
-        parts = read_images(source, resize=resize, stack=stack)
+        parts = read_images(source, resize=resize_of(resize, "", picture=True), stack=stack)
         sub_goals = sub_goals or (source.resolve().name,)
     else:
         parts = read_arrays(source)
@@ -60,21 +70,32 @@ def import_data(
     for line in warned:
         say(f"hypogoal: {line}", err=True)
     config: dict[str, Any] = {"source": printable(source.name)}
-    config |= ({"labels": dict(labels)} if labels else {}) | ({"resize": resize} if resize else {})
+    config |= ({"labels": dict(rules)} if rules else {}) | ({"resize": resize} if resize else {})
+    config |= {"every": every} if every > 1 else {}
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()
+
+
+def recording_of(source: Path, keys: Sequence[str], resize: Resize) -> Recording | None:
+    """The episodes of a LeRobotDataset, robomimic's HDF5 or a folder of mp4 files; None if it is none of them."""
+    if (source / INFO).exists():
+        return LeRobot(source, keys, resize)
+    if source.suffix in (".h5", ".hdf5"):
+        return Robomimic(source, keys, resize)
+    return Videos(source, keys, resize) if any(source.glob(f"*{SUFFIX}")) else None
 
 
 def _too_small(domain: str, states: Collected) -> list[str]:
     """The error that ``train-ensemble`` will raise for such images with its default network, if any."""
     from hypogoal.hypotheses.config import EnsembleConfig
-    from hypogoal.hypotheses.networks import build_network, network_for
+    from hypogoal.hypotheses.networks import build_network, names_in, network_for
 
     name = defaults_of(domain, "train-ensemble", given=True).get("network", EnsembleConfig().network)
     name = network_for(name, states.labelled.observations.dtype)
     try:
-        with own_code.vouched(name):  # the domain names it
-            build_network(name, states.observation_shape, torch_generator(0, "import"))
+        with own_code.vouched(*names_in(name)):  # the domain names it
+            dtype = states.labelled.observations.dtype
+            build_network(name, states.observation_shape, torch_generator(0, "import"), dtype=dtype)
     except UserError as error:
         return [str(error)]
     return []

@@ -11,7 +11,7 @@ from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import load_domain, require_one_kind
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.meta.training import cut, judged, played_world, write_layout
 from hypogoal.needs import baseline_needs, judging_member
@@ -68,6 +68,7 @@ def train_baseline(
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world)
     cut(engine, config.cap)
+    require_one_kind(engine)
     if data and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
     judges = 0.0

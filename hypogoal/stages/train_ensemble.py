@@ -20,12 +20,12 @@ from hypogoal.core.manifests import LOG, SCORES
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
-from hypogoal.dataset import Dataset, Observations, States, open_dataset
+from hypogoal.dataset import Dataset, Observations, States, open_dataset, type_text
 from hypogoal.diversity import load_objective
 from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
-from hypogoal.hypotheses.networks import load_network, network_for
+from hypogoal.hypotheses.networks import load_network, names_in, network_for
 from hypogoal.hypotheses.scores import best_mean_worst, best_threshold, halves, member_scores, ranking
 from hypogoal.hypotheses.thresholds import thresholds
 from hypogoal.hypotheses.training import Look, Watcher, fit
@@ -61,7 +61,8 @@ def train_ensemble(
     load_objective(config.diversity)
     dataset = open_dataset(data)
     config = replace(config, network=network_for(config.network, dataset.observation_dtype))
-    load_network(config.network)
+    for name in names_in(config.network):
+        load_network(name)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
         raise UserError("a sub-goal is named twice", ", ".join(sub_goals), "Name each once.")
@@ -72,7 +73,7 @@ def train_ensemble(
     inputs = [data, *others]
     out = claim(out, kind="ensemble", inputs=inputs, force=force, resume=resume)
     settings = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
-    settings |= {"observation_dtype": str(dataset.observation_dtype)}
+    settings |= {"observation_dtype": type_text(dataset.observation_dtype)}
     settings |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, steps_of(config), workers, device)

@@ -151,9 +151,10 @@ class _Contract:
         promise(shape == tuple(self.domain.observation_shape), text, "Make them agree.")
         dtype = engine.observation_dtype
         text = f"observations are {dtype} in the engine, {self.domain.observation_dtype} in the domain"
-        promise(dtype == self.domain.observation_dtype and dtype in (PICTURE, NUMBERS), text, "Give uint8 or float32.")
+        known = dtype in (PICTURE, NUMBERS) or dtype.names is not None
+        promise(dtype == self.domain.observation_dtype and known, text, "Give uint8 or float32.")
         text = f"observation_shape is {shape}"
-        promise(len(shape) == 3 or dtype == NUMBERS, text, "Pictures are (height, width, channels).")
+        promise(len(shape) == 3 or dtype != PICTURE, text, "Pictures are (height, width, channels).")
         if self.domain.doubt:
             warnings.warn(self.domain.doubt, stacklevel=2)
         _array(engine.reset(), np.int64, (COUNT,), "what reset() returns")
@@ -323,8 +324,9 @@ class _Contract:
         from hypogoal.hypotheses.networks import build_network, network_for
 
         name = self.domain.defaults.get("train-ensemble", {}).get("network", EnsembleConfig().network)
-        name = network_for(name, self.domain.observation_dtype)
-        build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"))
+        dtype = self.domain.observation_dtype
+        name = network_for(name, dtype)
+        build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"), dtype=dtype)
         return f"member network {name!r} takes the observations"
 
     def never_reached(self, goal: str, always: bool) -> str:

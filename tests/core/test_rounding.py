@@ -12,7 +12,7 @@ from hypogoal.core.rounding import above, at_least
 from hypogoal.diversity import ace
 from hypogoal.domains import montezuma_states
 from hypogoal.evaluation.curves import NEAR, SOLVED
-from hypogoal.options.termination import Patience
+from hypogoal.hypotheses.thresholds import ENOUGH
 
 
 def test_what_misses_a_bound_by_rounding_meets_it() -> None:
@@ -34,7 +34,7 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
         *(
             NEAR,
             SOLVED,
-            Patience.ENOUGH,
+            ENOUGH,
             ace.LEAST_SHARE,
             *montezuma_states.KIND_SHARES.values(),
             montezuma_states.SPARE,

@@ -152,7 +152,7 @@ def test_a_policy_collects() -> None:
     ("name", "message"),
     [
         ("WORDY", "observations must be images, uint8 .* or numbers"),
-        ("MIXED", "observations mix pictures with other values: image, cell. Wrap it in .*FilterObservation"),
+        ("MIXED", "observations mix pictures with other values: 0, 1. Give a Dict with each picture under a key"),
         ("STEERED", "actions must be Discrete"),
         ("LYING", "an observation that does not fit its space"),
         ("NEVER", "on-the-moon has no positives"),

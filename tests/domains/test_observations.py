@@ -82,7 +82,7 @@ def test_a_dictionary_hides_no_picture() -> None:
     speed = spaces.Box(0, 1, (2,))
     for shape, dtype in (((4, 48, 48, 3), np.uint8), ((48, 48), np.int64), ((3, 48, 48), np.uint8)):
         space = spaces.Dict(a=speed, b=spaces.Box(0, 1, shape, dtype))
-        with pytest.raises(UserError, match="observations mix pictures with other values: a, b"):
+        with pytest.raises(UserError, match=r"observations .*: b, u?int.* Under that key give x"):
             reader_of(Says(space, None))
         alone = Says(spaces.Dict(b=space["b"]), {"b": np.ones(shape, dtype)})
         with pytest.raises(UserError) as refused:

@@ -29,6 +29,7 @@ from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.wrappers import RewardedEnv
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.env import Options
 from hypogoal.options.initiation import Narrowed
@@ -259,8 +260,7 @@ def test_what_a_wrapped_environment_gives_is_looked_at(options: Options, ensembl
 
     for env in (
         hypogoal.OptionEnv(Unsure(), options),
-        hypogoal.SubgoalReward(Unsure(), ensemble),
-        hypogoal.SubgoalTermination(Unsure(), ensemble),
+        hypogoal.SubgoalReward(ensemble).wrap(Unsure()),
     ):
         env.reset(seed=0)
         with pytest.raises(UserError, match=r"^the environment's step gave the reward nan: test_agents\.py, line "):
@@ -273,8 +273,7 @@ def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) ->
     """Spec E1: Gymnasium's checker, whose warnings are errors here, but for the one that says: wrapped."""
     wrapped = [
         hypogoal.OptionEnv(corridor(), options),
-        hypogoal.SubgoalReward(corridor(), ensemble),
-        hypogoal.SubgoalTermination(corridor(), ensemble),
+        hypogoal.SubgoalReward(ensemble).wrap(corridor(), ends=False),
     ]
     for env in wrapped:
         with pytest.warns(UserWarning, match="different from the unwrapped version"):
@@ -285,7 +284,7 @@ def test_a_registered_environment_can_be_made_again_with_its_wrapper() -> None:
     """Gymnasium's ``spec`` of a wrapped environment knows the wrapper; without that its checker stops."""
     from gymnasium.utils import RecordConstructorArgs
 
-    for kind in (hypogoal.OptionEnv, hypogoal.SubgoalReward, hypogoal.SubgoalTermination):
+    for kind in (hypogoal.OptionEnv, RewardedEnv):
         assert issubclass(kind, RecordConstructorArgs)
 
 
@@ -294,9 +293,9 @@ def test_pictures_that_are_flipped_views(options: Options, ensemble: Ensemble) -
     env = hypogoal.OptionEnv(TimeLimit(Flipped(), 30), options)
     env.reset(seed=0)
     assert 1 <= env.step(0)[4]["duration"] <= options.timeout
-    reward = hypogoal.SubgoalReward(TimeLimit(Flipped(), 30), ensemble)
-    observation, _ = reward.reset(seed=0)
-    reward.step(1)
+    rewarded = hypogoal.SubgoalReward(ensemble).wrap(TimeLimit(Flipped(), 30))
+    observation, _ = rewarded.reset(seed=0)
+    rewarded.step(1)
     flipped, copied = observation[None], observation[None].copy()
     np.testing.assert_array_equal(ensemble.predict(flipped), ensemble.predict(copied))
     assert options.policies(0)(flipped[0]) == options.policies(0)(copied[0])
@@ -317,7 +316,7 @@ def test_pictures_without_an_axis_of_colours(tmp_path: Path) -> None:
     assert known.observation_shape == (48, 48, 1)
     for env in (
         hypogoal.OptionEnv(TimeLimit(Grey(), 30), hypogoal.load_options(tmp_path / "o")),
-        hypogoal.SubgoalReward(TimeLimit(Grey(), 30), known),
+        hypogoal.SubgoalReward(known).wrap(TimeLimit(Grey(), 30)),
     ):
         assert env.reset(seed=0)[0].shape == (48, 48)
         assert env.step(0)[0].shape == (48, 48)
@@ -340,32 +339,65 @@ def test_options_in_a_vector_of_environments(options: Options) -> None:
 @pytest.mark.parametrize("by", ["any", "vote", "all", "mean", 0, 1, np.int64(1), np.array(0), torch.tensor(1)])
 def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) -> None:
     """Spec D1: reward 1 where the classifier fires, else 0; with ``add`` the environment's own too."""
-    env = hypogoal.SubgoalReward(corridor(), ensemble, by)
+    reward = hypogoal.SubgoalReward(ensemble, by=by)
+    env = reward.wrap(corridor())
     env.reset(seed=0)
     told = [env.step(action) for action in (0, 1, 1, 1, 1)]
-    assert [reward for _, reward, _, _, _ in told] == [0, 0, 0, 0, 1]
+    assert [paid for _, paid, _, _, _ in told] == [0, 0, 0, 0, 1]
     assert [info["subgoal"] for *_, info in told] == [False] * 4 + [True]
-    both = hypogoal.SubgoalReward(corridor(), ensemble, by, scale=0.5, add=True)
+    rewards = reward(np.stack([observation for observation, *_ in told]))
+    assert rewards.dtype == np.float32 and rewards.tolist() == [0, 0, 0, 0, 1]
+    both = reward.wrap(corridor(), scale=0.5, add=True)
     both.reset(seed=0)
     assert [both.step(1)[1] for _ in range(3)] == [0, 0, 1.5]
 
 
 def test_a_classifier_ends_an_episode(run: Path) -> None:
     """Spec D1: the left end is no end of the task, and of the episode only with the wrapper."""
-    env = hypogoal.SubgoalTermination(corridor(), hypogoal.load_ensemble(run / "ensemble", "left-end"))
-    env.reset(seed=0)
-    assert [env.step(0)[2] for _ in range(2)] == [False, True]
+    reward = hypogoal.SubgoalReward(run / "ensemble", "left-end")
+    for ends in (True, False):
+        env = reward.wrap(corridor(), ends=ends)
+        env.reset(seed=0)
+        assert [env.step(0)[2] for _ in range(2)] == [False, ends]
 
 
-def test_mistakes_are_one_line(options: Options, ensemble: Ensemble) -> None:
+def test_thresholds_fall_where_nothing_is_rewarded(run: Path) -> None:
+    """Spec H4: after ``patience`` steps without a reward to .75 of the highest log-odds met, at least to half; not
+    where episodes are rewarded, and the ensemble's own stay.
+    """
+    ensemble = hypogoal.load_ensemble(run / "ensemble", "left-end")
+    ensemble.set_thresholds(np.full(MEMBERS, 0.9999999, np.float32))
+    high = ensemble.thresholds_as_log_odds()
+    env = hypogoal.SubgoalReward(ensemble, by="any", patience=10).wrap(SameLayout(corridor()))
+    for _ in range(3):  # three steps to the right end, where the task ends
+        env.reset()
+        assert [env.step(1)[1] for _ in range(3)] == [0, 0, 0]
+        assert (env.thresholds == high).all(), "not before ten steps"
+    env.reset()
+    seen = [env.step(action)[0] for action in (0, 0, 1, 1, 1, 1, 1)]
+    highest = ensemble.log_odds(np.stack(seen)).max(0)
+    np.testing.assert_allclose(env.thresholds, np.maximum(high / 2, 0.75 * highest), rtol=1e-5)
+    assert (env.thresholds < high).all() and (ensemble.thresholds_as_log_odds() == high).all()
+    before, paid = env.thresholds, 0
+    for _ in range(8):
+        env.reset()
+        paid += env.step(0)[1] + env.step(0)[1]
+    assert paid and (env.thresholds == before).all(), "episodes are rewarded: they stay"
+    with pytest.raises(UserError, match="the mean has no threshold that can fall"):
+        hypogoal.SubgoalReward(ensemble, by="mean", patience=10)
+
+
+def test_mistakes_are_one_line(run: Path, options: Options, ensemble: Ensemble) -> None:
     """Spec G2."""
     other = gymnasium.wrappers.ResizeObservation(CorridorEnv(), (24, 24))
-    for make in (lambda: hypogoal.OptionEnv(other, options), lambda: hypogoal.SubgoalReward(other, ensemble)):
+    for make in (lambda: hypogoal.OptionEnv(other, options), lambda: hypogoal.SubgoalReward(ensemble).wrap(other)):
         with pytest.raises(UserError, match=r"members were trained on other observations: uint8 \(24, 24, 3\)"):
             make()
     for by in ("most", 2, -1, True, np.True_, 1.0, np.int64(2), None):
         with pytest.raises(UserError, match="Choose one of any, vote, all, mean, or a member, 0 to 1"):
-            hypogoal.SubgoalTermination(CorridorEnv(), ensemble, by)
+            hypogoal.SubgoalReward(ensemble, by=by)
+    with pytest.raises(UserError, match="unknown sub-goal"):
+        hypogoal.SubgoalReward(run / "ensemble")
     env = hypogoal.OptionEnv(corridor(), options)
     with pytest.raises(UserError, match="was not reset"):
         env.step(0)
@@ -406,8 +438,7 @@ def test_maskable_ppo_learns_which_option_pays(options: Options) -> None:
 
 def test_stable_baselines3_learns_a_classifiers_reward(run: Path) -> None:
     """Spec D1: DQN, rewarded by the ensemble of the left end only, goes there; the environment pays at the right."""
-    left = hypogoal.load_ensemble(run / "ensemble", "left-end")
-    env = hypogoal.SubgoalTermination(hypogoal.SubgoalReward(SameLayout(corridor()), left), left)
+    env = hypogoal.SubgoalReward(run / "ensemble", "left-end").wrap(SameLayout(corridor()))
     agent = DQN(
         "MlpPolicy", env, learning_starts=100, buffer_size=2000, train_freq=2, target_update_interval=50, gamma=0.8,
         learning_rate=1e-3, exploration_fraction=0.6, seed=0,

@@ -447,17 +447,34 @@ def test_minari_datasets_are_labelled_by_a_function(tmp_path: Path, nested: bool
     assert open_dataset(data).config["labels"] == {"right": "test_import:at_right"}
 
 
+def goes_right(observation: dict[str, np.ndarray]) -> bool:
+    return at_right(observation["image"])
+
+
+def test_several_keys_of_a_minari_dataset(tmp_path: Path) -> None:
+    """Spec H6: pictures beside numbers; the label function gets a dictionary of them."""
+    folder, data = save_minari(tmp_path / "own-v0", nested=True), tmp_path / "data.h5"
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        for number in range(10):
+            file[f"episode_{number}/observations/speed"] = np.arange(12.0).reshape(6, 2)
+    words = ["import", str(folder), "--out", str(data), "--label", "right=test_import:goes_right", "-q"]
+    assert main([*words, "--key", "image", "--key", "speed"]) == 0
+    states = open_dataset(data).labelled("right")
+    assert states.observations["image"].shape == (24, SIDE, SIDE, 3)
+    assert states.labels.sum() == 12 and set(states.observations["speed"][:, 0]) == {0, 2, 4, 6, 8, 10}
+
+
 def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G2."""
     label = ["--label", "right=test_import:at_right"]
     cases = [
         (save_minari(tmp_path / "a"), [], "has no labels"),
-        (save_minari(tmp_path / "b"), ["--label", "right"], "--label needs name=module:function"),
+        (save_minari(tmp_path / "b"), ["--label", "right"], "--label needs NAME=RULE"),
         (save_minari(tmp_path / "c", nested=True), label, "Give --key, one of image"),
         (save_minari(tmp_path / "d", stored="arrow"), label, "'arrow' is not read"),
         (save_minari(tmp_path / "e", 2), label, "2 episodes cannot be"),
         (save_minari(tmp_path / "f"), [*label, "--key", "x"], "no readable 'episode_0/observations/x'"),
-        (save_images(tmp_path / "g"), label, "not a Minari dataset"),
+        (save_images(tmp_path / "g"), label, "this is no recording"),
         (
             save_minari(tmp_path / "h"),
             ["--label", "right=test_import:fails"],

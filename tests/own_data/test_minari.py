@@ -121,7 +121,7 @@ def test_what_cannot_be_exported_is_one_line(
     assert main(["export", str(agent), "--out", str(there / name), *more]) == 2
     assert words in capsys.readouterr().err
     assert [path.name for path in there.iterdir()] == ["there-v0"]
-    assert main(["export", str(agent.parent / "ensemble"), "--out", str(there / "x-v0")]) == 2
+    assert main(["export", str(agent.parent), "--out", str(there / "x-v0")]) == 2
 
 
 @pytest.mark.parametrize("jpeg", [True, False])

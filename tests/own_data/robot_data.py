@@ -1,0 +1,181 @@
+"""Writers of recorded episodes, field by field as their formats are published: LeRobotDataset, robomimic, mp4 files.
+
+Each episode is a light that wanders from left to right in what two cameras see; its place is the state. It is at the
+goal where the light is right of the middle of the picture.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+FPS, SIDES, LENGTHS = 10, {"top": (96, 128), "wrist": (64, 64)}, (12, 9, 15, 10, 14, 11)
+TOP, WRIST, STATE = "observation.images.top", "observation.images.wrist", "observation.state"
+
+
+def places(episode: int) -> np.ndarray:
+    """Where the light is in each frame, 0 to 1."""
+    return np.linspace(0.05 + 0.0031 * episode, 0.6 + 0.0517 * episode, LENGTHS[episode]).astype(np.float32)
+
+
+def picture(camera: str, place: float, episode: int) -> np.ndarray:
+    """A frame, uint8 (H, W, 3)."""
+    height, width = SIDES[camera]
+    frame = np.full((height, width, 3), 20 + 10 * episode, np.uint8)
+    left = int(place * (width - 16))
+    frame[height // 4 : height // 2, left : left + 16] = (250, 240, 200)
+    return frame
+
+
+def write_video(path: Path, frames: list[np.ndarray], fps: int = FPS) -> None:
+    """An mp4 file of the best codec that this build of FFmpeg has."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    codec = next(name for name in ("libx264", "libopenh264", "mpeg4") if name in av.codecs_available)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=fps)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate, stream.time_base = "yuv420p", 4_000_000, Fraction(1, fps)
+        for number, values in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(values, format="rgb24")
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def columns(episode: int, first: int) -> dict[str, Any]:
+    """An episode's columns of numbers; the third episode fails."""
+    count, at = LENGTHS[episode], places(episode)
+    success = (at > 0.5) & (episode != 2)
+    return {
+        STATE: pa.array(np.stack([at, 1 - at, at**2], 1).tolist(), pa.list_(pa.float32(), 3)),
+        "action": pa.array([[0.0, 1.0]] * count, pa.list_(pa.float32(), 2)),
+        "timestamp": pa.array((np.arange(count) / FPS).astype(np.float32)),
+        "frame_index": pa.array(np.arange(count)),
+        "episode_index": pa.array(np.full(count, episode)),
+        "index": pa.array(np.arange(first, first + count)),
+        "task_index": pa.array(np.zeros(count, np.int64)),
+        "next.reward": pa.array(success.astype(np.float32)),
+        "next.success": pa.array(success),
+    }
+
+
+def facts(version: str, kind: str) -> dict[str, Any]:
+    """``meta/info.json``."""
+    cameras = {
+        key: {"dtype": kind, "shape": [*SIDES[key.rpartition(".")[2]], 3], "names": ["height", "width", "channels"]}
+        for key in (TOP, WRIST)
+    }
+    one = {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in {
+        "timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
+        "task_index": "int64", "next.reward": "float32", "next.success": "bool",
+    }.items()}  # fmt: skip
+    numbers = {STATE: {"dtype": "float32", "shape": [3], "names": ["a", "b", "c"]}}
+    numbers |= {"action": {"dtype": "float32", "shape": [2], "names": ["x", "y"]}}
+    new = version == "v3.0"
+    paths = {
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+        if new
+        else "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+        if new
+        else "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    }
+    totals = {"total_episodes": len(LENGTHS), "total_frames": sum(LENGTHS), "total_tasks": 1, "chunks_size": 1000}
+    about = {"codebase_version": version, "robot_type": "so100", "fps": FPS, "splits": {"train": f"0:{len(LENGTHS)}"}}
+    return {**about, **totals, **paths, "features": {**cameras, **numbers, **one}}
+
+
+def cells(camera: str, episode: int) -> pa.Array:
+    """Frames as a table keeps them: ``{bytes, path}``."""
+    rows = []
+    for number, place in enumerate(places(episode)):
+        file = io.BytesIO()
+        Image.fromarray(picture(camera, place, episode)).save(file, format="png")
+        rows.append({"bytes": file.getvalue(), "path": f"frame_{number:06d}.png"})
+    return pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path)
+
+
+def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> Path:
+    """A LeRobotDataset; in v3.0 two files share the episodes of each camera, and one table all of them."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(facts(version, kind)))
+    episodes, first = range(len(LENGTHS)), np.cumsum([0, *LENGTHS]).tolist()
+    cameras = {key: key.rpartition(".")[2] for key in (TOP, WRIST)}
+    tables = []
+    for episode in episodes:
+        rows = columns(episode, first[episode])
+        if kind == "image":
+            rows |= {key: cells(camera, episode) for key, camera in cameras.items()}
+        tables.append(pa.table(rows))
+    if version == "v2.1":
+        lines = [{"episode_index": at, "tasks": ["reach"], "length": LENGTHS[at]} for at in episodes]
+        (folder / "meta" / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        for episode, table in enumerate(tables):
+            write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
+            for key, camera in cameras.items() if kind == "video" else ():
+                frames = [picture(camera, place, episode) for place in places(episode)]
+                write_video(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames)
+        return folder
+    table = pa.concat_tables(tables)
+    write_table(folder / "data/chunk-000/file-000.parquet", table)
+    listed: list[dict[str, Any]] = []
+    for episode in episodes:
+        row: dict[str, Any] = {"episode_index": episode, "tasks": ["reach"], "length": LENGTHS[episode]}
+        row |= {"data/chunk_index": 0, "data/file_index": 0}
+        row |= {"dataset_from_index": first[episode], "dataset_to_index": first[episode + 1]}
+        for key in cameras if kind == "video" else ():
+            file = episode // 3
+            begin = sum(LENGTHS[3 * file : episode]) / FPS
+            row |= {f"videos/{key}/chunk_index": 0, f"videos/{key}/file_index": file}
+            row |= {f"videos/{key}/from_timestamp": begin, f"videos/{key}/to_timestamp": begin + LENGTHS[episode] / FPS}
+        listed.append(row)
+    write_table(folder / "meta/episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(listed))
+    for key, camera in cameras.items() if kind == "video" else ():
+        for file in (0, 1):
+            some = [(at, place) for at in episodes if at // 3 == file for place in places(at)]
+            frames = [picture(camera, place, at) for at, place in some]
+            write_video(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames)
+    return folder
+
+
+def write_robomimic(path: Path) -> Path:
+    """HDF5 as robomimic's ``dataset_states_to_obs.py`` writes it."""
+    with h5py.File(path, "w") as file:
+        file.create_group("data").attrs["total"] = sum(LENGTHS)
+        for episode, length in enumerate(LENGTHS):
+            demo = file["data"].create_group(f"demo_{episode}")
+            demo.attrs["num_samples"] = length
+            at = places(episode)
+            demo["obs/agentview_image"] = np.stack([picture("top", place, episode) for place in at])
+            demo["obs/robot0_eef_pos"] = np.stack([at, 1 - at, at**2], 1).astype(np.float64)
+            demo["actions"] = np.zeros((length, 7))
+            demo["rewards"] = (at > 0.5).astype(np.float64)
+            demo["dones"] = np.arange(length) == length - 1
+    return path
+
+
+def write_videos(folder: Path) -> Path:
+    """A folder of mp4 files, and a table of where the light is at the goal; the last episode is not in it."""
+    folder.mkdir()
+    lines = ["episode,from,to"]
+    for episode, length in enumerate(LENGTHS):
+        write_video(folder / f"take-{episode}.mp4", [picture("top", place, episode) for place in places(episode)])
+        if episode < len(LENGTHS) - 1:
+            lines.append(f"take-{episode},{int((places(episode) <= 0.5).sum())},{length}")
+    (folder / "labels.csv").write_text("\n".join(lines) + "\n")
+    return folder
