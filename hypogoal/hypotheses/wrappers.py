@@ -61,6 +61,9 @@ class SubgoalReward:
     def __init__(
         self, source: str | os.PathLike[str] | Ensemble, sub_goal: str = "", by: By = "vote", *, patience: int = 0
     ):
+        if isinstance(source, gymnasium.Env):  # so it was called until version 0.18
+            do = "Give SubgoalReward(ensemble).wrap(env)."
+            raise UserError("SubgoalReward takes an ensemble, not an environment", None, do)
         ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
         rule = by if isinstance(by, str) else as_number(by)
         if ensemble.needs_positions:
