@@ -28,6 +28,7 @@ CHANGES = """changes to compare: settings of train-ensemble as key=value, severa
 each gives one more ensemble per method"""
 OPTION_GROUPS = "the N whose ensembles get options; they must be among 'groups'"
 OPTION_METHODS = "the ensembles that get options; they must be among 'methods'"
+SUB_GOAL = "what is labelled, a sub-goal of collect montezuma; empty: climb-down-ladder. 'ladders' are starts then"
 ORACLE = "options that end at the true sub-goal beside them, on each ladder"
 
 
@@ -42,6 +43,7 @@ def montezuma_ladders(
     ),
     seeds: Seeds = (0,),
     methods: Annotated[Names, explained(ENSEMBLES, source="Figure 3", choices=METHODS)] = tuple(METHODS),
+    sub_goal: Annotated[str, explained(SUB_GOAL, source="authors' code")] = "",
     variants: Annotated[Names, explained(CHANGES)] = (),
     ladders: Annotated[Names, explained("ladders to learn options on; empty for none", source="Figure 4")] = (),
     option_groups: Annotated[Integers, explained(OPTION_GROUPS, low=1, high=7)] = (2,),
@@ -49,8 +51,9 @@ def montezuma_ladders(
     oracle: Annotated[bool, explained(ORACLE, source="ours: a control")] = True,
 ) -> Iterator[Command]:
     """The states and ensembles of each N, then the options of each ladder and seed with their oracle."""
+    labelled = f" --set sub_goals={sub_goal}" if sub_goal else ""
     for count in groups:
-        yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}", {"groups": count})
+        yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}{labelled}", {"groups": count})
         for method, variant, seed in product(methods, ("", *variants), seeds):
             changes = variant.split()
             sets = " ".join(f"--set {shlex.quote(change)}" for change in changes)

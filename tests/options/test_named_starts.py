@@ -51,11 +51,11 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
     """An ensemble artefact with random weights."""
     shape = domain.observation_shape
     config = {
-        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.sub_goals), "members": members,
+        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
         "network": network, "observation_shape": list(shape),
     }  # fmt: skip
     with create_artefact(folder, kind="ensemble", config=config, seed=0, inputs=[]) as place:
-        for number, sub_goal in enumerate(domain.sub_goals):
+        for number, sub_goal in enumerate(domain.usual_sub_goals):
             write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
         fill(place, "ensemble", config)
     return folder
@@ -75,7 +75,7 @@ def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class TallDomain:
     """Only for the ensemble's manifest: oracle terminations read no weights."""
 
-    name, sub_goals, observation_shape = DOMAIN.name, DOMAIN.sub_goals, (84, 84, 4)
+    name, usual_sub_goals, observation_shape = DOMAIN.name, DOMAIN.sub_goals, (84, 84, 4)
 
 
 def rows_of(folder: Path) -> list[dict[str, int]]:

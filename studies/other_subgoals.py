@@ -1,0 +1,73 @@
+"""What members know of rooms nobody labelled, for sub-goals other than climbing down a ladder, with labels of room 1.
+
+    python -m studies.other_subgoals docs/results/other-subgoals.csv --seeds 0-2
+
+A cell is a sub-goal, a method and a seed, trained and scored as in ``studies.ladders``. ``--tables`` draws them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from studies import ladders
+from studies.cells import Row, interval, parser_of, run_cells, table
+
+SUB_GOALS = ("climb-up-ladder", "pass-enemy-left", "pass-enemy-right")
+METHODS = ("dbat", "none", "cnn")
+LOOKS = tuple(step for step in ladders.LOOKS if step <= 450)
+GROUPS = 1
+COLUMNS = ("sub_goal", *ladders.COLUMNS)
+
+
+def run_cell(sub_goal: str, method: str, seed: int) -> list[Row]:
+    """One ensemble of ``studies.ladders``, of another sub-goal."""
+    return [{"sub_goal": sub_goal, **row} for row in ladders.run_cell(GROUPS, method, seed, LOOKS, sub_goal)]
+
+
+def tables(path: Path) -> Iterator[str]:
+    """The table of the page, as lines of Markdown."""
+    titles = [
+        "",
+        "",
+        "mean member's ranking",
+        "picked: steps",
+        "its ranking",
+        "its balanced accuracy",
+        "D-BAT ahead in",
+    ]
+    yield from table(titles, (row for goal in SUB_GOALS for row in _rows(goal, ladders.read(path, GROUPS, goal))))
+
+
+def _rows(sub_goal: str, numbers: ladders.Numbers) -> Iterator[list[str]]:
+    for method, seeds in numbers.items():
+        means = np.array([looks[LOOKS[-1]]["ranking_unseen"].mean() for looks in seeds.values()])
+        steps = f"{ladders.picked(seeds, 'first')}, {ladders.picked(seeds, 'second')}"
+        rankings, dbat = (ladders.crossed(each, "ranking") for each in (seeds, numbers["dbat"]))
+        accuracies = ladders.crossed(seeds, "balanced_accuracy")
+        ahead = "-" if method == "dbat" else f"{(dbat > rankings).sum()} of {len(rankings)}"
+        yield [sub_goal, method, interval(means), steps, interval(rankings), interval(accuracies), ahead]
+
+
+def main() -> None:
+    """Run the cells that are not in the file yet."""
+    parser = parser_of(__doc__, "0-2")
+    parser.add_argument("--sub-goals", default=",".join(SUB_GOALS), help="comma-separated; all by default")
+    arguments = parser.parse_args()
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+        return
+    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+        (sub_goal, method, str(seed)): partial(run_cell, sub_goal, method, seed)
+        for sub_goal in arguments.sub_goals.split(",")
+        for seed in arguments.seeds
+        for method in METHODS
+    }
+    run_cells(arguments.csv, COLUMNS, ("sub_goal", "method", "seed"), jobs, lambda _: LOOKS, arguments.workers)
+
+
+if __name__ == "__main__":
+    main()
