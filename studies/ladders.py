@@ -45,6 +45,7 @@ MEMBERS = 3
 LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
 SHOWN = (10, 25, 50, 100, 300, 600, 1000)  # of these in the table
 SCOPES = ("all", "unseen", "first", "second")  # all rooms; those of no training set, and both halves of these
+HELDOUT = 300  # states of each room
 ALL_ROOMS_FROM = 4  # groups: one half of the unseen rooms has no base
 KEYS = ("groups", "method", "seed", "step", "member")
 COLUMNS = (*KEYS, *(f"{name}_{scope}" for scope in SCOPES for name in ("ranking", "balanced_accuracy", "accuracy")))
@@ -81,18 +82,24 @@ AUTHORS = {
 
 
 @lru_cache(maxsize=1)
-def states_of(groups: int, sub_goal: str) -> Collected:
-    """The states of ``hypogoal collect montezuma --set groups=N --set sub_goals=SUB_GOAL``."""
-    config = MontezumaConfig(groups=groups, sub_goals=(sub_goal,), workers=1)
+def states_of(groups: int, sub_goal: str, heldout: int) -> Collected:
+    """The states of ``collect montezuma --set groups=N --set sub_goals=SUB_GOAL --set heldout_per_room=HELDOUT``."""
+    config = MontezumaConfig(groups=groups, sub_goals=(sub_goal,), heldout_per_room=heldout, workers=1)
     return DOMAIN.collect(config, 0, Progress("collect", 1, quiet=True))
 
 
 def run_cell(
-    groups: int, method: str, seed: int, looks: tuple[int, ...], sub_goal: str = CLIMB_DOWN.name, **changes: Any
+    groups: int,
+    method: str,
+    seed: int,
+    looks: tuple[int, ...],
+    sub_goal: str = CLIMB_DOWN.name,
+    heldout: int = HELDOUT,
+    **changes: Any,
 ) -> list[Row]:
     """Train one ensemble as ``hypogoal train-ensemble --seed`` would, with ``changes``, and score it on the way."""
     prepare()
-    data = states_of(groups, sub_goal)
+    data = states_of(groups, sub_goal, heldout)
     labels, unseen = data.heldout.labels[:, 0], data.heldout.origins["seen"] == SEEN_NOWHERE
     first = halves(data.heldout.origins["room"][unseen])
     assert first is not None

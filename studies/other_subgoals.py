@@ -18,14 +18,14 @@ from studies.cells import Row, interval, parser_of, run_cells, table
 
 SUB_GOALS = ("climb-up-ladder", "pass-enemy-left", "pass-enemy-right")
 METHODS = ("dbat", "none", "cnn")
-LOOKS = tuple(step for step in ladders.LOOKS if step <= 450)
-GROUPS = 1
+LOOKS = (25, 100, 300)
+GROUPS, HELDOUT = 1, 100
 COLUMNS = ("sub_goal", *ladders.COLUMNS)
 
 
 def run_cell(sub_goal: str, method: str, seed: int) -> list[Row]:
     """One ensemble of ``studies.ladders``, of another sub-goal."""
-    return [{"sub_goal": sub_goal, **row} for row in ladders.run_cell(GROUPS, method, seed, LOOKS, sub_goal)]
+    return [{"sub_goal": sub_goal, **row} for row in ladders.run_cell(GROUPS, method, seed, LOOKS, sub_goal, HELDOUT)]
 
 
 def tables(path: Path) -> Iterator[str]:

@@ -16,7 +16,7 @@ RATES = {
     "collect_cores": 6,  # rooms that a collection plays in at once, at most
     "member_step": {"montezuma": 0.08, "montezuma-crop": 0.01},
     "localiser": 90,
-    "step": {"light": 2.5e-3, "paper": 4.0},
+    "step": {"light": 2.5e-3, "paper": 2.4, "paper-none": 0.042},
 }
 METHODS = {
     "dbat": "--set diversity=dbat",
