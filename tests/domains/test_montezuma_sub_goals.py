@@ -18,6 +18,7 @@ from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import BEGINNINGS, CLIMBED_UP, arrives, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import LADDERS, TOPS, Ladder
 from hypogoal.domains.montezuma_sub_goals import ENEMIES, FACT_BYTES, GATES, LASER_Y, SUB_GOALS, Enemy
+from hypogoal.meta.training import distances_of
 
 pytestmark = pytest.mark.atari
 
@@ -218,6 +219,8 @@ def test_distances_are_those_of_the_sub_goal() -> None:
     assert DOMAIN.distance_to("climb-up-ladder", base) == DOMAIN.distance_to("climb-down-ladder", top) == 44
     for name, goal in SUB_GOALS.items():
         assert not DOMAIN.distance_to(name, np.array(goal.places)).any()
+    away = distances_of(DOMAIN, ["climb-down-ladder", "climb-up-ladder"], 2)  # options 0, 1 down, 2, 3 up
+    assert away(np.repeat(top, 4, axis=0), np.arange(4)).tolist() == [44, 44, 0, 0]
 
 
 def test_the_engine_labels_as_the_emulator_does() -> None:
