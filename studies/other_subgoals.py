@@ -3,16 +3,20 @@
     python -m studies.other_subgoals docs/results/other-subgoals.csv --seeds 0-2
 
 A cell is a sub-goal, a method and a seed, trained and scored as in ``studies.ladders``. ``--tables`` draws them.
+``--options FOLDER`` learns options in room 1 in that folder, stage by stage, and writes how their last executions ended.
 """
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from hypogoal.cli import main as main_of
+from hypogoal.options.tables import Executions
 from studies import ladders
 from studies.cells import Row, interval, parser_of, run_cells, table
 
@@ -26,6 +30,44 @@ COLUMNS = ("sub_goal", *ladders.COLUMNS)
 def run_cell(sub_goal: str, method: str, seed: int) -> list[Row]:
     """One ensemble of ``studies.ladders``, of another sub-goal."""
     return [{"sub_goal": sub_goal, **row} for row in ladders.run_cell(GROUPS, method, seed, LOOKS, sub_goal, HELDOUT)]
+
+
+# Start, sub-goal, termination.
+OPTIONS = (
+    ("up-1L", "climb-up-ladder", "oracle"),
+    ("skull-right", "pass-enemy-left", "oracle"),
+    ("up-1L", "climb-up-ladder", "learned"),
+)
+
+
+def learn_options(folder: Path, out: Path) -> None:
+    """Ensembles of room 1 and options from a start, by the command line; a row an option: how its executions ended."""
+    with out.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(["start", "sub_goal", "termination", "member", "executions", "reached", "died", "within_4"])
+        for start, sub_goal, termination in OPTIONS:
+            data, ensemble, options = (folder / name for name in (f"{sub_goal}.h5", sub_goal, f"{start}-{termination}"))
+            few = [f"sub_goals={sub_goal}", "unlabelled_per_room=200", "heldout_per_room=20", "workers=1"]
+            short = ["members=3", "steps=100", "workers=1"]
+            if not data.exists():
+                stage("collect", "montezuma", out=data, settings=few)
+            if not ensemble.exists():
+                stage("train-ensemble", str(data), out=ensemble, settings=short)
+            learning = [f"start={start}", f"termination={termination}", "steps=8000"]
+            stage("train-options", str(ensemble), out=options, settings=learning)
+            ended = Executions.read(options / Executions.FILE)
+            for member in sorted(set(ended.option.tolist())):
+                last = ended.of(member)
+                counts = (last.reached.sum(), last.terminated.sum(), (last.distance <= 4).sum())
+                rows.writerow([start, sub_goal, termination, member, len(last.step), *counts])
+            file.flush()
+
+
+def stage(name: str, given: str, *, out: Path, settings: list[str]) -> None:
+    """A command of hypogoal."""
+    words = [word for setting in settings for word in ("--set", setting)]
+    if code := main_of([name, given, "--out", str(out), "-q", *words]):
+        raise SystemExit(code)
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -56,9 +98,13 @@ def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "0-2")
     parser.add_argument("--sub-goals", default=",".join(SUB_GOALS), help="comma-separated; all by default")
+    parser.add_argument("--options", type=Path, help="a folder: learn options there instead")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
+        return
+    if arguments.options:
+        learn_options(arguments.options, arguments.csv)
         return
     jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
         (sub_goal, method, str(seed)): partial(run_cell, sub_goal, method, seed)

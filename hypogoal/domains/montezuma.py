@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
@@ -69,9 +70,8 @@ class MontezumaConfig:
     groups: int = setting(1, "ladder groups with labels (N), out of seven", source="Figure 3", low=1, high=len(GROUPS))
     sub_goals: tuple[str, ...] = setting(
         (CLIMB_DOWN.name,),
-        "what is labelled; other sub-goals than the first have groups of their own, fewer than seven for some",
+        f"what is labelled: {', '.join(SUB_GOALS)}; others than ladders have five or three groups",
         source="paper; the others: the authors' code",
-        choices=tuple(SUB_GOALS),
     )
     unlabelled_rooms: tuple[int, ...] = setting(
         (),
@@ -97,6 +97,11 @@ class MontezumaConfig:
         choices=PLAYS,
     )
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
+
+    def __post_init__(self) -> None:
+        for name in self.sub_goals or ("",):
+            if name not in SUB_GOALS:
+                raise UserError("no such sub-goal", name or "sub_goals", f"Choose among {', '.join(SUB_GOALS)}.")
 
 
 class _Task(NamedTuple):
