@@ -9,7 +9,7 @@ A cell is a sub-goal, a method and a seed, trained and scored as in ``studies.la
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -40,26 +40,34 @@ OPTIONS = (
 )
 
 
-def learn_options(folder: Path, out: Path) -> None:
+ENDS = ("start", "sub_goal", "termination", "steps", "member", "executions", "reached", "died", "within_4")
+
+
+def learn_options(folder: Path, out: Path, steps: int, terminations: Sequence[str]) -> None:
     """Ensembles of room 1 and options from a start, by the command line; a row an option: how its executions ended."""
-    with out.open("w", encoding="utf-8", newline="") as file:
+    new = not out.exists()
+    with out.open("a", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["start", "sub_goal", "termination", "member", "executions", "reached", "died", "within_4"])
+        if new:
+            rows.writerow(ENDS)
         for start, sub_goal, termination in OPTIONS:
-            data, ensemble, options = (folder / name for name in (f"{sub_goal}.h5", sub_goal, f"{start}-{termination}"))
+            if termination not in terminations:
+                continue
+            names = (f"{sub_goal}.h5", sub_goal, f"{start}-{termination}-{steps}")
+            data, ensemble, options = (folder / name for name in names)
             few = [f"sub_goals={sub_goal}", "unlabelled_per_room=200", "heldout_per_room=20", "workers=1"]
             short = ["members=3", "steps=100", "workers=1"]
             if not data.exists():
                 stage("collect", "montezuma", out=data, settings=few)
             if not ensemble.exists():
                 stage("train-ensemble", str(data), out=ensemble, settings=short)
-            learning = [f"start={start}", f"termination={termination}", "steps=8000"]
+            learning = [f"start={start}", f"termination={termination}", f"steps={steps}"]
             stage("train-options", str(ensemble), out=options, settings=learning)
             ended = Executions.read(options / Executions.FILE)
             for member in sorted(set(ended.option.tolist())):
                 last = ended.of(member)
                 counts = (last.reached.sum(), last.terminated.sum(), (last.distance <= 4).sum())
-                rows.writerow([start, sub_goal, termination, member, len(last.step), *counts])
+                rows.writerow([start, sub_goal, termination, steps, member, len(last.step), *counts])
             file.flush()
 
 
@@ -99,12 +107,14 @@ def main() -> None:
     parser = parser_of(__doc__, "0-2")
     parser.add_argument("--sub-goals", default=",".join(SUB_GOALS), help="comma-separated; all by default")
     parser.add_argument("--options", type=Path, help="a folder: learn options there instead")
+    parser.add_argument("--steps", type=int, default=8_000, help="of each option")
+    parser.add_argument("--terminations", default="oracle,learned", help="comma-separated")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
         return
     if arguments.options:
-        learn_options(arguments.options, arguments.csv)
+        learn_options(arguments.options, arguments.csv, arguments.steps, arguments.terminations.split(","))
         return
     jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
         (sub_goal, method, str(seed)): partial(run_cell, sub_goal, method, seed)

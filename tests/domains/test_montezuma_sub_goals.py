@@ -196,7 +196,7 @@ def test_each_sub_goal_is_collected_alone(name: str) -> None:
 def test_unknown_sub_goals_are_refused() -> None:
     """One line that names those there are."""
     for given in ("climb", ""):
-        with pytest.raises(UserError, match="no such sub-goal: .*Choose among climb-down-ladder, climb-up-ladder"):
+        with pytest.raises(UserError, match=r"no such sub-goal: .*Choose among climb-down-ladder, climb-up-ladder"):
             from_values(MontezumaConfig, {"sub_goals": given}, "collect")
 
 
