@@ -3,7 +3,7 @@
     python -m studies.other_subgoals docs/results/other-subgoals.csv --seeds 0-2
 
 A cell is a sub-goal, a method and a seed, trained and scored as in ``studies.ladders``. ``--tables`` draws them.
-``--options FOLDER`` learns options in room 1 in that folder, stage by stage, and writes how their last executions ended.
+``--options FOLDER`` learns options in room 1 there, stage by stage, and writes how their last executions ended.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hypogoal.options.tables import Executions
 from studies import ladders
 from studies.cells import Row, interval, parser_of, run_cells, table
 
-SUB_GOALS = ("climb-up-ladder", "pass-enemy-left", "pass-enemy-right")
+SUB_GOALS = ("climb-up-ladder", "pass-enemy-left")
 METHODS = ("dbat", "none", "cnn")
 LOOKS = (25, 100, 300)
 GROUPS, HELDOUT = 1, 100
