@@ -27,6 +27,7 @@ from hypogoal.dataset import digest
 from hypogoal.domains.montezuma_emulator import N_ACTIONS, Emulator, Position
 from hypogoal.domains.montezuma_ladders import LADDERS
 from hypogoal.domains.montezuma_states import PLAYS, Shown, emulator_of_process, gather, labels_of
+from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
 
 WANTED_RATE = 700  # made
 ROOMS = (1, 6, 9, 12, 18, 22)  # three ladders; one; one and snakes; lasers; lava; lava and one
@@ -46,11 +47,11 @@ def make(room: int, count: int, seed: int) -> int:
     """Distinct stacks of the expert's rollouts, with their labels, until there are so many; positives among them."""
     rng = np.random.default_rng(seed)
     found: dict[bytes, Shown] = {}
-    for shown in PLAYS["expert"](emulator_of_process(), room, rng):
+    for shown in PLAYS["expert"](emulator_of_process(), room, rng, [CLIMB_DOWN]):
         found.setdefault(digest(shown.stack), shown)
         if len(found) == count:
             break
-    return int(labels_of(np.stack([shown.ram for shown in found.values()])).sum())
+    return int(labels_of(np.stack([shown.ram for shown in found.values()]), [CLIMB_DOWN]).sum())
 
 
 def time_ceiling(
@@ -76,10 +77,13 @@ def time_room(room: int, states: int, seed: int) -> Timing:
     make(room, states, seed)
     made = time.process_time() - begin
     begin = time.process_time()
-    found = gather(room, states, seed, ("benchmark",), play="expert", held_out=False, runs_on=False)
+    how: dict[str, Any] = {"play": "expert", "held_out": False, "unclear": False}
+    found = gather(room, states, seed, ("benchmark",), sub_goals=[CLIMB_DOWN], **how)
     kept = time.process_time() - begin
     after = time_ceiling(emulator_of_process(), LADDERS[0].top, actions)
-    return Timing(statistics.mean((before, after)), states / made, states / kept, int(labels_of(found.ram).sum()))
+    return Timing(
+        statistics.mean((before, after)), states / made, states / kept, int(labels_of(found.ram, [CLIMB_DOWN]).sum())
+    )
 
 
 def summary(name: str, timings: list[Timing]) -> dict[str, Any]:

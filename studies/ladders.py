@@ -27,6 +27,7 @@ from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
+from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
@@ -44,10 +45,10 @@ MEMBERS = 3
 LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
 SHOWN = (10, 25, 50, 100, 300, 600, 1000)  # of these in the table
 SCOPES = ("all", "unseen", "first", "second")  # all rooms; those of no training set, and both halves of these
+HELDOUT = 300  # states of each room
 ALL_ROOMS_FROM = 4  # groups: one half of the unseen rooms has no base
 KEYS = ("groups", "method", "seed", "step", "member")
 COLUMNS = (*KEYS, *(f"{name}_{scope}" for scope in SCOPES for name in ("ranking", "balanced_accuracy", "accuracy")))
-(SUB_GOAL,) = DOMAIN.sub_goals
 # 'Accuracy', three seeds each: experiments/divdis_monte/classifier_plot.py of the authors' repository.
 AUTHORS = {
     "dbat": {
@@ -81,15 +82,24 @@ AUTHORS = {
 
 
 @lru_cache(maxsize=1)
-def states_of(groups: int) -> Collected:
-    """The states of ``hypogoal collect montezuma --set groups=N``."""
-    return DOMAIN.collect(MontezumaConfig(groups=groups, workers=1), 0, Progress("collect", 1, quiet=True))
+def states_of(groups: int, sub_goal: str, heldout: int) -> Collected:
+    """The states of ``collect montezuma --set groups=N --set sub_goals=SUB_GOAL --set heldout_per_room=HELDOUT``."""
+    config = MontezumaConfig(groups=groups, sub_goals=(sub_goal,), heldout_per_room=heldout, workers=1)
+    return DOMAIN.collect(config, 0, Progress("collect", 1, quiet=True))
 
 
-def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...], **changes: Any) -> list[Row]:
+def run_cell(
+    groups: int,
+    method: str,
+    seed: int,
+    looks: tuple[int, ...],
+    sub_goal: str = CLIMB_DOWN.name,
+    heldout: int = HELDOUT,
+    **changes: Any,
+) -> list[Row]:
     """Train one ensemble as ``hypogoal train-ensemble --seed`` would, with ``changes``, and score it on the way."""
     prepare()
-    data = states_of(groups)
+    data = states_of(groups, sub_goal, heldout)
     labels, unseen = data.heldout.labels[:, 0], data.heldout.origins["seen"] == SEEN_NOWHERE
     first = halves(data.heldout.origins["room"][unseen])
     assert first is not None
@@ -117,7 +127,7 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...], **chan
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
         dataclasses.replace(config, **METHODS[method], **changes),
-        seed_for(seed, "ensemble", SUB_GOAL),
+        seed_for(seed, "ensemble", sub_goal),
         Watcher(look=look, look_at=looks),
     )
     return rows
@@ -127,12 +137,12 @@ Seeds = dict[int, dict[int, dict[str, NDArray[np.float64]]]]  # by seed, step an
 Numbers = dict[str, Seeds]  # by method
 
 
-def read(path: Path, groups: int) -> Numbers:
-    """The cells of one N; seeds that every method has, so that all are compared on the same ones."""
+def read(path: Path, groups: int, sub_goal: str | None = None) -> Numbers:
+    """The cells of one N, and of one sub-goal where a file has several; only seeds that every method has."""
     numbers: Numbers = {}
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            if int(row["groups"]) == groups:
+            if int(row["groups"]) == groups and row.get("sub_goal") == sub_goal:
                 steps = numbers.setdefault(row["method"], {}).setdefault(int(row["seed"]), {})
                 columns = steps.setdefault(int(row["step"]), {})
                 for name in COLUMNS[len(KEYS) :]:

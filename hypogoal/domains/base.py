@@ -312,6 +312,7 @@ class Domain(ABC):
     Attributes:
         name: for messages.
         sub_goals: their names (G).
+        usual_sub_goals: those that ``collect`` labels by default; all, if it labels all.
         config_class: the settings of ``collect``, a frozen dataclass of ``core.config.setting`` fields.
         engine_settings: the names of the settings that define the world; later stages play with them too.
         defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
@@ -347,6 +348,10 @@ class Domain(ABC):
     measures = pictures = sees_agent = False
     near = 0
     packed = 1
+
+    @property
+    def usual_sub_goals(self) -> tuple[str, ...]:
+        return self.sub_goals
 
     @property
     @abstractmethod
@@ -437,6 +442,10 @@ class Domain(ABC):
     def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
         """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
         raise UserError("this domain measures no distances", self.name, "Leave them out.")
+
+    def distance_to(self, sub_goal: str, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The same for one sub-goal; by default :meth:`distance`."""
+        return self.distance(positions)
 
     def rooms_of(self, start: str) -> tuple[int, ...]:
         """The rooms to draw for a start."""

@@ -1,8 +1,8 @@
-"""Climbing down ladders in Montezuma's Revenge (Spec B4, B5): the domain, and how its states are collected.
+"""Sub-goals in Montezuma's Revenge (Spec B4, B5): the domain, and how its states are collected.
 
 See also ``montezuma_emulator`` (the game, with the agent placed anywhere), ``montezuma_ladders`` (the ladders'
-positions), ``montezuma_states`` (the states of a room), ``montezuma_env`` and ``montezuma_engine`` (one game and many,
-from the top of a ladder).
+positions), ``montezuma_sub_goals`` (climbing, passing enemies), ``montezuma_states`` (the states of a room),
+``montezuma_env`` and ``montezuma_engine`` (one game and many, from the top of a ladder).
 """
 
 import math
@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma_ahead import AheadEngine
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observed_pixel, picture, pixel
 from hypogoal.domains.montezuma_engine import MontezumaEngine
-from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS
-from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
+from hypogoal.domains.montezuma_env import BEGINNINGS, MAX_STEPS, beginning_named
+from hypogoal.domains.montezuma_ladders import GROUPS, distance_to, distance_to_base
 from hypogoal.domains.montezuma_states import (
     KINDS,
     PLAYS,
@@ -34,11 +35,8 @@ from hypogoal.domains.montezuma_states import (
     labels_of,
     origins_of,
 )
+from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN, SUB_GOALS, SubGoal
 
-# The default unlabelled rooms: the first of these ladder rooms without labels, and a room without a ladder; if all have
-# labels, two rooms without a ladder.
-UNLABELLED_LADDER_ROOMS = (9, 21, 19, 22, 10)
-UNLABELLED_OTHER_ROOMS = (18, 12)
 SEEN_NOWHERE, SEEN_UNLABELLED, SEEN_LABELLED = range(3)
 
 
@@ -71,9 +69,14 @@ class MontezumaConfig:
     """Settings of ``hypogoal collect montezuma``."""
 
     groups: int = setting(1, "ladder groups with labels (N), out of seven", source="Figure 3", low=1, high=len(GROUPS))
+    sub_goals: tuple[str, ...] = setting(
+        (CLIMB_DOWN.name,),
+        f"what is labelled: {', '.join(SUB_GOALS)}; others than ladders have five or three groups",
+        source="paper; the others: the authors' code",
+    )
     unlabelled_rooms: tuple[int, ...] = setting(
         (),
-        "rooms of the unlabelled states; empty: one with an unlabelled ladder, and room 18, without a ladder",
+        "rooms of the unlabelled states; empty: two, for ladders one with an unlabelled ladder, and 18, without one",
         source="paper: for N = 1 one room of each kind",
         low=0,
         high=ROOMS - 1,
@@ -96,6 +99,11 @@ class MontezumaConfig:
     )
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
 
+    def __post_init__(self) -> None:
+        for name in self.sub_goals or ("",):
+            if name not in SUB_GOALS:
+                raise UserError("no such sub-goal", name or "sub_goals", f"Choose among {', '.join(SUB_GOALS)}.")
+
 
 class _Task(NamedTuple):
     """Gathers the states of a room for the set ``name``, and keeps them until all rooms are complete."""
@@ -111,29 +119,40 @@ class _Task(NamedTuple):
             return RoomStates(**saved) if saved else None
 
 
-def labelled_rooms(groups: int) -> tuple[int, ...]:
-    """The rooms of the first N ladder groups."""
-    return tuple(room for group in GROUPS[:groups] for room in group)
+def chosen(config: MontezumaConfig) -> list[SubGoal]:
+    """The sub-goals to label."""
+    return [SUB_GOALS[name] for name in dict.fromkeys(config.sub_goals)]
+
+
+def labelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
+    """The rooms of the first N groups of each sub-goal."""
+    groups = [group for sub_goal in chosen(config) for group in sub_goal.groups[: config.groups]]
+    return tuple(dict.fromkeys(room for group in groups for room in group))
 
 
 def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
-    """The rooms of the unlabelled states: the configured ones, or one with an unlabelled ladder and one without any."""
+    """The rooms of the unlabelled states: the configured ones, or the first sub-goal's.
+
+    These are one without labels where it holds somewhere and one where it holds nowhere; or two of these, if all others
+    have labels.
+    """
     if config.unlabelled_rooms:
         return tuple(dict.fromkeys(config.unlabelled_rooms))
-    labelled = labelled_rooms(config.groups)
-    left = [room for room in UNLABELLED_LADDER_ROOMS if room not in labelled]
-    return (left[0], UNLABELLED_OTHER_ROOMS[0]) if left else UNLABELLED_OTHER_ROOMS
+    first = chosen(config)[0]
+    left = [room for room in first.unlabelled if room not in labelled_rooms(config)]
+    return (left[0], first.others[0]) if left else first.others
 
 
 class MontezumaDomain(Domain):
-    """Spec B6: Montezuma's ladders; the defaults are Table 1, and for options what lets them learn on a laptop."""
+    """Spec B6: Montezuma's Revenge; the defaults are Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"
-    sub_goals = SUB_GOALS
+    sub_goals = tuple(SUB_GOALS)
+    usual_sub_goals = (CLIMB_DOWN.name,)
     observation_shape = OBSERVATION_SHAPE
     config_class = MontezumaConfig
     env_id = "hypogoal/MontezumaLadder-v0"
-    starts = tuple(ladder.name for ladder in LADDERS)
+    starts = tuple(BEGINNINGS)
     many_starts = plays_ahead = True
     packed = 20  # 24 measured
     kinds = KINDS
@@ -174,8 +193,8 @@ class MontezumaDomain(Domain):
     ) -> Collected:
         """Spec B5: labelled, unlabelled and held-out states, each with its origin.
 
-        The rooms of the first N ladder groups are labelled; all 24 rooms have held-out states, the same for every N.
-        States at the base of a ladder that continues through the floor are in the unlabelled set only. No held-out
+        The rooms of the first N groups are labelled; all 24 rooms have held-out states, the same for every N. States at
+        the base of a ladder that continues through the floor are in the unlabelled set only. No held-out
         stack is in another set, and no stack occurs twice in a room of a set. The result does not depend on the number
         of processes.
 
@@ -185,7 +204,7 @@ class MontezumaDomain(Domain):
         held-out states also have ``seen``: 0 the room is in no training set, 1 it is an unlabelled room, 2 a labelled
         one. An unknown room, no emulator, or a room with too few different states is a ``UserError``.
         """
-        labelled, unlabelled = labelled_rooms(config.groups), unlabelled_rooms(config)
+        sub_goals, labelled, unlabelled = chosen(config), labelled_rooms(config), unlabelled_rooms(config)
         tasks: list[_Task] = []
         expected = 0
         for name, rooms, wanted, stream, play in (
@@ -193,9 +212,9 @@ class MontezumaDomain(Domain):
             ("unlabelled", unlabelled, config.unlabelled_per_room, (), config.unlabelled_from),
             ("heldout", range(ROOMS), config.heldout_per_room, (config.heldout_seed,), "expert"),
         ):
-            draw = partial(gather, play=play, held_out=name == "heldout", runs_on=name == "unlabelled")
+            draw = partial(gather, play=play, held_out=name == "heldout", unclear=name == "unlabelled")
             for room in rooms:
-                job = partial(draw, room, wanted, seed, ("montezuma", name, *stream))
+                job = partial(draw, room, wanted, seed, ("montezuma", name, *stream), sub_goals=sub_goals)
                 tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None)))
             expected += wanted * len(rooms)
         progress.expect(expected)
@@ -213,14 +232,20 @@ class MontezumaDomain(Domain):
 
         def all_of(name: str) -> States:
             rooms = [gathered.pop(number) for number, task in enumerate(tasks) if task.name == name]
-            return joined([States(room.observations, labels_of(room.ram)[:, None], origins_of(room)) for room in rooms])
+            return joined(
+                [
+                    States(room.observations, labels_of(room.ram, sub_goals), origins_of(room, sub_goals[0]))
+                    for room in rooms
+                ]
+            )
 
         labelled_states, unlabelled_states, heldout = map(all_of, ("labelled", "unlabelled", "heldout"))
         seen = np.full(len(heldout.labels), SEEN_NOWHERE)
         seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
         seen[np.isin(heldout.origins["room"], labelled)] = SEEN_LABELLED
         heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
-        return Collected(OBSERVATION_SHAPE, SUB_GOALS, labelled_states, unlabelled_states, heldout)
+        names = tuple(sub_goal.name for sub_goal in sub_goals)
+        return Collected(OBSERVATION_SHAPE, names, labelled_states, unlabelled_states, heldout)
 
     def make_engine(
         self,
@@ -228,11 +253,11 @@ class MontezumaDomain(Domain):
         count: int,
         max_steps: int = MAX_STEPS,
         *,
-        start: str = LADDERS[0].name,
+        start: str = next(iter(BEGINNINGS)),
         play_ahead: bool = False,
         **arguments: Any,
     ) -> MontezumaEngine:
-        """An engine of ``count`` games that begin at the ladder ``start``, with ``play_ahead`` in a second process.
+        """An engine of ``count`` games that begin at ``start``, with ``play_ahead`` in a second process.
 
         The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``. Other
         arguments as for ``MontezumaEngine``.
@@ -241,12 +266,14 @@ class MontezumaDomain(Domain):
         return kind(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
 
     def task(self, world: Mapping[str, Any]) -> str:
-        return "Climb down a ladder to its base; options begin at its top, and a lost life ends the episode."
+        return "Reach a sub-goal, such as the base of a ladder, from a start; a lost life ends the episode."
 
     def rooms_of(self, start: str) -> tuple[int, ...]:
-        """The rooms of a ladder, from its top to its base."""
-        ladder = ladder_named(start)
-        return tuple(dict.fromkeys((ladder.top.room, ladder.base.room)))
+        """The rooms of a start, from there to where its script ends, such as a ladder's top and its base."""
+        return tuple(dict.fromkeys(place.room for place in (beginning_named(start).at, beginning_named(start).end)))
+
+    def distance_to(self, sub_goal: str, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        return distance_to(positions, SUB_GOALS.get(sub_goal, CLIMB_DOWN).places)
 
     def picture(self, room: int) -> NDArray[np.uint8]:
         return picture(emulator_of_process(), room)

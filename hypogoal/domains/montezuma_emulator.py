@@ -35,6 +35,8 @@ RAM = {
     "dying": 0x37,  # counts down after a death; 0 alive
     "lives": 0x3A,  # spare ones
     "inventory": 0x41,  # bits: 01 hammer, 02-10 keys, 20 and 40 swords, 80 torch
+    "object": 0x2C,  # x of a spider
+    "skull": 0x2F,  # x of a skull, less an offset that the room sets
     "row": 0x50,  # of the pyramid, from the top
     "jump": 0x56,  # 255 on the ground, 19..0 in a jump
     "fall": 0x58,  # frames of free fall
@@ -239,17 +241,28 @@ class Emulator:
             return None
         return self.save()
 
-    def _enter(self, room: int) -> Any:
-        if not 0 <= room < ROOMS:
-            raise UserError("no such room", room, f"Rooms are 0 to {ROOMS - 1}.")
+    def new_game(self, phase: int) -> Snapshot:
+        """Begin a new game; the agent waits for ``phase`` frames once it may act, then fills the stack."""
+        self._to_first_room()
+        self.frames(NOOP, phase)
+        for _ in range(STACK):
+            self.step(NOOP)
+        return self.save()
+
+    def _to_first_room(self) -> None:
         if self._first_room is None:
             self.ale.reset_game()
             self.frames(NOOP, FIRST_ROOM_FRAMES)
             self._first_room = self.ale.cloneState()
+        self.ale.restoreState(self._first_room)
+
+    def _enter(self, room: int) -> Any:
+        if not 0 <= room < ROOMS:
+            raise UserError("no such room", room, f"Rooms are 0 to {ROOMS - 1}.")
         for neighbour, x, action in ((room - 1, RIGHT_EDGE, RIGHT), (room + 1, LEFT_EDGE, LEFT)):
             if not 0 <= neighbour < ROOMS:
                 continue
-            self.ale.restoreState(self._first_room)
+            self._to_first_room()
             self.write("row", row_of(room))
             self.write("inventory", self.read("inventory") | TORCH)
             self.write("room", neighbour)

@@ -7,6 +7,7 @@ the frames of older ones are forgotten.
 import json
 from collections.abc import Mapping
 from itertools import chain
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -16,22 +17,23 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.base import TurnEngine
-from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, labels_of, make_starts
-from hypogoal.domains.montezuma_ladders import ladder_named
+from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, beginning_named, labels_of, make_starts
+from hypogoal.domains.montezuma_sub_goals import FACT_BYTES, FACTS
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
-ROOM, X, Y, DYING = (game.RAM[name] for name in ("room", "x", "y", "dying"))
+DYING = game.RAM["dying"]
+facts_in = itemgetter(*FACT_BYTES)
 
 
 class MontezumaEngine(TurnEngine):
-    """Many games that begin at one ladder, stepped together.
+    """Many games that begin at one ladder or elsewhere, stepped together.
 
     Ids 0 .. S-1 always are the S start states; every step of every environment gets a new id. Images are available for
     the newest ``memory`` of these; positions, labels and whether the agent is alive for all.
 
-    Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``start`` may also be several
-    ladders, comma-separated, with ``start_states`` each; ``seed`` also draws the one each episode begins with. A frame
-    is 7 kB, allocated on first use. An unknown ladder, too few start states, too small a memory, or no emulator is a
+    Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``start`` may also be several,
+    comma-separated, with ``start_states`` each; ``seed`` also draws the one each episode begins with. A frame is 7 kB,
+    allocated on first use. An unknown start, too few start states, too small a memory, or no emulator is a
     ``UserError``.
     """
 
@@ -57,12 +59,12 @@ class MontezumaEngine(TurnEngine):
         self.memory: int = memory
         self.room = memory
         self._emulators = self._make_emulators(seed)
-        emulator, ladders = game.Emulator(seed), map(ladder_named, start.split(","))
-        starts = [make_starts(emulator, ladder, start_states, seed) for ladder in ladders]
+        emulator, beginnings = game.Emulator(seed), map(beginning_named, start.split(","))
+        starts = [make_starts(emulator, beginning, start_states, seed) for beginning in beginnings]
         self.starts: list[Start] = [*chain(*starts)]
         self._rng = rng_for(seed, "start-of-episode")
         self._ring: list[game.Frames] = []  # four states' stacks share a frame in memory
-        self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
+        self._facts = bytearray(b"".join(bytes(begin.facts) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
 
@@ -83,7 +85,7 @@ class MontezumaEngine(TurnEngine):
         reward, over, ram = emulator.play(action)
         alive = not over and ram[DYING] == 0
         self._keep(state, emulator.seen)
-        self._positions += bytes((ram[ROOM], ram[X], ram[Y]))
+        self._facts += bytes(facts_in(ram))
         self._alive.append(alive)
         return state, reward, over or (self.end_at_death and not alive), elapsed >= self.max_steps
 
@@ -96,14 +98,18 @@ class MontezumaEngine(TurnEngine):
         return out
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._known(ids)].astype(np.int64)
+        return self.facts(ids)[:, : len(self.position_names)]
+
+    def facts(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The bytes that labels follow from, int64 (n, ``FACTS``), also in forgotten states; position first."""
+        return np.frombuffer(self._facts, np.uint8).reshape(-1, len(FACTS))[self._known(ids)].astype(np.int64)
 
     def alive(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the agent is not dying and the game is not over, bool (n,), also in forgotten states."""
         return np.frombuffer(self._alive, np.bool_)[self._known(ids)]
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return labels_of(self.positions(ids), self.alive(ids))
+        return labels_of(self.facts(ids), self.alive(ids))
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         """All that a resumed run needs. Nearly all of it is the frames in memory, 7 kB per state."""
@@ -117,7 +123,7 @@ class MontezumaEngine(TurnEngine):
         return {
             **super().snapshot(),
             "rng": np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8),
-            "positions": np.frombuffer(self._positions, np.uint8).copy(),
+            "facts": np.frombuffer(self._facts, np.uint8).copy(),
             "alive": np.frombuffer(self._alive, np.uint8).copy(),
             "frames": np.stack(list(frames.values())),
             "stacks": np.array([[row[id(frame)] for frame in seen] for seen in stacks], np.int32),
@@ -132,14 +138,14 @@ class MontezumaEngine(TurnEngine):
 
         super().restore(snapshot)
         self._rng.bit_generator.state = json.loads(snapshot["rng"].tobytes())
-        self._positions = bytearray(snapshot["positions"].tobytes())
+        self._facts = bytearray(snapshot["facts"].tobytes())
         self._alive = bytearray(snapshot["alive"].tobytes())
         played = len(self._alive) - len(self.starts)
         if (
-            len(self._positions) != 3 * len(self._alive)
+            len(self._facts) != len(FACTS) * len(self._alive)
             or len(snapshot["stacks"]) != min(played, self.memory) + self.count
         ):
-            raise ValueError("its states, positions and stacks differ in number")
+            raise ValueError("its states, facts and stacks differ in number")
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
         stacks = [tuple(frames[row] for row in rows) for rows in snapshot["stacks"].tolist()]
         self._ring = stacks[: -self.count]

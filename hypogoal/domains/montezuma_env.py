@@ -1,11 +1,11 @@
-"""Spec B4, D4: Montezuma's Revenge from the top of a ladder, as a Gymnasium environment, and its start states.
+"""Spec B4, D4: Montezuma's Revenge from the top of a ladder or elsewhere, a Gymnasium environment; its start states.
 
 This is the reference: tests compare the training engine (``montezuma_engine.py``) with it.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
-from hypogoal.domains.montezuma_ladders import REACH, SUB_GOAL, Ladder, at_base, ladder_named, within
+from hypogoal.domains.montezuma_emulator import Position
+from hypogoal.domains.montezuma_ladders import LADDERS, REACH, within
+from hypogoal.domains.montezuma_sub_goals import CROSSINGS, FACT_BYTES, SUB_GOALS
 
-SUB_GOALS = (SUB_GOAL,)
 MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
 START_STATES = 32
 PHASES = range(2, 258)  # frames that the agent may wait before it starts
@@ -25,17 +26,49 @@ TRIES = 4  # phases tried per start state
 FRAMES_PER_SECOND = 60
 
 
+class Beginning(NamedTuple):
+    """Where episodes may begin, and the script by which the agent must get alive from there to ``end``."""
+
+    name: str
+    at: Position
+    end: Position
+    action: int  # of the script
+    steps: int  # agent steps of it
+
+
+FIRST = Position(1, 77, 235)  # where the game begins
+GAME = "game"
+# Without 1M, from whose base the conveyor carries the agent off, and 13-21, at whose top the spider waits.
+CLIMBED_UP = [ladder for ladder in LADDERS if ladder.name not in ("1M", "13-21")]
+BEGINNINGS = {
+    beginning.name: beginning
+    for beginning in (
+        *(Beginning(each.name, each.top, each.base, game.DOWN, each.steps_down) for each in LADDERS),
+        *(Beginning(f"up-{each.name}", each.base, each.top, game.UP, each.steps_up) for each in CLIMBED_UP),
+        *(Beginning(name, at, at, game.NOOP, 1) for name, at in CROSSINGS.items()),
+        Beginning(GAME, FIRST, FIRST, game.NOOP, 1),
+    )
+}
+
+
+def beginning_named(name: str) -> Beginning:
+    """A beginning by name; ``UserError`` if unknown."""
+    if name not in BEGINNINGS:
+        raise UserError("unknown start", name, f"Choose one of {', '.join(BEGINNINGS)}.")
+    return BEGINNINGS[name]
+
+
 @dataclass(frozen=True)
 class Start:
     """Where an episode begins."""
 
     snapshot: game.Snapshot
-    position: game.Position  # of the agent
+    facts: tuple[int, ...]  # the bytes that labels follow from, see ``FACTS``
     picture: NDArray[np.uint8]  # the console's, (210, 160, 3): a restored emulator has none until its first step
 
 
-def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int) -> list[Start]:
-    """Spec D4: states at the top of a ladder from which the scripted descent survives.
+def make_starts(emulator: game.Emulator, beginning: Beginning, count: int, seed: int) -> list[Start]:
+    """Spec D4: states at a beginning, such as the top of a ladder, from which its script survives.
 
     They differ in the phase of what moves, drawn from ``seed``, and look different if ``TRIES`` phases per state offer
     enough different looks. The top of 14-22 has one look only; its states differ out of sight.
@@ -43,23 +76,24 @@ def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int) 
     The same seed gives the same states, whatever was played before; the emulator's state is changed. Too few such
     states is a ``UserError``.
     """
-    rng = rng_for(seed, "start-states", ladder.name)
-    starts = _looking_different(_tops(emulator, ladder, TRIES * count, rng), count)
+    rng = rng_for(seed, "start-states", beginning.name)
+    starts = _looking_different(_in_phases(emulator, beginning, TRIES * count, rng), count)
     if len(starts) < max(count, 1):
-        fault = f"only {len(starts)} of {count} start states survive the descent"
-        raise UserError(fault, ladder.name, "Ask for fewer.")
+        fault = f"only {len(starts)} of {count} start states survive the script"
+        raise UserError(fault, beginning.name, "Ask for fewer.")
     return starts
 
 
-def _tops(emulator: game.Emulator, ladder: Ladder, tries: int, rng: np.random.Generator) -> Iterator[Start]:
-    """The top in random phases from which the descent survives."""
+def _in_phases(emulator: game.Emulator, beginning: Beginning, tries: int, rng: np.random.Generator) -> Iterator[Start]:
+    """The beginning in random phases from which its script survives."""
     for phase in rng.permutation(PHASES)[:tries].tolist():
-        snapshot = emulator.place(*ladder.top, phase=phase)
-        if snapshot is None or emulator.position() != ladder.top:
+        new_game = beginning.name == GAME
+        snapshot = emulator.new_game(phase) if new_game else emulator.place(*beginning.at, phase=phase)
+        if snapshot is None or emulator.position() != beginning.at:
             continue
-        start = Start(snapshot, ladder.top, emulator.screen_rgb())
+        start = Start(snapshot, tuple(emulator.ram()[FACT_BYTES].tolist()), emulator.screen_rgb())
         emulator.screens = False
-        survives = descend(emulator, ladder)
+        survives = arrives(emulator, beginning)
         emulator.screens = True
         if survives:
             yield start
@@ -78,29 +112,29 @@ def _looking_different(starts: Iterator[Start], count: int) -> list[Start]:
     return [*chosen.values(), *others][:count]
 
 
-def descend(emulator: game.Emulator, ladder: Ladder) -> bool:
-    """The scripted descent: DOWN from the top to the base. Returns whether the agent arrives alive."""
-    for _ in range(ladder.steps_down):
-        emulator.step(game.DOWN)
+def arrives(emulator: game.Emulator, beginning: Beginning) -> bool:
+    """Play the script, such as DOWN from a ladder's top to its base. Returns whether the agent arrives alive."""
+    for _ in range(beginning.steps):
+        emulator.step(beginning.action)
         if not emulator.alive():
             return False
-    return bool(within(np.array([emulator.position()]), [ladder.base], REACH))
+    return bool(within(np.array([emulator.position()]), [beginning.end], REACH))
 
 
-def labels_of(positions: NDArray[np.int64], alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Spec B4: the true predicates, bool (n, 1), for positions (n, 3) of the agent and whether it is alive (n,)."""
-    return (at_base(positions) & alive)[:, None]
+def labels_of(facts: NDArray[np.int64], alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Spec B4: the true predicates, bool (n, G), for facts (n, ``FACTS``) and whether the agent is alive (n,)."""
+    return np.stack([sub_goal.holds(facts, alive) for sub_goal in SUB_GOALS.values()], axis=1)
 
 
 class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
-    """Montezuma's Revenge from the top of a ladder. Gymnasium id ``hypogoal/MontezumaLadder-v0``.
+    """Montezuma's Revenge from the top of a ladder or elsewhere. Gymnasium id ``hypogoal/MontezumaLadder-v0``.
 
     An observation is the last four agent steps' frames, uint8 (84, 84, 4), grey, oldest first; 18 actions, each
     played for four frames; the reward is the game's. ``info`` has ``labels`` (sub-goal: whether it holds),
     ``position`` (room, x, y in RAM units) and ``alive``.
 
     Args:
-        start: the ladder, see ``montezuma_ladders.LADDERS``.
+        start: a ladder or another of ``BEGINNINGS``.
         max_steps: agent steps after which an episode is truncated.
         end_at_death: True, an episode terminates when the agent begins to die; False, when the game is over.
         render_mode: None, or ``rgb_array``: the console's picture, uint8 (210, 160, 3).
@@ -124,7 +158,7 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         self.observation_space = spaces.Box(0, 255, game.OBSERVATION_SHAPE, np.uint8)
         self.action_space = spaces.Discrete(game.N_ACTIONS)
         self.emulator = game.Emulator()
-        self.starts = make_starts(self.emulator, ladder_named(start), start_states, start_seed)
+        self.starts = make_starts(self.emulator, beginning_named(start), start_states, start_seed)
         self.elapsed = 0
         self._picture: NDArray[np.uint8] | None = None
 
@@ -157,8 +191,9 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         return self.emulator.stack, reward, terminated, self.elapsed >= self.max_steps, info
 
     def labels(self) -> NDArray[np.bool_]:
-        """The true predicates of the current state, bool (1,)."""
-        return labels_of(np.array([self.emulator.position()]), np.array([self.emulator.alive()]))[0]
+        """The true predicates of the current state, bool (G,)."""
+        facts = self.emulator.ram()[None, FACT_BYTES].astype(np.int64)
+        return labels_of(facts, np.array([self.emulator.alive()]))[0]
 
     def _info(self) -> dict[str, Any]:
         return {

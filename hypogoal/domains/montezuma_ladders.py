@@ -11,11 +11,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma_emulator import FIRST_ROOM_OF_ROW, ROOMS, Position, row_of
 
-SUB_GOAL = "climb-down-ladder"
-REACH = 2  # at a base: at most this far from it, in x and in y
+REACH = 2  # at a place: at most this far from it, in x and in y
 
 
 @dataclass(frozen=True)
@@ -27,6 +25,11 @@ class Ladder:
     base: Position
     steps_down: int  # agent steps of DOWN from the top to the base
     runs_on: bool = False  # the base is the top of the next ladder; by Spec B5 such states are not labelled
+
+    @property
+    def steps_up(self) -> int:
+        """Agent steps of UP from the base to the top: one more where that is another room."""
+        return self.steps_down + (self.top.room != self.base.room)
 
 
 LADDERS = (
@@ -43,7 +46,6 @@ LADDERS = (
     Ladder("13-21", Position(13, 77, 235), Position(21, 77, 235), 28),
     Ladder("14-22", Position(14, 77, 160), Position(22, 77, 235), 10),
 )
-BY_NAME = {ladder.name: ladder for ladder in LADDERS}
 GROUPS: tuple[tuple[int, ...], ...] = ((1,), (2, 6), (0, 4, 10), (3, 9), (7, 13, 21), (5, 11, 19), (14, 22))
 BASES, TOPS = [ladder.base for ladder in LADDERS], [ladder.top for ladder in LADDERS]
 
@@ -56,13 +58,6 @@ WALLS = frozenset({(9, 10), (20, 21)})
 FAR = 10**9  # longer than any path
 
 
-def ladder_named(name: str) -> Ladder:
-    """A ladder by name; ``UserError`` if unknown."""
-    if name not in BY_NAME:
-        raise UserError("unknown ladder", name, f"Choose one of {', '.join(BY_NAME)}.")
-    return BY_NAME[name]
-
-
 def within(positions: NDArray[np.integer], places: Sequence[Position], reach: int) -> NDArray[np.bool_]:
     """Whether positions (n, 3) of room, x, y are within ``reach``, in x and in y, of places (m); bool (n, m)."""
     distance = np.abs(positions[:, None] - np.array(places))
@@ -70,10 +65,15 @@ def within(positions: NDArray[np.integer], places: Sequence[Position], reach: in
     return near & (distance[..., 0] == 0)
 
 
+def place_of(positions: NDArray[np.integer], places: Sequence[Position]) -> NDArray[np.int64]:
+    """The index of the place at which positions (n, 3) are, -1 for none; int64 (n,)."""
+    at = within(positions, places, REACH)
+    return np.where(at.any(1), at.argmax(1), -1)
+
+
 def ladders_of(positions: NDArray[np.integer]) -> NDArray[np.int64]:
     """The index in ``LADDERS`` of the base at which positions (n, 3) are, -1 for none; int64 (n,)."""
-    at = within(positions, BASES, REACH)
-    return np.where(at.any(1), at.argmax(1), -1)
+    return place_of(positions, BASES)
 
 
 def at_base(positions: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -99,32 +99,37 @@ def _regions() -> NDArray[np.int64]:
 
 
 @cache
-def _landmarks() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """All bases and both ends of each shaft between rooms: regions (m,), plane (m, 2), distance to a base (m,)."""
+def _landmarks(places: tuple[Position, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """All places and both ends of each shaft between rooms: regions (m,), plane (m, 2), distance to a place (m,)."""
     shafts = [ladder for ladder in LADDERS if ladder.top.room != ladder.base.room]
     exits = [Position(ladder.top.room, ladder.top.x, SHAFT_EXIT) for ladder in shafts]
     entries = [Position(ladder.base.room, ladder.base.x, SHAFT_ENTRY) for ladder in shafts]
-    positions = np.array([*BASES, *exits, *entries])
+    positions = np.array([*places, *exits, *entries])
     region, at = _regions()[positions[:, 0]], plane(positions)
     joined = region[:, None] == region
-    out = len(BASES) + np.arange(len(shafts))
+    out = len(places) + np.arange(len(shafts))
     into = out + len(shafts)
     joined[out, into] = joined[into, out] = True
     away = np.where(joined, np.abs(at[:, None] - at).sum(2), FAR)
-    distance = np.where(np.arange(len(positions)) < len(BASES), 0, FAR)
+    distance = np.where(np.arange(len(positions)) < len(places), 0, FAR)
     for _ in positions:  # Bellman-Ford: a shortest path has at most as many legs as there are landmarks
         distance = (away + distance).min(1)
     return region, at, distance
 
 
 def distance_to_base(positions: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Spec F3: the Manhattan distance from positions (n, 3) to the nearest base, through the rooms; int (n,).
+    """Spec F3: :func:`distance_to` the nearest base."""
+    return distance_to(positions, tuple(BASES))
+
+
+def distance_to(positions: NDArray[np.int64], places: tuple[Position, ...]) -> NDArray[np.int64]:
+    """Spec F3: the Manhattan distance from positions (n, 3) to the nearest place, through the rooms; int (n,).
 
     Paths go sideways from room to room within a row of the pyramid, except through ``WALLS``, freely up and down, and
     from row to row only through the nine ladders that join rooms. Platforms and walls inside a room are ignored, so it
-    is a lower bound. 0 at a base itself.
+    is a lower bound. 0 at a place itself.
     """
-    region, at, onwards = _landmarks()
+    region, at, onwards = _landmarks(places)
     away = np.abs(plane(positions)[:, None] - at).sum(2) + onwards
     same = _regions()[positions[:, 0]][:, None] == region
     return np.where(same, away, np.iinfo(np.int64).max).min(1)

@@ -25,9 +25,9 @@ from hypogoal.domains.montezuma_ladders import (
     TOPS,
     Ladder,
     at_base,
-    ladders_of,
     within,
 )
+from hypogoal.domains.montezuma_sub_goals import FACT_BYTES, SubGoal
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DYING, ELSEWHERE = range(len(KINDS))
@@ -35,8 +35,9 @@ NEAR = 12  # from a base, in RAM units, in x and in y
 LADDER_POSES = (game.ON_LADDER, 0)  # climbing, holding still; on ropes 14 and 4
 ON_GROUND = 255  # the RAM's value for the jump without one
 
+POSITIVE = len(KINDS)  # in place of its kind, where a sub-goal holds
 # The least shares of a room's states by kind, as far as the rollouts reached them.
-KIND_SHARES = {BASE: 0.2, NEAR_BASE: 0.15, CLIMBING: 0.15, TOP: 0.05, JUMPING: 0.1, DYING: 0.1}
+KIND_SHARES = {POSITIVE: 0.2, NEAR_BASE: 0.15, CLIMBING: 0.15, TOP: 0.05, JUMPING: 0.1, DYING: 0.1}
 SPARE = 1.25  # states to gather, relative to those to keep
 # Play in a room until these shares of the states to keep are positive, at all its bases and at each.
 FEWEST_POSITIVES, FEWEST_AT_A_BASE = 0.1, 0.02
@@ -48,15 +49,15 @@ RANDOM_STEPS = 200
 SETTLE = 4  # agent steps that fill the stack with frames of the start
 PHASES = (2, 200)  # frames for which the room's enemies move before the first step
 ROLLOUTS_PER_PHASE = 4
-STARTS = {"base": 0.5, "ladder": 0.15, "top": 0.1, "anywhere": 0.25}  # shares, among the kinds that a room has
+STARTS = {"spot": 0.5, "ladder": 0.15, "side": 0.1, "anywhere": 0.25}  # shares, among the kinds that a room has
 
 LONGEST_REPEAT = 8  # agent steps of one action
 JITTER = 0.1  # share of the steps with another action in between
 HEADINGS = (game.DOWN, game.UP, game.LEFT, game.RIGHT)
 HEADING = 0.7  # share of the actions that are a heading; the others are any action
-CLOSE = 1  # distance from a base, in RAM units, at which an agent that heads for it stops
-STEPS_ASIDE = 3  # most steps from a base or top before a rollout begins
-HELD = 0.5  # share of the starts at a base where the agent stays there, against the conveyor belt in room 1
+CLOSE = 1  # distance from a spot, in RAM units, at which an agent that heads for it stops
+STEPS_ASIDE = 3  # most steps from a spot or side before a rollout begins
+HELD = 0.5  # share of the starts at a spot where the agent stays there, against the conveyor belt in room 1
 STRIDE = 4  # RAM units that the agent walks or climbs in an agent step
 
 # Where the agent can be placed.
@@ -81,9 +82,10 @@ def positions_of(ram: NDArray[np.uint8]) -> NDArray[np.int64]:
     return ram[:, [RAM["room"], RAM["x"], RAM["y"]]].astype(np.int64)
 
 
-def labels_of(ram: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Spec B4: whether the agent is at the base of a ladder and alive, bool (n,), from RAM (n, 128) alone."""
-    return at_base(positions_of(ram)) & (ram[:, RAM["dying"]] == 0)
+def labels_of(ram: NDArray[np.uint8], sub_goals: Sequence[SubGoal]) -> NDArray[np.bool_]:
+    """Spec B4: whether each sub-goal holds, bool (n, G), from RAM (n, 128) alone."""
+    facts, alive = ram[:, FACT_BYTES].astype(np.int64), ram[:, RAM["dying"]] == 0
+    return np.stack([sub_goal.holds(facts, alive) for sub_goal in sub_goals], axis=1)
 
 
 def kinds_of(ram: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -100,11 +102,12 @@ def kinds_of(ram: NDArray[np.uint8]) -> NDArray[np.int64]:
     return np.select(list(fits.values()), list(fits), default=ELSEWHERE).astype(np.int64)
 
 
-def origins_of(states: RoomStates) -> dict[str, NDArray[np.int64]]:
+def origins_of(states: RoomStates, sub_goal: SubGoal) -> dict[str, NDArray[np.int64]]:
     """The states' origins, int64 (n,) each.
 
-    room, x, y; group 1..7 of the room (0: it has no ladder); kind, an index into ``KINDS``; ladder, see ``ladders_of``;
-    dying, 0 or 1; action, 0..17, that led to the last frame, and previous_action, that led to the one before.
+    room, x, y; group 1..7 of the room (0: it has no ladder); kind, an index into ``KINDS``; ladder, the index of the
+    sub-goal's place at which the state is, see ``SubGoal.at``; dying, 0 or 1; action, 0..17, that led to the last
+    frame, and previous_action, that led to the one before.
     """
     positions = positions_of(states.ram)
     group = np.zeros(len(positions), np.int64)
@@ -116,7 +119,7 @@ def origins_of(states: RoomStates) -> dict[str, NDArray[np.int64]]:
         "y": positions[:, 2],
         "group": group,
         "kind": kinds_of(states.ram),
-        "ladder": ladders_of(positions),
+        "ladder": sub_goal.at(states.ram[:, FACT_BYTES].astype(np.int64)),
         "dying": (states.ram[:, RAM["dying"]] > 0).astype(np.int64),
         "action": states.actions[:, 0],
         "previous_action": states.actions[:, 1],
@@ -139,19 +142,26 @@ def emulator_of_process() -> Emulator:
 
 
 def gather(
-    room: int, wanted: int, seed: int, stream: tuple[str | int, ...], *, play: str, held_out: bool, runs_on: bool
+    room: int,
+    wanted: int,
+    seed: int,
+    stream: tuple[str | int, ...],
+    *,
+    sub_goals: Sequence[SubGoal],
+    play: str,
+    held_out: bool,
+    unclear: bool,
 ) -> RoomStates:
     """``wanted`` different states of a room: rollouts until there are enough, then a choice among them.
 
     ``seed`` and ``stream`` determine all randomness, see ``rng_for``; ``play``, a name in ``PLAYS``, is how the agent
-    plays; ``held_out``, the side of ``may_be_held_out``; ``runs_on``, whether to keep states at bases of ladders that
-    continue through the floor. A room with too few different states is a ``UserError``.
+    plays; ``held_out``, the side of ``may_be_held_out``; ``unclear``, whether to keep states at unclear places, such as
+    bases of ladders that continue through the floor. A room with too few different states is a ``UserError``.
     """
     rng = rng_for(seed, *stream, room)
-    bases = [
-        index for index, ladder in enumerate(LADDERS) if ladder.base.room == room and (runs_on or not ladder.runs_on)
-    ]
-    positives = dict.fromkeys(bases if play == "expert" else (), 0)
+    left_out = set() if unclear else {(goal.name, place) for goal in sub_goals for place in goal.unclear}
+    here = {(goal.name, place) for goal in sub_goals for place, at in enumerate(goal.places) if at.room == room}
+    positives = dict.fromkeys(here - left_out if play == "expert" else (), 0)
 
     def enough() -> bool:
         if len(pool) < SPARE * wanted:
@@ -161,24 +171,27 @@ def gather(
 
     seen: set[bytes] = set()
     pool: list[Shown] = []
-    for step, shown in enumerate(PLAYS[play](emulator_of_process(), room, rng)):
+    for step, shown in enumerate(PLAYS[play](emulator_of_process(), room, rng, sub_goals)):
         if enough() or step == MOST_STEPS * wanted:
             break
         looks = digest(shown.stack)
         if looks in seen or may_be_held_out(looks) != held_out:
             continue
         seen.add(looks)
-        ladder = int(ladders_of(positions_of(shown.ram[None]))[0])
-        if ladder >= 0 and LADDERS[ladder].runs_on and not runs_on:
+        facts = shown.ram[None, FACT_BYTES].astype(np.int64)
+        places = {(goal.name, int(goal.at(facts)[0])) for goal in sub_goals}
+        if places & left_out:
             continue
         pool.append(shown)
-        if ladder in positives and shown.ram[RAM["dying"]] == 0:
-            positives[ladder] += 1
+        if shown.ram[RAM["dying"]] == 0:
+            for place in places & positives.keys():
+                positives[place] += 1
     if len(pool) < wanted:
         fault = f"room {room} does not show {wanted} different states"
         raise UserError(fault, f"{len(pool)} in {step} steps", "Ask for fewer.")
     ram = np.stack([shown.ram for shown in pool])
-    chosen = [pool[index] for index in choose(kinds_of(ram), positions_of(ram), wanted, rng)]
+    kinds = np.where(labels_of(ram, sub_goals).any(1), POSITIVE, kinds_of(ram))
+    chosen = [pool[index] for index in choose(kinds, positions_of(ram), wanted, rng)]
     return RoomStates(
         np.stack([shown.stack for shown in chosen]),
         np.stack([shown.ram for shown in chosen]),
@@ -222,14 +235,17 @@ class Shown(NamedTuple):
     previous_action: int
 
 
-def expert_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iterator[Shown]:
-    """Spec B5: endlessly, the states of rollouts from around a room's bases, ladders, tops and platforms.
+def expert_play(
+    emulator: Emulator, room: int, rng: np.random.Generator, sub_goals: Sequence[SubGoal]
+) -> Iterator[Shown]:
+    """Spec B5: endlessly, the states of rollouts from around a room's spots, ladders, sides and platforms.
 
-    Actions are repeated, most of them headings; some lead to a base. A rollout ends when the agent leaves the room or
+    Actions are repeated, most of them headings; some lead to a spot. A rollout ends when the agent leaves the room or
     would revive after a death.
     """
-    bases = [base for base in BASES if base.room == room]
-    starts = _starts(emulator, room, rng)
+    spots = [spot for goal in sub_goals for spot in goal.spots or goal.places if spot.room == room]
+    sides = [side for goal in sub_goals for side in goal.sides if side.room == room]
+    starts = _starts(emulator, room, rng, spots, sides)
     kinds = list(starts)
     weights = np.array([STARTS[kind] for kind in kinds])
     while True:
@@ -237,12 +253,14 @@ def expert_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iter
         for _ in range(ROLLOUTS_PER_PHASE):
             emulator.restore(scene)
             start = starts[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]()
-            if (begun := _begin(emulator, room, start, bases)) is not None:
-                yield from _rollout(emulator, room, begun, _expert_actions(emulator, bases, rng))
+            if (begun := _begin(emulator, room, start, spots)) is not None:
+                yield from _rollout(emulator, room, begun, _expert_actions(emulator, spots, rng))
 
 
-def random_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iterator[Shown]:
-    """Spec B7: endlessly, the states of uniform-random actions from the sides of a room."""
+def random_play(
+    emulator: Emulator, room: int, rng: np.random.Generator, sub_goals: Sequence[SubGoal]
+) -> Iterator[Shown]:
+    """Spec B7: endlessly, the states of uniform-random actions from the sides of a room, whatever the sub-goals."""
     places = standing_places(emulator, room)
     row = places[places[:, 1] == places[:, 1].max()]
     sides = [Placing(*row[row[:, 0].argmin()].tolist()), Placing(*row[row[:, 0].argmax()].tolist())]
@@ -267,12 +285,12 @@ def _rollout(
         yield shown
 
 
-def _expert_actions(emulator: Emulator, bases: Sequence[Position], rng: np.random.Generator) -> Iterator[int]:
+def _expert_actions(emulator: Emulator, spots: Sequence[Position], rng: np.random.Generator) -> Iterator[int]:
     action, left = game.NOOP, 0
-    homing = rng.random() if bases else 0.0
+    homing = rng.random() if spots else 0.0
     for _ in range(ROLLOUT_STEPS):
         if left == 0 and rng.random() < homing:
-            action, left = _towards_base(emulator.position(), bases)
+            action, left = _towards(emulator.position(), spots)
         elif left == 0:
             heading = rng.random() < HEADING
             action = HEADINGS[rng.integers(len(HEADINGS))] if heading else int(rng.integers(game.N_ACTIONS))
@@ -281,13 +299,14 @@ def _expert_actions(emulator: Emulator, bases: Sequence[Position], rng: np.rando
         yield int(rng.integers(game.N_ACTIONS)) if rng.random() < JITTER else action
 
 
-def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, int]:
-    """An action that moves the agent to the nearest base or holds it there, and its number of agent steps."""
-    base = min(bases, key=lambda base: abs(position.x - base.x) + abs(position.y - base.y))
-    aside = base.x - position.x
+def _towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
+    """An action that moves the agent to the nearest spot or holds it there, and its number of agent steps."""
+    spot = min(spots, key=lambda spot: abs(position.x - spot.x) + abs(position.y - spot.y))
+    aside = spot.x - position.x
     if abs(aside) > CLOSE:
         return (game.RIGHT if aside > 0 else game.LEFT), max(1, round(abs(aside) / STRIDE))
-    return (game.DOWN if position.y > base.y else game.NOOP), 1
+    upwards = position.y < spot.y and spot in TOPS and spot not in BASES
+    return (game.DOWN if position.y > spot.y else game.UP if upwards else game.NOOP), 1
 
 
 def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> game.Snapshot:
@@ -300,7 +319,7 @@ def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> game.Snap
             return scene
 
 
-def _begin(emulator: Emulator, room: int, start: Placing, bases: Sequence[Position] = ()) -> tuple[int, int] | None:
+def _begin(emulator: Emulator, room: int, start: Placing, spots: Sequence[Position] = ()) -> tuple[int, int] | None:
     """Bring the agent to its start and fill the stack; the last two actions, None unless it is alive in the room."""
     emulator.write("x", start.x)
     emulator.write("y", start.y)
@@ -308,16 +327,17 @@ def _begin(emulator: Emulator, room: int, start: Placing, bases: Sequence[Positi
     action = previous = game.NOOP
     for _ in range(SETTLE):
         previous = action
-        action = _towards_base(emulator.position(), bases)[0] if start.hold else game.NOOP
+        action = _towards(emulator.position(), spots)[0] if start.hold else game.NOOP
         emulator.step(action)
     return (action, previous) if emulator.alive() and emulator.position().room == room else None
 
 
-def _starts(emulator: Emulator, room: int, rng: np.random.Generator) -> dict[str, Callable[[], Placing]]:
-    """A function for each kind of start that the room has, which draws one. Several ladders take turns."""
+def _starts(
+    emulator: Emulator, room: int, rng: np.random.Generator, spots: Sequence[Position], sides: Sequence[Position]
+) -> dict[str, Callable[[], Placing]]:
+    """A function for each kind of start that the room has, which draws one. Several of a kind take turns."""
     places = standing_places(emulator, room)
-    bases = _in_turn([base for base in BASES if base.room == room], rng)
-    tops = _in_turn([top for top in TOPS if top.room == room], rng)
+    spots_in_turn, sides_in_turn = _in_turn(spots, rng), _in_turn(sides, rng)
     climbs = _in_turn([climb for ladder in LADDERS for climb in _climbs(ladder) if climb[0].room == room], rng)
 
     def beside(spot: Position, held: float) -> Placing:
@@ -330,12 +350,12 @@ def _starts(emulator: Emulator, room: int, rng: np.random.Generator) -> dict[str
         return Placing(end.x, end.y, action, int(rng.integers(1, longest + 1)))
 
     starts: dict[str, Callable[[], Placing]] = {}
-    if bases:
-        starts["base"] = lambda: beside(next(bases), HELD)
+    if spots_in_turn:
+        starts["spot"] = lambda: beside(next(spots_in_turn), HELD)
     if climbs:
         starts["ladder"] = lambda: climbing(*next(climbs))
-    if tops:
-        starts["top"] = lambda: beside(next(tops), 0.0)
+    if sides_in_turn:
+        starts["side"] = lambda: beside(next(sides_in_turn), 0.0)
     starts["anywhere"] = lambda: Placing(*places[rng.integers(len(places))].tolist())
     return starts
 
@@ -377,7 +397,7 @@ def _climbs(ladder: Ladder) -> list[tuple[Position, int, int]]:
     return [(ladder.base, game.UP, up // STRIDE - 1), (ladder.top, game.DOWN, down // STRIDE - 1)]
 
 
-PLAYS: dict[str, Callable[[Emulator, int, np.random.Generator], Iterator[Shown]]] = {
+PLAYS: dict[str, Callable[[Emulator, int, np.random.Generator, Sequence[SubGoal]], Iterator[Shown]]] = {
     "expert": expert_play,
     "random": random_play,
 }

@@ -73,13 +73,13 @@ class Estimates:
             if source and heldout in as_dict(source):
                 source = replace(source, **{heldout: 0})
             learned = domain.collected_bytes(source) if source else 0
-            goals = len(config.sub_goals or domain.sub_goals)
+            goals = len(config.sub_goals or domain.usual_sub_goals)
             seconds = self._rate("member_step", config.network) * config.steps * config.members
             seconds += self._rate("localiser") * (config.view == "agent-crop" and config.localiser == "learned")
             memory = ensemble_process(learned, config, shape, dtype).memory
             return Cost(seconds, memory, min(config.workers or goals, goals))
         ensemble: dict[str, Any] = {
-            "sub_goals": source.sub_goals or domain.sub_goals if source else domain.sub_goals,
+            "sub_goals": source.sub_goals or domain.usual_sub_goals if source else domain.usual_sub_goals,
             "members": source.members if source else 1,
             "network": source.network if source else "auto",
         }
@@ -94,7 +94,8 @@ class Estimates:
             domain.rooms_of(start)  # an unknown start is a UserError
         is_each = as_dict(config).get("steps_for") == "each" and config.termination != "oracle"
         steps = config.steps * (ensemble["members"] if is_each else 1)
-        return Cost(steps * self._rate("step", config.network), play_needs(domain, ensemble, config).memory)
+        kind = f"{config.network}-none" if config.recurrence == "none" else config.network
+        return Cost(steps * self._rate("step", kind), play_needs(domain, ensemble, config).memory)
 
 
 def wall_seconds(cells: Sequence[Cell], workers: int) -> float:

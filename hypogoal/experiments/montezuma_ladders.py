@@ -16,7 +16,7 @@ RATES = {
     "collect_cores": 6,  # rooms that a collection plays in at once, at most
     "member_step": {"montezuma": 0.08, "montezuma-crop": 0.01},
     "localiser": 90,
-    "step": {"light": 2.5e-3, "paper": 4.0},
+    "step": {"light": 2.5e-3, "paper": 2.4, "paper-none": 0.042},
 }
 METHODS = {
     "dbat": "--set diversity=dbat",
@@ -28,6 +28,7 @@ CHANGES = """changes to compare: settings of train-ensemble as key=value, severa
 each gives one more ensemble per method"""
 OPTION_GROUPS = "the N whose ensembles get options; they must be among 'groups'"
 OPTION_METHODS = "the ensembles that get options; they must be among 'methods'"
+SUB_GOAL = "what is labelled, a sub-goal of collect montezuma; empty: climb-down-ladder. 'ladders' are starts then"
 ORACLE = "options that end at the true sub-goal beside them, on each ladder"
 
 
@@ -42,6 +43,7 @@ def montezuma_ladders(
     ),
     seeds: Seeds = (0,),
     methods: Annotated[Names, explained(ENSEMBLES, source="Figure 3", choices=METHODS)] = tuple(METHODS),
+    sub_goal: Annotated[str, explained(SUB_GOAL, source="authors' code")] = "",
     variants: Annotated[Names, explained(CHANGES)] = (),
     ladders: Annotated[Names, explained("ladders to learn options on; empty for none", source="Figure 4")] = (),
     option_groups: Annotated[Integers, explained(OPTION_GROUPS, low=1, high=7)] = (2,),
@@ -49,8 +51,9 @@ def montezuma_ladders(
     oracle: Annotated[bool, explained(ORACLE, source="ours: a control")] = True,
 ) -> Iterator[Command]:
     """The states and ensembles of each N, then the options of each ladder and seed with their oracle."""
+    labelled = f" --set sub_goals={sub_goal}" if sub_goal else ""
     for count in groups:
-        yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}", {"groups": count})
+        yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}{labelled}", {"groups": count})
         for method, variant, seed in product(methods, ("", *variants), seeds):
             changes = variant.split()
             sets = " ".join(f"--set {shlex.quote(change)}" for change in changes)

@@ -154,6 +154,6 @@ def _cores(words: Sequence[str], sources: Sequence[Cell]) -> int:
     if not sub_goals:
         domain = next((cell.arguments[1] for cell in sources if cell.stage == "collect"), "")
         with contextlib.suppress(UserError):  # its cell refuses a domain that may not be loaded
-            sub_goals = load_domain(domain).sub_goals
+            sub_goals = load_domain(domain).usual_sub_goals
     workers = settings.get("workers", "")
     return max(1, min(len(sub_goals), int(workers) if workers.isdigit() and int(workers) else len(sub_goals)))

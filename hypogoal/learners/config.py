@@ -10,6 +10,11 @@ class WorldConfig:
     """The world that an agent plays in."""
 
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
+    start: str = setting(
+        "",
+        "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
+        source="paper, policy learning; several: ours",
+    )
     max_episode_steps: int = setting(
         500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
     )

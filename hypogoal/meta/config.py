@@ -59,11 +59,6 @@ class MetaConfig:
 class PlayConfig(OptionConfig, WorldConfig):
     """Where options are played."""
 
-    start: str = setting(
-        "",
-        "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
-        source="paper, policy learning; several: ours",
-    )
     layouts: str = setting(
         "",
         "layouts to draw episodes from: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: that one",

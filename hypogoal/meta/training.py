@@ -126,15 +126,31 @@ def nearness(
     if config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
         return None
     columns = np.repeat(columns_of(domain, sub_goals), ensemble_config["members"])
+    away = distances_of(domain, sub_goals, ensemble_config["members"])
 
     def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
         with UsersCode("the engine's labels", engine, "labels"):
             holds = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
         if not (domain.measures and engine.position_names):
             return holds
-        return holds | (domain.distance(engine.positions(ids)) <= domain.near)
+        return holds | (away(engine.positions(ids), options) <= domain.near)
 
     return near
+
+
+def distances_of(
+    domain: Domain, sub_goals: Sequence[str], members: int
+) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]:
+    """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
+
+    def away(positions: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.int64]:
+        distances = np.zeros(len(options), np.int64)
+        for number, sub_goal in enumerate(sub_goals):
+            of_goal = options // members == number
+            distances[of_goal] = domain.distance_to(sub_goal, positions[of_goal])
+        return distances
+
+    return away
 
 
 def cut(engine: Engine, cap: float) -> None:
@@ -187,12 +203,17 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
         if config.start:
             raise UserError(f"{domain.name} has no named starts", f"start={config.start}", "Leave it out.")
         return more
-    for start in config.start.split(",") if domain.many_starts else [config.start]:
+    check_start(domain, config.start)
+    memory = frames_kept(config, options)
+    return {"start": config.start, "memory": memory, "seed": seed, **more}
+
+
+def check_start(domain: Domain, starts: str) -> None:
+    """Refuse (``UserError``) a start that the domain does not name."""
+    for start in starts.split(",") if domain.many_starts else [starts]:
         if start not in domain.starts:
             fault = "unknown start" if start else "where are episodes to begin?"
             raise UserError(fault, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
-    memory = frames_kept(config, options)
-    return {"start": config.start, "memory": memory, "seed": seed, **more}
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:
@@ -322,14 +343,19 @@ def write_layout(folder: Path, engine: Engine, layout_seed: int, episodes: int, 
     """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
     Both are null where the engine does not know them; then no episode of random play is played. ``places`` are written
-    first.
+    first, last the step at which each room was first reached, where there are rooms.
     """
     success = engine.random_success(episodes, rng_for(seed, "random-play")) if episodes else None
-    facts = {
+    facts: dict[str, Any] = {
         **places,
         "layout_seed": layout_seed,
         "shortest_path": engine.shortest_path(),
         "random_success": success,
         "random_episodes": 0 if success is None else episodes,
     }
+    if "room" in engine.position_names:
+        positions = engine.positions(np.arange(engine.n_states))
+        rooms, first = np.unique(positions[:, engine.position_names.index("room")], return_index=True)
+        steps = np.maximum(first - len(engine.starts) + 1, 0)
+        facts["rooms"] = dict(zip(map(str, rooms.tolist()), steps.tolist(), strict=True))
     (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")

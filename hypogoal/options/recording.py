@@ -129,17 +129,20 @@ class Recorder(Resumable):
                     states = np.stack(kept) if kept else self.engine.images(np.array(stops, dtype=np.int64))
                     file.create_dataset(str(option), data=states, compression="gzip", compression_opts=1)
 
-    def write_executions(self, folder: Path, distance: Callable[[NDArray[np.int64]], NDArray[np.int64]]) -> None:
+    def write_executions(
+        self, folder: Path, distances: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
+    ) -> None:
         """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
 
-        ``distance`` is of positions (n, 3) from where the sub-goal truly holds, int (n,).
+        ``distances`` are of positions (n, 3) from where the sub-goals of their options (n,) truly hold, int (n,).
         """
         executions = self._executions()
         stops = np.array([execution.states[-1] for execution in executions], dtype=np.int64)
         places = self.engine.positions(stops)
+        away = distances(places, np.array([execution.option for execution in executions], dtype=np.int64))
         Executions.of_rows(
-            (run.step, run.option, run.duration, run.reached, run.inside_at_start, run.terminated, *place, away)
-            for run, place, away in zip(executions, places.tolist(), distance(places).tolist(), strict=True)
+            (run.step, run.option, run.duration, run.reached, run.inside_at_start, run.terminated, *place, far)
+            for run, place, far in zip(executions, places.tolist(), away.tolist(), strict=True)
         ).write(folder)
 
     def write_exploits(

@@ -86,8 +86,9 @@ class Visited(Resumable):
 
     def write(self, folder: Path, domain: Domain, ensemble_config: Mapping[str, Any], seed: int) -> None:
         """``visited.h5`` into ``folder``: a data file of unlabelled states, of the ensemble's domain."""
-        none = States(self.engine.room_for(0, None), np.zeros((0, len(domain.sub_goals)), np.bool_))
-        collected = Collected(self.engine.observation_shape, domain.sub_goals, none, self.states(), none)
+        sub_goals = domain.usual_sub_goals
+        none = States(self.engine.room_for(0, None), np.zeros((0, len(sub_goals)), np.bool_))
+        collected = Collected(self.engine.observation_shape, sub_goals, none, self.states(), none)
         named = {"domain": ensemble_config["domain"], "config": ensemble_config["domain_config"]}
         write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)
 

@@ -13,7 +13,7 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain, require_one_kind
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
-from hypogoal.meta.training import cut, judged, played_world, write_layout
+from hypogoal.meta.training import check_start, cut, judged, played_world, write_layout
 from hypogoal.needs import baseline_needs, judging_member
 from hypogoal.options.tables import Episodes
 
@@ -63,10 +63,14 @@ def train_baseline(
             raise UserError(fault, data, "Name their domain.")
         lived = played.world(dataset.config)
     world = played_world(played, lived, config.world)
+    begins: dict[str, str] = {}
+    if config.start:
+        check_start(played, config.start)
+        begins = {"start": config.start}
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
-    engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world)
+    engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world, **begins)
     cut(engine, config.cap)
     require_one_kind(engine)
     if data and engine.observation_dtype != PICTURE:
@@ -90,6 +94,6 @@ def train_baseline(
         work.progress.update(config.steps)
         Episodes.of_rows(env.episodes).write(work.folder)
         save_tensors(work.folder / "policy.safetensors", weights(agent))
-        write_layout(work.folder, engine, config.layout_seed, config.random_episodes, seed)
+        write_layout(work.folder, engine, config.layout_seed, config.random_episodes, seed, **begins)
     counts = {"steps": env.episodes.steps, "episodes": len(env.episodes)}
     return counts | {"success": env.episodes.success(), "length": env.episodes.length()}

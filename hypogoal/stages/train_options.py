@@ -14,6 +14,7 @@ from hypogoal.meta.training import (
     check_fit,
     continue_with,
     description,
+    distances_of,
     options_of,
     start_arguments,
     train,
@@ -66,7 +67,9 @@ def train_options(
         recorder = loop.recorder
         solved = train(loop, steps, work.log, work.progress, work.checkpoints, config.until)
         if domain.measures and loop.engine.position_names:
-            recorder.write_executions(work.folder, domain.distance)
+            sub_goals = source.config["sub_goals"]
+            each = options_of(source.config, config) // len(sub_goals)
+            recorder.write_executions(work.folder, distances_of(domain, sub_goals, each))
         write_trained(work.folder, loop, domain, source.config, config, seed)
         if config.until:
             settings |= {"ended_at": recorder.steps, "until_reached": solved}  # for the manifest, which comes last

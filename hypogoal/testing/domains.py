@@ -264,9 +264,9 @@ class _Contract:
             text = f"played {steps:,} of the {planned:,} steps that 'collect' plays, for want of time"
             warnings.warn(f"{text}: --minutes gives it more", stacklevel=2)
         self.collected = self.collect()
-        goals = len(self.domain.sub_goals)
+        goals = len(self.domain.usual_sub_goals)
         text = f"the states' sub_goals are {self.collected.sub_goals}"
-        same = tuple(self.collected.sub_goals) == tuple(self.domain.sub_goals)
+        same = tuple(self.collected.sub_goals) == tuple(self.domain.usual_sub_goals)
         promise(same, text, "Give those of the domain, in their order.")
         for name, states in _sets(self.collected):
             count = len(states.observations)
@@ -286,7 +286,7 @@ class _Contract:
 
     def classes(self) -> str:
         text = []
-        for column, goal in enumerate(self.domain.sub_goals):
+        for column, goal in enumerate(self.domain.usual_sub_goals):
             labelled, heldout = self.collected.labelled.labels[:, column], self.collected.heldout.labels[:, column]
             both = len(np.unique(labelled)) == 2
             promise(both or not self.reached_all, *_missing(goal, "labelled", labelled))
@@ -296,7 +296,7 @@ class _Contract:
                 warnings.warn(". ".join(_missing(goal, "held-out", heldout)), stacklevel=2)
             text.append(f"{goal} {int(labelled.sum())} of {len(labelled)}")
         complete = [len(np.unique(column)) > 1 for column in self.collected.labelled.labels.T]
-        goals = [goal for goal, both in zip(self.domain.sub_goals, complete, strict=True) if both]
+        goals = [goal for goal, both in zip(self.domain.usual_sub_goals, complete, strict=True) if both]
         for line in hard_to_learn(self.collected.labelled.labels[:, complete], goals):
             warnings.warn(f"{line}. {GET_MORE}", stacklevel=2)
         return f"positives among labelled: {', '.join(text)}"

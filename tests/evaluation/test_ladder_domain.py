@@ -24,7 +24,7 @@ def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
     assert own.distance[0] > own.distance[2] > 4
     assert at_base(own).tolist() == [False, True, False, True, False]
     place = {"method": "single CNN", "N": 2, "ladder": "2-6", "seed": 0, "artefact": "options"}
-    rows = list(rows_of_ladder(own, domain.sub_goals, 1, {}, masked=False, **place))
+    rows = list(rows_of_ladder(own, domain.usual_sub_goals, 1, {}, masked=False, **place))
     (over,) = distance_table(rows, ["2-6"])
     assert over["best"]["mean"] == pytest.approx(away.mean())
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:

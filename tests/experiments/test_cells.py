@@ -186,7 +186,7 @@ def test_a_sweep_of_one_seed_can_be_given_more(tmp_path: Path) -> None:
     [
         (["option_groups=3", "groups=1,2", "ladders=1L"], "no cell before it makes: ensemble/dbat/groups-3"),
         (["option_methods=none", "methods=dbat", "ladders=1L"], "no cell before it makes: ensemble/none"),
-        (["ladders=1X"], "unknown ladder"),
+        (["ladders=1X"], "unknown start"),
         (["variants=thresold=0.5"], "has no setting"),
         (["train-meta.steps=3"], "no such stage"),
     ],

@@ -34,7 +34,7 @@ QUICK = {
 
 def ensemble_in(folder: Path, seed: int = 0, **changes: object) -> Path:
     """An ensemble artefact with random weights, of two members that look at a window."""
-    config = {"domain": "montezuma", "domain_config": {}, "sub_goals": list(DOMAIN.sub_goals), "members": 2,
+    config = {"domain": "montezuma", "domain_config": {}, "sub_goals": list(DOMAIN.usual_sub_goals), "members": 2,
               "observation_shape": list(SHAPE), **CROP, **changes}  # fmt: skip
     with torch.random.fork_rng():
         torch.manual_seed(0)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import TRUST
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
+from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
+from hypogoal.stages.train_baseline import train_baseline
 from hypogoal.stages.train_options import train_options
 
 BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "environments": 4, "warm_up": 60}
@@ -51,11 +54,11 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
     """An ensemble artefact with random weights."""
     shape = domain.observation_shape
     config = {
-        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.sub_goals), "members": members,
+        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
         "network": network, "observation_shape": list(shape),
     }  # fmt: skip
     with create_artefact(folder, kind="ensemble", config=config, seed=0, inputs=[]) as place:
-        for number, sub_goal in enumerate(domain.sub_goals):
+        for number, sub_goal in enumerate(domain.usual_sub_goals):
             write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
         fill(place, "ensemble", config)
     return folder
@@ -75,7 +78,7 @@ def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class TallDomain:
     """Only for the ensemble's manifest: oracle terminations read no weights."""
 
-    name, sub_goals, observation_shape = DOMAIN.name, DOMAIN.sub_goals, (84, 84, 4)
+    name, usual_sub_goals, observation_shape = DOMAIN.name, DOMAIN.sub_goals, (84, 84, 4)
 
 
 def rows_of(folder: Path) -> list[dict[str, int]]:
@@ -166,3 +169,15 @@ def test_options_on_a_ladder(tmp_path: Path) -> None:
         assert all(row["duration"] <= 25 for row in rows)
     reached = [row["distance"] <= 4 for row in rows if row["reached"]]  # the oracle's: two units in x and two in y
     assert all(reached)
+
+
+@pytest.mark.atari
+def test_a_baseline_begins_where_it_is_told(tmp_path: Path) -> None:
+    """Spec E7, I4: in a new game, in room 1 from step 0 on; an unknown start leaves nothing behind."""
+    config = BaselineConfig(agent="ppo", setting="paper", steps=200, start="game", max_episode_steps=50)
+    train_baseline("montezuma", config, tmp_path / "ppo", quiet=True)
+    layout = json.loads((tmp_path / "ppo" / "layout.json").read_text())
+    assert (layout["start"], layout["rooms"]) == ("game", {"1": 0})
+    with pytest.raises(UserError, match="unknown start: nowhere"):
+        train_baseline("montezuma", replace(config, start="nowhere"), tmp_path / "none", quiet=True)
+    assert not (tmp_path / "none").exists()

@@ -96,7 +96,7 @@ def test_every_option_begins_at_a_start_state(tmp_path: Path) -> None:
     assert recorder.episodes == [(2, 2, 0.0, 0, 0), (6, 4, 0.0, 0, 0), (9, 3, 0.0, 1, 0)]
     assert engine.elapsed[0] == 1, "the fourth runs"
 
-    recorder.write_executions(tmp_path, lambda positions: 10 * positions[:, 1])
+    recorder.write_executions(tmp_path, lambda positions, options: 10 * positions[:, 1])
     rows = columns(tmp_path)
     assert [(row["step"], row["option"], row["duration"]) for row in rows] == [(2, 0, 2), (6, 0, 4), (9, 0, 3)]
     assert [row["reached"] for row in rows] == [1, 0, 0]
@@ -114,7 +114,7 @@ def test_an_option_that_begins_inside_its_sub_goal_runs_and_says_so(tmp_path: Pa
     """Spec D4, F3: nothing is masked; it runs one step at least, and its row says inside_at_start."""
     engine = LongCorridor(1, start="left")
     _, recorder = play(engine, [LEFT, RIGHT, RIGHT, RIGHT, RIGHT, STAY], [0, 0, 1])
-    recorder.write_executions(tmp_path, lambda positions: positions[:, 1])
+    recorder.write_executions(tmp_path, lambda positions, options: positions[:, 1])
     rows = columns(tmp_path)
     assert [(row["duration"], row["reached"], row["inside_at_start"], row["x"]) for row in rows] == [
         (1, 1, 1, 0),
@@ -125,7 +125,7 @@ def test_an_option_that_begins_inside_its_sub_goal_runs_and_says_so(tmp_path: Pa
 def test_no_executions_no_rows(tmp_path: Path) -> None:
     """Spec F3: an option that was never chosen has no rows, and nothing breaks."""
     engine = LongCorridor(1)
-    Recorder(2, engine).write_executions(tmp_path, lambda positions: positions[:, 1])
+    Recorder(2, engine).write_executions(tmp_path, lambda positions, options: positions[:, 1])
     assert columns(tmp_path) == []
 
 
