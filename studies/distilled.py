@@ -208,39 +208,41 @@ def tables(path: Path) -> Iterator[str]:
     )
 
 
+CONTRASTS = (  # a minus b; of four, a minus b minus (c minus d)
+    ("dbat", "planned"),
+    ("grid", "planned"),
+    ("none", "none-planned"),
+    ("one", "one-planned"),
+    ("dbat", "none"),
+    ("dbat", "one"),
+    ("planned", "none-planned"),
+    ("planned", "one-planned"),
+    ("dbat", "none", "planned", "none-planned"),
+)
+
+
 def _differences(path: Path) -> Iterator[str]:
     """What the rules ask for, seed by seed: distilled minus planned; diversity's share in the picked member."""
     within = read(path, "within_2")
-    pairs = [
-        ("dbat", "planned"),
-        ("grid", "planned"),
-        ("none", "none-planned"),
-        ("one", "one-planned"),
-        ("dbat", "none"),
-        ("dbat", "one"),
-    ]
     yield "Differences over the seeds that both have."
     yield ""
     lines = []
-    for first, second in pairs:
-        keys = [(method, STEP, WHERE[1]) for method in (first, second)]
-        seeds = sorted(set(within[keys[0]]) & set(within[keys[1]]))
+    for methods in CONTRASTS:
+        seeds = sorted(set.intersection(*(set(within[method, STEP, WHERE[1]]) for method in methods)))
         if not seeds:
             continue
-        some = {(method, STEP, where): {seed: within[method, STEP, where][seed] for seed in seeds}
-                for method in (first, second) for where in WHERE}  # fmt: skip
-        means, picks = ([of(some, method) for method in (first, second)] for of in (_means, _picks))
-        name = f"{METHODS[first][0]} - {METHODS[second][0]}"
-        lines.append([name, difference(means[0] - means[1], 3), difference(picks[0] - picks[1], 3), str(len(seeds))])
+        some = {
+            (method, STEP, where): {seed: within[method, STEP, where][seed] for seed in seeds}
+            for method in methods
+            for where in WHERE
+        }
+        signed = [*zip((1, -1, -1, 1), methods, strict=False)]
+        means = sum(sign * of_seeds(some, (method, STEP, WHERE[1])) for sign, method in signed)
+        picks = sum(sign * picked(some, method, STEP) for sign, method in signed)
+        name = " - ".join(METHODS[method][0] for method in methods[:2])
+        name += "".join(f", minus the same of {METHODS[method][0]}" for method in methods[2:3])
+        lines.append([name, difference(np.asarray(means), 3), difference(np.asarray(picks), 3), str(len(seeds))])
     yield from table(["difference", "mean member", "picked member", "seeds"], lines)
-
-
-def _means(numbers: Any, method: str) -> Any:
-    return of_seeds(numbers, (method, STEP, WHERE[1]))
-
-
-def _picks(numbers: Any, method: str) -> Any:
-    return picked(numbers, method, STEP)
 
 
 def main() -> None:
