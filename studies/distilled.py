@@ -41,7 +41,8 @@ from hypogoal.stages.train_options import train_options
 from studies.cells import Cell, Row, difference, interval, parser_of, run_cells, table
 from studies.many_layouts import ENSEMBLE_STEPS, KEYS, WHERE, new_layouts, of_seeds, picked, read, tried_out
 
-FIRST, CHOOSING = 6000, 2000  # where new layouts begin; others from 2000 and 5000 on were seen while settings were chosen
+FIRST = 6000  # new layouts begin here; those from 5000 on were seen while settings were chosen
+CHOOSING = 2000  # layouts on which settings are chosen begin here
 PICKING = tuple(range(1000, 1050))  # layouts on which members are picked
 CHOOSE, STEP = 0, 1  # of a cell: looked at on layouts to choose on, or on new ones
 GRID = {  # the first setting
