@@ -66,16 +66,10 @@ METHODS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "one-planned": ("one classifier, planned", "one", {"network": "planned"}),
     "oracle": ("true sub-goals, distilled", "dbat", TRUE),
     "oracle-many": ("true sub-goals, 800 layouts", "dbat", TRUE | {"layouts": "1000-1799"}),
-    "oracle-long": (
-        "true sub-goals, 800 layouts, twice as long",
-        "dbat",
-        TRUE | {"layouts": "1000-1799", "steps": 409_600, "rate_steps": 409_600},
-    ),
     "oracle-own": ("true sub-goals, also from states of its own play", "dbat", TRUE | {"network": OWN}),
     "oracle-drawn": ("true sub-goals, actions drawn", "dbat", TRUE),
-    "harsh": ("D-BAT, distilled where a wrong key ends the episode", "dbat", {"world": ("wrong_key=ends",)}),
 }
-PUBLISHED = tuple(METHODS)[:8]  # others are for layouts on which settings are chosen, or for agents
+PUBLISHED = tuple(METHODS)[:8]  # the others are tried on layouts on which settings are chosen
 SAME_OPTIONS = {"oracle-drawn": "oracle"}  # as those of another method, played in another way
 COLUMNS = (*KEYS, *OF_OPTIONS, "cpu_seconds")
 

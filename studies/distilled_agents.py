@@ -81,15 +81,9 @@ OPTIONS: dict[str, tuple[str, str | None, str]] = {
     "uniform": ("the same, uniform-random choice", "dbat", "random"),
     "grid": ("distilled, grid, 200 layouts", "grid", "ppo"),
     "uniform-grid": ("the same, uniform-random choice", "grid", "random"),
-    "there": ("distilled in the harsh world", "harsh", "ppo"),
-    "uniform-there": ("the same, uniform-random choice", "harsh", "random"),
     "planned": ("planned there", None, "ppo"),
 }
-# PPO on primitive actions, which plays in many layouts alone: a title, its network.
-PIXELS = {
-    "pixels": ("no options: PPO from pixels", "cells"),
-    "pixels-grid": ("no options: PPO from pixels, grid", GRID),
-}
+PIXELS = "pixels-grid"  # PPO on primitive actions, which plays in many layouts alone
 KEYS = ("world", "options", "layout")
 SCORES = ("success", "near", "within_2")
 COLUMNS = (
@@ -151,10 +145,10 @@ def run_cell(work: Path, world: str, options: str, number: int, seed: int) -> li
     return [{"world": world, "options": options, "layout": number, "step": STEP, "seed": seed, **numbers}]
 
 
-def run_pixels(world: str, options: str, seed: int) -> list[Row]:
+def run_pixels(world: str, seed: int) -> list[Row]:
     """PPO on primitive actions learns in many layouts and plays 100 others."""
     prepare()
-    chosen = replace(HYPERPARAMETERS["ppo", "tuned"], network=PIXELS[options][1])
+    chosen = replace(HYPERPARAMETERS["ppo", "tuned"], network=GRID)
     changes = parse_assignments(WORLDS[world].get("world", ()))
 
     def engine_in(layouts: Layouts, count: int) -> Engine:
@@ -169,7 +163,7 @@ def run_pixels(world: str, options: str, seed: int) -> list[Row]:
     with own_randomness():
         torch.manual_seed(seed_for(seed, "play"))
         numbers |= scored(*first_episodes(agent, EngineEnv(engine), EPISODES), ways)
-    return [{"world": world, "options": options, "layout": seed, "step": STEP, "seed": seed, **numbers}]
+    return [{"world": world, "options": PIXELS, "layout": seed, "step": STEP, "seed": seed, **numbers}]
 
 
 def first_episodes(agent: BaseAlgorithm, env: EngineEnv, count: int) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -231,9 +225,9 @@ def tables(path: Path) -> Iterator[str]:
     yield "100 new layouts, without learning there, those that can be solved: agent / uniform-random choice."
     yield ""
     rows = []
-    for world, options in ((world, options) for world in ("many", "many-harsh") for options in (*OPTIONS, *PIXELS)):
+    for world, options in ((world, options) for world in ("many", "many-harsh") for options in (*OPTIONS, PIXELS)):
         if some := cells[world, options]:
-            title = OPTIONS[options][0] if options in OPTIONS else PIXELS[options][0]
+            title = "no options: PPO from pixels, grid" if options == PIXELS else OPTIONS[options][0]
             pairs = [
                 " / ".join(
                     interval(values, 2)
@@ -253,8 +247,7 @@ def main() -> None:
     parser = parser_of(__doc__, "0-4")
     parser.add_argument("--work", type=Path, default=Path("runs/distilled"), help="where studies.distilled worked")
     parser.add_argument("--worlds", default=",".join(WORLDS), help=f"of {', '.join(WORLDS)}")
-    every = ", ".join((*OPTIONS, *PIXELS))
-    parser.add_argument("--options", default=",".join(OPTIONS), help=f"of {every}; the last two where layouts are many")
+    parser.add_argument("--options", default=",".join(OPTIONS), help=f"of {', '.join(OPTIONS)}; or {PIXELS}")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
@@ -265,8 +258,7 @@ def main() -> None:
             for place, number in enumerate(arguments.seeds if world.startswith("many") else LAYOUTS[world]):
                 seed = arguments.seeds[place % len(arguments.seeds)]
                 cell = partial(run_cell, arguments.work, world, options, number, seed)
-                pixels = partial(run_pixels, world, options, seed)
-                jobs[world, options, str(number)] = pixels if options in PIXELS else cell
+                jobs[world, options, str(number)] = partial(run_pixels, world, seed) if options == PIXELS else cell
     run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda _: (STEP,), arguments.workers)
 
 
