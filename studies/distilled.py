@@ -4,7 +4,8 @@
 
 A cell is a method and a seed: an ensemble's options, distilled by ``train-options --preset distilled`` or planned in
 the new layouts themselves, each then played alone as in ``studies.many_layouts``, in layouts that were learned in
-(``trained``) and in 100 others from ``FIRST`` on (``new``). The options stay in ``--work``, for
+(``trained``) and in 100 others from ``FIRST`` on (``new``). With ``--choosing`` they play 100 layouts from
+``CHOOSING`` on instead, on which settings are chosen. The options stay in ``--work``, for
 ``studies.distilled_agents``.
 """
 
@@ -16,9 +17,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import resolve
+from hypogoal.core.own_code import vouched
+from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
@@ -26,6 +32,9 @@ from hypogoal.evaluation.zero_shot import OF_OPTIONS
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import assemble
+from hypogoal.options.choosers import Ids
+from hypogoal.options.distilled import DistilledLearner
+from hypogoal.options.networks import apply_to_states
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
@@ -33,8 +42,9 @@ from studies.cells import Cell, Row, difference, interval, parser_of, run_cells,
 from studies.many_layouts import ENSEMBLE_STEPS, KEYS, WHERE, new_layouts, of_seeds, picked, read, tried_out
 
 FIRST = 6000  # new layouts begin here; those from 5000 on were seen while settings were chosen
+CHOOSING = 2000  # layouts on which settings are chosen begin here
 PICKING = tuple(range(1000, 1050))  # layouts on which members are picked
-STEP = 1  # of a cell: options are looked at once
+CHOOSE, STEP = 0, 1  # of a cell: looked at on layouts to choose on, or on new ones
 GRID = {  # the first setting
     "embedding": "grid",
     "layouts": "1000-1199",
@@ -42,6 +52,8 @@ GRID = {  # the first setting
     "steps": 160_000,
     "rate_steps": 160_000,
 }
+TRUE = {"termination": "oracle"}
+OWN = "studies.distilled:OwnStates"
 ENSEMBLES: dict[str, dict[str, Any]] = {"dbat": {}, "none": {"diversity": "none"}, "one": {"members": 1}}
 # A title, the ensemble, settings of the options.
 METHODS: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -52,8 +64,13 @@ METHODS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "none-planned": ("no diversity, planned", "none", {"network": "planned"}),
     "one": ("one classifier, distilled", "one", {}),
     "one-planned": ("one classifier, planned", "one", {"network": "planned"}),
-    "oracle": ("true sub-goals, distilled", "dbat", {"termination": "oracle"}),
+    "oracle": ("true sub-goals, distilled", "dbat", TRUE),
+    "oracle-many": ("true sub-goals, 800 layouts", "dbat", TRUE | {"layouts": "1000-1799"}),
+    "oracle-own": ("true sub-goals, also from states of its own play", "dbat", TRUE | {"network": OWN}),
+    "oracle-drawn": ("true sub-goals, actions drawn", "dbat", TRUE),
 }
+PUBLISHED = tuple(METHODS)[:8]  # the others are tried on layouts on which settings are chosen
+SAME_OPTIONS = {"oracle-drawn": "oracle"}  # as those of another method, played in another way
 COLUMNS = (*KEYS, *OF_OPTIONS, "cpu_seconds")
 
 
@@ -69,33 +86,70 @@ def ensemble_of(work: Path, name: str, seed: int) -> Artefact:
 def settings_of(method: str) -> TrainOptionsConfig:
     """The preset's, or those of planned options, which learn in no layout."""
     _, _, changes = METHODS[method]
-    if "network" in changes:
+    if changes.get("network") == "planned":
         return TrainOptionsConfig(**changes)
     return resolve(TrainOptionsConfig, stage="train-options", preset="distilled", options=changes)
 
 
-def run_cell(work: Path, method: str, seed: int) -> list[Row]:
-    """Distil an ensemble's options, then play each alone, on layouts learned in and on new ones; a row of each."""
+class OwnStates(DistilledLearner):
+    """It also learns from states of its own play: in the second half of training its network plays, greedily, in half
+    of the environments; plans say what was best there (DAgger: Ross, Gordon and Bagnell 2011).
+    """
+
+    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
+        actions = super().act(ids, options, age, explore=explore)
+        if explore and not self.loaded and 2 * self.steps >= self.config.rate_steps:
+            half = slice(len(ids) // 2)
+            actions[half] = self.actions[self.greedy(ids[half], options[half], age[half])]
+        return actions
+
+
+@torch.no_grad()
+def drawn(learner: DistilledLearner, generator: torch.Generator, ids: Ids, options: Ids, age: Ids) -> Ids:
+    """Actions drawn by their probabilities, in place of the most probable one, which may lead in circles."""
+    scores = apply_to_states(learner.online, learner.pictures, ids)[np.arange(len(ids)), options]
+    chosen: Ids = torch.multinomial(scores.softmax(1), 1, generator=generator)[:, 0].numpy()
+    return chosen
+
+
+def options_of(work: Path, method: str, seed: int) -> tuple[Path, float]:
+    """Where the distilled options of an ensemble are, trained if they are not there, and the CPU seconds that took."""
+    method = SAME_OPTIONS.get(method, method)
+    out, seconds = work / f"options-{method}-{seed}", work / f"options-{method}-{seed}.seconds"
+    if not (out / "manifest.json").exists():
+        source, begun = ensemble_of(work, METHODS[method][1], seed), time.process_time()
+        with vouched(OWN):
+            train_options(source.path, settings_of(method), out, seed=seed, force=True, quiet=True)
+        seconds.write_text(str(time.process_time() - begun), encoding="utf-8")
+    return out, float(seconds.read_text(encoding="utf-8")) if seconds.exists() else 0.0
+
+
+def run_cell(work: Path, method: str, seed: int, step: int) -> list[Row]:
+    """An ensemble's options, each played alone; a row of each, on layouts learned in and new ones, or to choose on."""
     prepare()
     source = ensemble_of(work, METHODS[method][1], seed)
     config, spent, state = settings_of(method), 0.0, None
-    if config.network == "distilled":
-        out, begun = work / f"options-{method}-{seed}", time.process_time()
-        train_options(source.path, config, out, seed=seed, force=True, quiet=True)
-        spent, state = time.process_time() - begun, load_tensors(out / "options.safetensors")
+    if config.network != "planned":
+        out, spent = options_of(work, method, seed)
+        state = load_tensors(out / "options.safetensors")
+    places = {"trained": PICKING, "new": new_layouts(FIRST)} if step == STEP else {"choosing": new_layouts(CHOOSING)}
     rows = []
-    for where, seeds in zip(WHERE, (PICKING, new_layouts(FIRST)), strict=True):
+    for where, seeds in places.items():
         played = TrainOptionsConfig(
-            network=config.network,
+            network="planned" if state is None else "distilled",
             embedding=config.embedding,
             termination=config.termination,
             environments=len(seeds),
             mask_reached=False,
         )
         loop = assemble(DOMAIN, source.path, source.config, played, seed, layouts=Layouts(tuple(seeds)))
+        learner = loop.learner
         if state is not None:
-            loop.learner.load(state)
-        place = {"method": method, "seed": seed, "step": STEP, "layouts": where, "cpu_seconds": spent}
+            learner.load(state)
+        if method == "oracle-drawn":
+            assert isinstance(learner, DistilledLearner)
+            learner.greedy = partial(drawn, learner, torch_generator(seed, "drawn"))  # type: ignore[method-assign]
+        place = {"method": method, "seed": seed, "step": step, "layouts": where, "cpu_seconds": spent}
         rows += [place | row for row in tried_out(loop, source.config["sub_goals"])]
     return rows
 
@@ -133,60 +187,78 @@ def tables(path: Path) -> Iterator[str]:
         ),
     )
     yield from _differences(path)
+    yield "Layouts on which settings are chosen: mean over five sub-goals, one seed."
+    yield ""
+    keys = [(method, CHOOSE, "choosing") for method in METHODS if (method, CHOOSE, "choosing") in within]
+    yield from table(
+        ["options", "within 2", "any success", "CPU minutes"],
+        (
+            [
+                METHODS[key[0]][0],
+                *(interval(of_seeds(numbers, key), 3) for numbers in (within, success)),
+                f"{of_seeds(spent, key).max() / 60:.1f}",
+            ]
+            for key in keys
+        ),
+    )
+
+
+CONTRASTS = (  # a minus b; of four, a minus b minus (c minus d)
+    ("dbat", "planned"),
+    ("grid", "planned"),
+    ("none", "none-planned"),
+    ("one", "one-planned"),
+    ("dbat", "none"),
+    ("dbat", "one"),
+    ("planned", "none-planned"),
+    ("planned", "one-planned"),
+    ("dbat", "none", "planned", "none-planned"),
+)
 
 
 def _differences(path: Path) -> Iterator[str]:
     """What the rules ask for, seed by seed: distilled minus planned; diversity's share in the picked member."""
     within = read(path, "within_2")
-    pairs = [
-        ("dbat", "planned"),
-        ("grid", "planned"),
-        ("none", "none-planned"),
-        ("one", "one-planned"),
-        ("dbat", "none"),
-        ("dbat", "one"),
-    ]
     yield "Differences over the seeds that both have."
     yield ""
     lines = []
-    for first, second in pairs:
-        keys = [(method, STEP, WHERE[1]) for method in (first, second)]
-        seeds = sorted(set(within[keys[0]]) & set(within[keys[1]]))
+    for methods in CONTRASTS:
+        seeds = sorted(set.intersection(*(set(within[method, STEP, WHERE[1]]) for method in methods)))
         if not seeds:
             continue
-        some = {(method, STEP, where): {seed: within[method, STEP, where][seed] for seed in seeds}
-                for method in (first, second) for where in WHERE}  # fmt: skip
-        means, picks = ([of(some, method) for method in (first, second)] for of in (_means, _picks))
-        name = f"{METHODS[first][0]} - {METHODS[second][0]}"
-        lines.append([name, difference(means[0] - means[1], 3), difference(picks[0] - picks[1], 3), str(len(seeds))])
+        some = {
+            (method, STEP, where): {seed: within[method, STEP, where][seed] for seed in seeds}
+            for method in methods
+            for where in WHERE
+        }
+        signed = [*zip((1, -1, -1, 1), methods, strict=False)]
+        means = sum(sign * of_seeds(some, (method, STEP, WHERE[1])) for sign, method in signed)
+        picks = sum(sign * picked(some, method, STEP) for sign, method in signed)
+        name = " - ".join(METHODS[method][0] for method in methods[:2])
+        name += "".join(f", minus the same of {METHODS[method][0]}" for method in methods[2:3])
+        lines.append([name, difference(np.asarray(means), 3), difference(np.asarray(picks), 3), str(len(seeds))])
     yield from table(["difference", "mean member", "picked member", "seeds"], lines)
-
-
-def _means(numbers: Any, method: str) -> Any:
-    return of_seeds(numbers, (method, STEP, WHERE[1]))
-
-
-def _picks(numbers: Any, method: str) -> Any:
-    return picked(numbers, method, STEP)
 
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "0")
     parser.add_argument("--work", type=Path, default=Path("runs/distilled"), help="the folder of data and artefacts")
-    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--methods", default=",".join(PUBLISHED), help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--choosing", action="store_true", help="play the layouts on which settings are chosen")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
         return
     if not (arguments.work / "data.h5").exists():
         collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", quiet=True)
+    step = CHOOSE if arguments.choosing else STEP
     jobs: dict[Cell, Callable[[], list[Row]]] = {
-        (method, str(seed)): partial(run_cell, arguments.work, method, seed)
+        (method, str(seed)): partial(run_cell, arguments.work, method, seed, step)
         for seed in arguments.seeds
         for method in arguments.methods.split(",")
     }
-    run_cells(arguments.csv, COLUMNS, KEYS[:2], jobs, lambda _: (STEP,), arguments.workers)
+    run_cells(arguments.csv, COLUMNS, KEYS[:2], jobs, lambda _: (step,), arguments.workers)
 
 
 if __name__ == "__main__":
