@@ -32,7 +32,7 @@ OBJECTIVES = (  # in the order in which they are run
     "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "say-no", "input-gradients",
 )  # fmt: skip
 OF_TWO = OBJECTIVES[:6]
-UNWEIGHTED = ("none", "cnn", "oracle")
+UNWEIGHTED = ("none", "cnn", "oracle", "joint")
 CHOICE_SEEDS, CHOICE_MIX, CHOICE_MIX_OF_TWO = (100,), 0.5, 1.0
 HIGH, LOW = 0.95, 0.6
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
@@ -108,7 +108,7 @@ def _side_by_side(title: str, boards: Mapping[str, Sequence[Scored]]) -> Iterato
     yield ""
     yield from table(
         ["", *columns],
-        ([name, *(_covered(lines.get(name)) for lines in columns.values())] for name in objectives),
+        ([name, *(covered(lines.get(name)) for lines in columns.values())] for name in objectives),
     )
 
 
@@ -116,7 +116,8 @@ def _objective(line: Line) -> str:
     return line.entry.partition(":")[0]
 
 
-def _covered(line: Line | None) -> str:
+def covered(line: Line | None) -> str:
+    """Coverage with its interval over seeds (best)."""
     return "-" if line is None else f"{with_interval(line.coverage)} ({line.best.mean():.2f})"
 
 

@@ -1,0 +1,113 @@
+"""What proposals=joint hangs on: each part of its features left out, fewer and more restarts, on its choosing seeds.
+
+python -m studies.joint docs/results/joint-parts.csv            run what the file lacks
+python -m studies.joint docs/results/joint-parts.csv --tables   print the table
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.files import write_table
+from hypogoal.core.progress import Progress
+from hypogoal.hypotheses import proposals
+from hypogoal.which_feature.run import COLUMNS, JOINT, parse_entry, read_cells, resolved, rows_of, run_cell
+from hypogoal.which_feature.states import FACTORS
+from hypogoal.which_feature.table import summary
+from studies.cells import table
+from studies.which_feature import HIGH, LOW, covered
+
+SEEDS, MIXES = (200, 201, 202, 203, 204), (0.5, 1.0)
+
+
+class RandomPatterns(proposals.Patterns):
+    """Filters that are noise instead of patches of the pictures."""
+
+    def __init__(self, pictures: NDArray[np.uint8], rng: np.random.Generator):
+        super().__init__(pictures, rng)
+        shape = (proposals.FILTERS, *self.weight.shape[1:])
+        self.weight = torch.from_numpy(rng.normal(0.0, 1.0 / proposals.SIDE, shape).astype(np.float32))
+        centre = float(pictures.mean()) / 255.0
+        offsets = torch.from_numpy(rng.normal(0.0, 0.3, proposals.FILTERS).astype(np.float32))
+        self.bias = offsets - centre * self.weight.sum((1, 2, 3))
+
+
+class WholePatterns(proposals.Patterns):
+    """Sums over the picture alone."""
+
+    def of(self, pictures: NDArray[np.uint8]) -> Tensor:
+        features = super().of(pictures)
+        return features[:, : features.shape[1] // 3]
+
+
+def alike(features: Tensor, labels: Tensor) -> Tensor:
+    """The same relevance for every feature that varies."""
+    return (features.std(0) > 0).float()
+
+
+VARIANTS: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {  # settings, and what stands in for parts
+    "as it is": ({}, {}),
+    "random filters": ({}, {"Patterns": RandomPatterns}),
+    "no halves": ({}, {"Patterns": WholePatterns}),
+    "no relevance": ({}, {"relevance": alike}),
+    "32 restarts": ({"restarts": 32}, {}),
+    "300 restarts": ({"restarts": 300}, {}),
+}
+
+
+def run(path: Path) -> None:
+    """Run the cells that the file lacks; the agreement is given, 1 - mix."""
+    cells = read_cells(path) if path.exists() else []
+    complete = {(cell.entry, cell.mix, cell.seed) for cell in cells}
+    wanted = [cell for cell in product(VARIANTS, MIXES, SEEDS) if cell not in complete]
+    with Progress(path.stem, len(wanted)) as progress:
+        for variant, mix, seed in wanted:
+            settings, parts = VARIANTS[variant]
+            config = replace(resolved({}), agreement=f"{1.0 - mix:g}", **settings)
+            with mock.patch.multiple(proposals, **parts):
+                cells.append(replace(run_cell(parse_entry(JOINT), mix, seed, config), entry=variant))
+            write_table(path, COLUMNS, rows_of(cells, FACTORS))
+            progress.advance()
+
+
+def tables(path: Path) -> Iterator[str]:
+    """Coverage (best) of each variant, by mix."""
+    lines = {(line.entry, line.mix): line for line in summary(read_cells(path), HIGH, LOW)}
+    yield "Coverage with Student's 95 % interval over the choosing seeds (best)."
+    yield ""
+    yield from table(
+        ["", *(f"mix {mix:g}" for mix in MIXES)],
+        (
+            [variant, *(covered(lines[variant, mix]) for mix in MIXES)]
+            for variant in VARIANTS
+            if (variant, MIXES[-1]) in lines
+        ),
+    )
+
+
+def main() -> None:
+    """Run, or print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser.add_argument("--tables", action="store_true", help="print the table and run nothing")
+    arguments = parser.parse_args()
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+    else:
+        torch.set_num_threads(1)
+        run(arguments.csv)
+
+
+if __name__ == "__main__":
+    main()
