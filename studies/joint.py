@@ -34,8 +34,8 @@ SEEDS, MIXES = (200, 201, 202, 203, 204), (0.5, 1.0)
 class RandomPatterns(proposals.Patterns):
     """Filters that are noise instead of patches of the pictures."""
 
-    def __init__(self, pictures: NDArray[np.uint8], rng: np.random.Generator):
-        super().__init__(pictures, rng)
+    def __init__(self, pictures: NDArray[np.uint8], stride: int, rng: np.random.Generator):
+        super().__init__(pictures, stride, rng)
         shape = (proposals.FILTERS, *self.weight.shape[1:])
         self.weight = torch.from_numpy(rng.normal(0.0, 1.0 / proposals.SIDE, shape).astype(np.float32))
         centre = float(pictures.mean()) / 255.0

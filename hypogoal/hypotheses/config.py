@@ -31,6 +31,14 @@ class EnsembleConfig:
         "to below 1; auto: of 0, .25, .5 and .75 the one whose proposals have the least loss",
         source=BEYOND,
     )
+    pattern_stride: int = setting(
+        8,
+        "pixels between two patterns of 8 x 8 (proposals=joint): 8 where pictures are made of such tiles, else 2",
+        unit="pixels",
+        source=BEYOND,
+        low=1,
+        high=64,
+    )
     restarts: int = setting(
         96, "starts of a search, one for each agreement (proposals=joint)", source=BEYOND, low=1, high=10_000
     )

@@ -27,11 +27,12 @@ AUTO = "auto"  # the agreement with the least loss
 AGREEMENTS = (0.0, 0.25, 0.5, 0.75)
 STEPS = 400  # of a search with one agreement
 MOST = 8  # proposals: the table of their predictions has 2^K cells
-MOST_STATES = 1024  # of each kind, labelled or not, that a search looks at
+MOST_STATES = 2048  # of each kind, labelled or not, that a search looks at
 # What follows was chosen on WhichFeature, seeds 200 to 204: docs/results/which-feature.md.
-SIDE, STRIDE = 8, 8  # pixels of a patch, and between two
-FILTERS, SAMPLED = 128, 20_000  # patches that become filters, of so many
-SILENT = 0.5  # the response up to which a filter is silent
+SIDE = 8  # pixels of a patch
+FILTERS, SAMPLED = 256, 20_000  # patches that become filters, of so many
+STRIKING = 0.3  # share of the patches, those of most contrast, that filters are drawn from where there are enough
+SILENT, OVERLAPPING = 0.5, 3.0  # the response up to which a filter is silent, among tiles and among overlapping patches
 NOISE = 2.4  # standard errors: a correlation with the label up to here counts as none
 KEPT = 0.999  # share of the variance in the principal components
 RATE, SPREAD = 0.05, 0.7  # Adam's rate; deviation of the logarithm of a start's metric
@@ -70,28 +71,32 @@ class Patterns:
     Filters are patches of the pictures (N, h, w, C) themselves, whitened (Coates and Ng 2011).
     """
 
-    def __init__(self, pictures: NDArray[np.uint8], rng: np.random.Generator):
+    def __init__(self, pictures: NDArray[np.uint8], stride: int, rng: np.random.Generator):
+        self.stride = stride
         height, width, channels = pictures.shape[1:]
         if min(height, width) < SIDE:
             fault = f"pictures of {height} x {width} pixels are too small for patterns"
             raise UserError(fault, "proposals=joint", "Set proposals=none.")
         some = as_input(torch.from_numpy(pictures[rng.permutation(len(pictures))[:512]]))
-        patches = functional.unfold(some, SIDE, stride=STRIDE).mT.reshape(-1, channels * SIDE**2)
+        patches = functional.unfold(some, SIDE, stride=stride).mT.reshape(-1, channels * SIDE**2)
         patches = patches[torch.from_numpy(rng.permutation(len(patches))[:SAMPLED])]
         centre = patches.mean(0)
         values, vectors = torch.linalg.eigh((patches - centre).T @ (patches - centre) / len(patches))
         whitening = vectors * (values + 0.01 * values[-1]).clamp(min=1e-9).rsqrt() @ vectors.T
         distinct = torch.unique(((patches - centre) @ whitening * 1e3).round(), dim=0)
+        if len(distinct) > FILTERS:
+            most = max(FILTERS, int(STRIKING * len(distinct)))
+            distinct = distinct[distinct.norm(dim=1).argsort(descending=True, stable=True)[:most]]
         filters = functional.normalize(distinct[torch.from_numpy(rng.permutation(len(distinct))[:FILTERS])], dim=1)
         self.weight = (filters @ whitening).view(-1, channels, SIDE, SIDE)
-        self.bias = -(filters @ whitening @ centre) - SILENT
+        self.bias = -(filters @ whitening @ centre) - (SILENT if stride >= SIDE else OVERLAPPING)
 
     def of(self, pictures: NDArray[np.uint8]) -> Tensor:
         """The features (N, 3 F): each filter's responses summed, right minus left, and bottom minus top."""
         rows, size = [], at_once(256, pictures.shape[1:])
         for start in range(0, len(pictures), size):
             inputs = as_input(torch.from_numpy(pictures[start : start + size]))
-            found = functional.conv2d(inputs, self.weight, self.bias, STRIDE).relu()
+            found = functional.conv2d(inputs, self.weight, self.bias, self.stride).relu()
             down, across = found.sum(3), found.sum(2)
             rows.append(torch.cat([down.sum(2), _difference(across), _difference(down)], dim=1))
         return torch.cat(rows)
@@ -176,7 +181,8 @@ class Search(Resumable):
         classes = [rng.permutation(np.flatnonzero(labels == holds)) for holds in (False, True)]
         each = min(MOST_STATES // 2, *map(len, classes))
         rows = np.concatenate([some[:each] for some in classes])
-        patterns = Patterns(np.concatenate([labelled[rows], unlabelled[:: -(-len(unlabelled) // MOST_STATES)]]), rng)
+        some = unlabelled[:: -(-len(unlabelled) // MOST_STATES)]
+        patterns = Patterns(np.concatenate([labelled[rows], some]), config.pattern_stride, rng)
         truth = torch.from_numpy(labels[rows])
         self.labelled, self.every = components(patterns.of(labelled[rows]), truth, patterns.of(unlabelled))
         self.unlabelled = self.every[torch.from_numpy(rng.permutation(len(unlabelled))[:MOST_STATES])]

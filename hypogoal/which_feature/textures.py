@@ -20,7 +20,7 @@ from hypogoal.which_feature.states import (
     tiles,
 )
 
-SMALLEST, LARGEST = 8, 12  # pixels of an item
+SMALLEST, LARGEST = 10, 12  # pixels of an item
 LAYERS = ((3, 25.0), (8, 20.0), (SIDE, 8.0))  # of a texture: points per side, deviation of their shades
 SHADE, DARKEST = 70.0, 0.7  # mean of a texture; least light on an item
 TRIES = 64  # places tried for an item that overlaps no other

@@ -79,7 +79,7 @@ def test_patterns_are_counted_and_placed() -> None:
     cells[0], cells[1], cells[2] = 0, 0, 0
     cells[1, 1, 3] = cells[2, 1, 0] = 4
     pictures = kinds[cells].swapaxes(2, 3).reshape(40, 32, 32, 3)
-    features = Patterns(pictures, rng).of(pictures)
+    features = Patterns(pictures, 8, rng).of(pictures)
     filters = features.shape[1] // 3
     whole, across, down = (features[:, part * filters : (part + 1) * filters] for part in range(3))
     change = (whole[1] - whole[0]).argmax()  # the filter of the tile that only two pictures have
