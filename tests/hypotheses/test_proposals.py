@@ -39,8 +39,11 @@ def searched(search: Search) -> Search:
 
 
 @pytest.mark.parametrize(("mix", "agreement"), [(1.0, 0.0), (0.5, 0.5)])
-def test_the_loss_says_in_how_many_states_features_agree(mix: float, agreement: float) -> None:
+def test_the_loss_says_in_how_many_states_features_agree(
+    mix: float, agreement: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of four; it need not be given."""
+    monkeypatch.setattr(proposals, "AGREEMENTS", (0.0, 0.5))
     scenes = labelled_states(256, 0), unlabelled_states(512, mix, 0)
     config = dataclasses.replace(CONFIG, members=4, restarts=16)
     search = Search(scenes[0].observations, scenes[0].factors[:, 0], scenes[1].observations, config, 3)
@@ -104,7 +107,8 @@ def test_a_rarer_feature_is_found_with_the_share_of_positives() -> None:
     """Proposals have as many positives as the labels, not a half."""
     observations, labels, unlabelled = states(1.0)
     kept = np.concatenate([np.flatnonzero(labels)[:32], np.flatnonzero(~labels)[:96]])
-    search = Search(observations[kept], labels[kept], unlabelled, CONFIG, 0)
+    config = dataclasses.replace(CONFIG, agreement="0")
+    search = Search(observations[kept], labels[kept], unlabelled, config, 0)
     assert search.positives == 0.25
     assert len(search.signs) == 64 and search.signs.sum() == 0
     shares = (searched(search).scores() > 0).float().mean(1)
