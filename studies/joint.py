@@ -75,7 +75,7 @@ def run(path: Path) -> None:
         for variant, mix, seed in wanted:
             settings, parts = VARIANTS[variant]
             config = replace(resolved({}), agreement=f"{1.0 - mix:g}", **settings)
-            with mock.patch.multiple(proposals, **parts):
+            with mock.patch.multiple(proposals, **{"Patterns": proposals.Patterns, **parts}):
                 cells.append(replace(run_cell(parse_entry(JOINT), mix, seed, config), entry=variant))
             write_table(path, COLUMNS, rows_of(cells, FACTORS))
             progress.advance()
