@@ -1,13 +1,14 @@
 """What proposals=joint hangs on: each part of its features left out, fewer and more restarts, on its choosing seeds.
 
 python -m studies.joint docs/results/which-feature-parts.csv            run what the file lacks
+python -m studies.joint docs/results/which-feature-random.csv --random  random filters on seeds 410 to 419
 python -m studies.joint docs/results/which-feature-parts.csv --tables   print the table
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -66,15 +67,15 @@ VARIANTS: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {  # setti
 }
 
 
-def run(path: Path) -> None:
-    """Run the cells that the file lacks; the agreement is given, 1 - mix."""
+def run(path: Path, cells_wanted: Iterable[tuple[str, float, int]], agreement: str | None = None) -> None:
+    """Run the cells (variant, mix, seed) that the file lacks; the agreement is 1 - mix where it is not given."""
     cells = read_cells(path) if path.exists() else []
     complete = {(cell.entry, cell.mix, cell.seed) for cell in cells}
-    wanted = [cell for cell in product(VARIANTS, MIXES, SEEDS) if cell not in complete]
+    wanted = [cell for cell in cells_wanted if cell not in complete]
     with Progress(path.stem, len(wanted)) as progress:
         for variant, mix, seed in wanted:
             settings, parts = VARIANTS[variant]
-            config = replace(resolved({}), agreement=f"{1.0 - mix:g}", **settings)
+            config = replace(resolved({}), agreement=agreement or f"{1.0 - mix:g}", **settings)
             with mock.patch.multiple(proposals, **{"Patterns": proposals.Patterns, **parts}):
                 cells.append(replace(run_cell(parse_entry(JOINT), mix, seed, config), entry=variant))
             write_table(path, COLUMNS, rows_of(cells, FACTORS))
@@ -84,14 +85,15 @@ def run(path: Path) -> None:
 def tables(path: Path) -> Iterator[str]:
     """Coverage (best) of each variant, by mix."""
     lines = {(line.entry, line.mix): line for line in summary(read_cells(path), HIGH, LOW)}
-    yield "Coverage with Student's 95 % interval over the choosing seeds (best)."
+    mixes = sorted({mix for _, mix in lines})
+    yield "Coverage with Student's 95 % interval over seeds (best)."
     yield ""
     yield from table(
-        ["", *(f"mix {mix:g}" for mix in MIXES)],
+        ["", *(f"mix {mix:g}" for mix in mixes)],
         (
-            [variant, *(covered(lines[variant, mix]) for mix in MIXES)]
+            [variant, *(covered(lines[variant, mix]) for mix in mixes)]
             for variant in VARIANTS
-            if (variant, MIXES[-1]) in lines
+            if all((variant, mix) in lines for mix in mixes)
         ),
     )
 
@@ -101,12 +103,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
     parser.add_argument("--tables", action="store_true", help="print the table and run nothing")
+    parser.add_argument("--random", action="store_true", help="test random filters, with the agreement found")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
+        return
+    torch.set_num_threads(1)
+    if arguments.random:
+        run(arguments.csv, product(["random filters"], (0.5, 1.0), range(410, 420)), "auto")
     else:
-        torch.set_num_threads(1)
-        run(arguments.csv)
+        run(arguments.csv, product(VARIANTS, MIXES, SEEDS))
 
 
 if __name__ == "__main__":
