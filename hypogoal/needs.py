@@ -43,6 +43,8 @@ DATA = 3  # copies of the states in memory: as read, joined, and as the network 
 LEARNED = 10  # bytes inside the light networks for each number of a picture in a batch
 PASSED = 20  # bytes inside a member for each number of a picture that it predicts
 EXPLAINED = 8  # states whose attributions are computed at once
+SEARCHED = 3e-8  # seconds of a step of a search for proposals, for each of them and each state
+SEARCHING = 100  # bytes inside a search, for the same
 SAMPLE_NUMBERS = 2**22  # numbers of the states read for a trial, at most
 LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
 
@@ -54,6 +56,7 @@ def ensemble_needs(
 
     A step is measured on the CPU; on a GPU it takes no main memory, and its time is unknown.
     """
+    from hypogoal.hypotheses.proposals import MOST_STATES, search_steps
     from hypogoal.hypotheses.trial import step_cost
 
     dataset = open_dataset(data)
@@ -74,8 +77,10 @@ def ensemble_needs(
     ways += ["--set workers=1"] if workers > 1 else []
     if longest_side(shape, dtype) > LARGE:
         ways += [f"pictures of {LARGE} pixels (import them with --resize {LARGE})"]
-    memory = workers * (process + config.batch_size * cost.memory_each)
-    seconds = len(goals) * steps * (cost.seconds + config.batch_size * cost.seconds_each) / workers
+    searched = config.restarts * config.members * min(MOST_STATES, count) if config.proposals == "joint" else 0
+    memory = workers * (process + config.batch_size * cost.memory_each + SEARCHING * searched)
+    seconds = steps * (cost.seconds + config.batch_size * cost.seconds_each)
+    seconds = len(goals) * (seconds + SEARCHED * search_steps(config) * searched) / workers
     smaller = f"Try {' or '.join(ways or ['fewer or smaller states'])}."
     return Needs(memory, ensemble_disk(len(goals), cost.weights), seconds, smaller)
 

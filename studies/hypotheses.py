@@ -48,6 +48,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "say-no": {"diversity": "say-no"},
     "cnn": {"members": 1, "diversity": "none"},
 }
+OTHERS: dict[str, dict[str, Any]] = {"joint": {"diversity": "none", "proposals": "joint"}}
 WEIGHTS = (1e-5, 1e-4, 1e-3, 1e-2)
 LOOKS = (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1300, 1600, 2000, 2600)
 LONG = (150, 600, 1000, 2600)  # looks at the seed that was trained longer
@@ -61,7 +62,7 @@ COLUMNS = (*KEYS, *OF_ALL, *(f"{name}_{half}" for half in ("first", "second") fo
 def settings_of(method: str) -> dict[str, Any]:
     """What a method changes: one of ``METHODS`` or an objective's name, with ``@`` and a weight behind it or not."""
     name, _, weight = method.partition("@")
-    return METHODS.get(name, {"diversity": name}) | ({"diversity_weight": float(weight)} if weight else {})
+    return (METHODS | OTHERS).get(name, {"diversity": name}) | ({"diversity_weight": float(weight)} if weight else {})
 
 
 @lru_cache(maxsize=1)

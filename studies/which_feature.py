@@ -32,10 +32,12 @@ OBJECTIVES = (  # in the order in which they are run
     "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "say-no", "input-gradients",
 )  # fmt: skip
 OF_TWO = OBJECTIVES[:6]
-UNWEIGHTED = ("none", "cnn", "oracle")
+UNWEIGHTED = ("none", "cnn", "oracle", "joint")
 CHOICE_SEEDS, CHOICE_MIX, CHOICE_MIX_OF_TWO = (100,), 0.5, 1.0
 HIGH, LOW = 0.95, 0.6
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
+TEN = CSV.with_name("which-feature-ten.csv")  # seeds 400 to 409
+TEXTURES = CSV.with_name("which-feature-textures.csv")  # the same, other scenes
 TWO = CSV.with_name("which-feature-two.csv")
 SEQUENTIAL = CSV.with_name("which-feature-two-sequential.csv")  # members one after the other
 LONG = CSV.with_name("which-feature-long.csv")  # cells of 600 steps instead of 150
@@ -73,16 +75,15 @@ def tables(path: Path) -> Iterator[str]:
     yield from _weights(
         "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose.", cells, chosen(cells)
     )
-    test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS]
-    main = [cell for cell in test if cell.mix == CHOICE_MIX]
-    yield from _board("Test", main)
-    mixes = sorted({cell.mix for cell in test} - {CHOICE_MIX})
-    yield from _side_by_side(
-        "Test at other mixes", {f"mix {mix:g}": [cell for cell in test if cell.mix == mix] for mix in mixes}
-    )
-    yield "Test at mix .5: the share of seeds in which some member owns the feature, and the highest ranking of it."
-    yield ""
-    yield from table(["", *FACTORS], _by_factor(main))
+    ten = _by_mix(read_cells(TEN))
+    if TEXTURES.exists():
+        ten |= {f"textures, {mix}": of for mix, of in _by_mix(read_cells(TEXTURES)).items()}
+    yield from _against("joint", ten)
+    for title, cells_of in ten.items():
+        yield f"Test at {title}: the share of seeds in which a member owns the feature, and the highest ranking of it."
+        yield ""
+        yield from table(["", *FACTORS], _by_factor(cells_of))
+    yield from _side_by_side("Seeds 0 to 4", _by_mix(cell for cell in cells if cell.seed not in CHOICE_SEEDS))
     if LONG.exists():
         yield from _board("600 steps", read_cells(LONG))
 
@@ -100,15 +101,37 @@ def tables_of_two(path: Path) -> Iterator[str]:
     yield from _side_by_side("Test", boards)
 
 
+def _by_mix(cells: Iterable[Scored]) -> dict[str, list[Scored]]:
+    ordered = sorted(cells, key=lambda cell: cell.mix)
+    return {f"mix {mix:g}": of for mix, of in grouped(ordered, lambda cell: cell.mix).items()}
+
+
+def _against(entry: str, boards: Mapping[str, Sequence[Scored]]) -> Iterator[str]:
+    """Coverage (best) of each entry, and what ``entry`` covers more, seed by seed; a pair of columns for each board."""
+    columns = {name: {line.entry: line for line in summary(cells, HIGH, LOW)} for name, cells in boards.items()}
+    names = next(iter(columns.values()))
+    yield f"Test: coverage (best), and {entry} minus it; mean and Student's 95 % interval over seeds."
+    yield ""
+    heads = [part for name in columns for part in (name, f"{entry} minus it")]
+    yield from table(["", *heads], ([name, *_compared(entry, name, columns.values())] for name in names))
+
+
+def _compared(entry: str, name: str, boards: Iterable[Mapping[str, Line]]) -> Iterator[str]:
+    for lines in boards:
+        yield covered(lines.get(name))
+        both = name in lines and name != entry
+        yield with_interval(lines[entry].coverage - lines[name].coverage) if both else "-"
+
+
 def _side_by_side(title: str, boards: Mapping[str, Sequence[Scored]]) -> Iterator[str]:
     """Coverage (best) of each objective at its chosen weight, a column for each set of cells."""
     columns = {name: {_objective(line): line for line in summary(cells, HIGH, LOW)} for name, cells in boards.items()}
     objectives = [name for name in (*OBJECTIVES, *UNWEIGHTED) if any(name in lines for lines in columns.values())]
-    yield f"{title}: coverage with Student's 95 % interval over five seeds (best)."
+    yield f"{title}: coverage with Student's 95 % interval over seeds (best)."
     yield ""
     yield from table(
         ["", *columns],
-        ([name, *(_covered(lines.get(name)) for lines in columns.values())] for name in objectives),
+        ([name, *(covered(lines.get(name)) for lines in columns.values())] for name in objectives),
     )
 
 
@@ -116,7 +139,8 @@ def _objective(line: Line) -> str:
     return line.entry.partition(":")[0]
 
 
-def _covered(line: Line | None) -> str:
+def covered(line: Line | None) -> str:
+    """Coverage with its interval over seeds (best)."""
     return "-" if line is None else f"{with_interval(line.coverage)} ({line.best.mean():.2f})"
 
 

@@ -11,7 +11,7 @@ from hypogoal.core.terminal import draw, give
 
 ENTRIES = (
     "Comma-separated: dbat, none, another objective (docs/concepts.md) or module:function, each also with a weight "
-    "(dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
+    "(dbat:0.01); cnn, one member; oracle, one taught by each feature's truth; joint, by proposals."
 )
 benchmark = typer.Typer(cls=cli.Commands, no_args_is_help=True)
 cli.app.add_typer(benchmark, name="benchmark", rich_help_panel=cli.MANY)
@@ -29,6 +29,7 @@ def which_feature(
     mix: Annotated[str, Option(help="Shares of unlabelled states with independent features: 0.1,0.5.")] = "0.5",
     members: Annotated[int, Option(help="Hypotheses (K) of an entry.")] = 4,
     seeds: Annotated[str, Option(help="0-4, or 0,3,7.")] = "0-4",
+    scenes: Annotated[str, Option(help="tiles, or textures: objects of any size at any pixel.")] = "tiles",
     factors: Annotated[
         str, Option(help="Planted features; another one is moved, with two frames.")
     ] = "colour,shape,place,count",
@@ -60,7 +61,7 @@ def which_feature(
     from hypogoal.which_feature import run, table
 
     prepare()
-    options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds}
+    options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds, "scenes": scenes}
     config = run.resolved({**options, "factors": factors, "high": high, "low": low}, set_ or ())
     with own_code.given(*run.objectives_in(diversity), *cli.values_of(set_)):
         cells = run.run(config, out, quiet)

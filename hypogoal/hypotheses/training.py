@@ -22,6 +22,7 @@ from hypogoal.diversity import Context, load_objective
 from hypogoal.hypotheses.batches import Outputs, TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.proposals import Search
 from hypogoal.hypotheses.thresholds import NEED_UNLABELLED, PAPER, thresholds
 from hypogoal.hypotheses.views import NO_ORIGINS, StateOrigins, positions_of, require_origins, view_of
 
@@ -36,9 +37,10 @@ class Watcher(Resumable):
     Args:
         on_step: called every ``REPORT_EVERY`` steps and at the last one (of each member, where sequential) with the
             number of steps done and with that step's ``loss``, ``labelled`` (mean over the members in training) and
-            ``diversity`` (the inner sums of Eq. (1), before their weight).
-        look, look_at: after these steps, ``look`` gets their number and the ensemble, to predict with; the training
-            goes on as if it had not.
+            ``diversity`` (the inner sums of Eq. (1), before their weight). First come the steps of a search for
+            proposals, if any, with ``loss`` and ``agreement``.
+        look, look_at: after these steps of the members' training, ``look`` gets their number and the ensemble, to
+            predict with; the training goes on as if it had not.
     """
 
     def __init__(self, on_step: OnStep | None = None, look: Look | None = None, look_at: Container[int] = ()):
@@ -82,8 +84,8 @@ def fit(
             without the origins that the settings need.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
-    if len(unlabelled) == 0 and _diverse(config):
-        do = "Give some, or set diversity=none."
+    if len(unlabelled) == 0 and (_diverse(config) or config.proposals != "none"):
+        do = "Give some, or set diversity=none and proposals=none."
         raise UserError("unlabelled states are needed to make members differ", None, do)
     if len(unlabelled) == 0 and config.threshold in NEED_UNLABELLED:
         do = "Give some, or set threshold=0.5."
@@ -104,6 +106,7 @@ def fit(
 
     def state(number: int, part: Round | None) -> State:
         return {
+            **({"search": search.snapshot()} if search else {}),
             "round": number,
             "part": part.snapshot() if part else {},
             "ensemble": ensemble.state_dict(),
@@ -132,16 +135,28 @@ def fit(
         trunk=trunk,
         frozen=ensemble.frozen,
     )
+    search = None
+    if config.proposals == "joint":
+        known, other = view.see(observations, positions_of(origins.labelled)), positions_of(origins.unlabelled)
+        search = Search(known, labels, view.see(unlabelled, other), config, seed_for(seed, "proposals"))
+        if saved is not None:
+            with checkpoints.restoring():
+                search.restore(saved["search"])
     first = saved["round"] if saved else 0
     forked = [states.device] if states.device.type == "cuda" else []
     with checkpoints, torch.random.fork_rng(devices=forked):  # Dropout and similar layers draw there
+        for _ in search.steps(watcher.report, REPORT_EVERY) if search else ():
+            checkpoints.offer(partial(state, 0, None))
+        searched, taught = (search.total, search.scores().to(device)) if search else (0, None)
         for number, members in enumerate(rounds[first:], start=first):
-            part = Round(networks, members, states, config, seed_for(seed, "batches", number), number * config.steps)
+            before = searched + number * config.steps
+            part = Round(networks, members, states, config, seed_for(seed, "batches", number), before, taught)
             if saved and number == first:
                 with checkpoints.restoring():
-                    part.restore(saved["part"])
+                    if saved["part"] or not search:  # broken in the search, no part had begun
+                        part.restore(saved["part"])
             for step in part.steps(watcher.report):
-                watcher.look(step, ensemble)
+                watcher.look(step - searched, ensemble)
                 checkpoints.offer(partial(state, number, part))
     ensemble.eval()
     if config.threshold != PAPER:
@@ -160,6 +175,7 @@ def _diverse(config: EnsembleConfig) -> bool:
 class Round(Resumable):
     """The training of ``members`` against each other and against the frozen members before them.
 
+    ``taught``, if any, are scores (K, M) of the unlabelled states, one row for each network, see ``proposals``.
     Checks every ``REPORT_EVERY`` steps for a loss, and at the end for a weight, that is NaN or Inf.
     """
 
@@ -173,11 +189,13 @@ class Round(Resumable):
         config: EnsembleConfig,
         seed: int,
         steps_before: int,
+        taught: Tensor | None = None,
     ):
         self.members, self.states, self.config, self.seed, self.before = members, states, config, seed, steps_before
         self.networks = [networks[member].train() for member in members]
         self.objective = load_objective(config.diversity) if _diverse(config) else None
         self.frozen = states.unlabelled_logits(networks[: members[0]] if self.objective else [])
+        self.taught = None if taught is None else taught[list(members)]
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
         self.optimiser = torch.optim.Adam(
@@ -224,12 +242,21 @@ class Round(Resumable):
                 raise NumericalError(f"a weight of member {member} is NaN or Inf after step {self.before + self.done}")
 
     def _losses(self, labelled: NDArray[np.int64], unlabelled: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
-        """Each member's loss on labelled states (K,), and the diversity objective's losses (P,)."""
+        """Each member's loss on labelled states and its proposal's predictions (K,), those of diversity (P,)."""
         states, config = self.states, self.config
         targets = states.targets(labelled)
-        if self.objective is not None:
+        diversity_losses = torch.zeros(0, device=states.device)
+        if self.objective is not None or self.taught is not None:
             counted = (True, config.unlabelled_bn)
             outputs = self._forward(labelled, unlabelled, counted=counted, changes=self.changes)
+        else:
+            outputs = self._forward(labelled, changes=self.changes[:1])
+            if config.unlabelled_bn and len(unlabelled):
+                with self._precision:
+                    states.count_in(self.networks, unlabelled, self.changes[1])
+        losses = torch.stack([functional.cross_entropy(known, targets, self.class_weights) for known, *_ in outputs[0]])
+        numbers = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
+        if self.objective is not None:
             logits, features = ([torch.stack(group) for group in zip(*each, strict=True)] for each in outputs)
             context = Context(
                 labels=targets,
@@ -237,19 +264,17 @@ class Round(Resumable):
                 unlabelled=logits[1],
                 labelled_features=features[0],
                 unlabelled_features=features[1],
-                frozen=self.frozen[:, torch.from_numpy(unlabelled - states.n_labelled).to(states.device)],
+                frozen=self.frozen[:, numbers],
                 positives=float(states.labels.mean()),
                 input_gradients=partial(states.input_gradients, self.networks, labelled),
             )
             diversity_losses = self.objective.losses(context)
-        else:
-            outputs = self._forward(labelled, changes=self.changes[:1])
-            diversity_losses = torch.zeros(0, device=states.device)
-            if config.unlabelled_bn and len(unlabelled):
-                with self._precision:
-                    states.count_in(self.networks, unlabelled, self.changes[1])
-        losses = [functional.cross_entropy(groups[0], targets, self.class_weights) for groups in outputs.logits]
-        return torch.stack(losses), diversity_losses
+        if self.taught is not None:
+            scores = self.taught[:, numbers]  # (K, N)
+            answers = torch.stack([each[1] for each in outputs.logits]).mT  # (K, 2, N)
+            errors = functional.cross_entropy(answers, (scores > 0).long(), reduction="none")
+            losses = losses + (errors * scores.abs().clamp(max=1.0)).mean(1)
+        return losses, diversity_losses
 
     def _forward(self, *groups: NDArray[np.int64], **more: Any) -> Outputs:
         """The networks' outputs in this training's precision, as float32."""

@@ -69,7 +69,8 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
             trunk=trunk,
             frozen=ensemble.frozen,
         )
-        training = Round(networks, range(trained), batches, config, 0, 0)
+        taught = torch.zeros(config.members, len(states)) if config.proposals == "joint" else None
+        training = Round(networks, range(trained), batches, config, 0, 0, taught)
         _tried(training, sizes[0], ensemble)  # the first step allocates
         end, rows = time.process_time() + seconds, []
         for size in sizes:

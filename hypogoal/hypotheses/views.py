@@ -185,7 +185,7 @@ def view_of(
     """The members' view; ``fitted`` trains its localiser and computes its standard, else these are to be loaded."""
     shape = observations.shape[1:]
     if observations.dtype != PICTURE:
-        for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
+        for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0), ("proposals", "none")):
             if (chosen := getattr(config, name)) != value:
                 raise UserError("these observations are not pictures", f"{name}={chosen}", f"Set {name}={value}.")
         return full_view(observations, *([observations, unlabelled] if fitted else []))

@@ -26,6 +26,7 @@ from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, names_in, network_for
+from hypogoal.hypotheses.proposals import agreements, search_steps
 from hypogoal.hypotheses.scores import best_mean_worst, best_threshold, halves, member_scores, ranking
 from hypogoal.hypotheses.thresholds import thresholds
 from hypogoal.hypotheses.training import Look, Watcher, fit
@@ -59,6 +60,7 @@ def train_ensemble(
     if config.precision == "bf16":
         require_bf16(device)
     load_objective(config.diversity)
+    agreements(config)
     dataset = open_dataset(data)
     config = replace(config, network=network_for(config.network, dataset.observation_dtype))
     for name in names_in(config.network):
@@ -77,7 +79,7 @@ def train_ensemble(
     settings |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, steps_of(config), workers, device)
-    steps = len(sub_goals) * steps_of(config)
+    steps = len(sub_goals) * (steps_of(config) + search_steps(config))
     artefact: dict[str, Any] = {"kind": "ensemble", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     with training("train-ensemble", out, needs, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
         folder, parts = work.folder, work.folder.parent / FOLDER

@@ -21,11 +21,24 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.diversity import load_objective
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.proposals import agreements
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
-from hypogoal.which_feature.states import FACTORS, KNOWN, Scenes, crossed_states, labelled_states, unlabelled_states
+from hypogoal.which_feature.states import (
+    FACTORS,
+    KNOWN,
+    MOVED,
+    Draw,
+    Scenes,
+    crossed_states,
+    drawn,
+    labelled_states,
+    unlabelled_states,
+)
+from hypogoal.which_feature.textures import textured
 
-CNN, ORACLE = "cnn", "oracle"  # entries without objective: one member, and one trained on the truth of each factor
+# Entries without objective: one member; one trained on the truth of each factor; members taught by proposals.
+CNN, ORACLE, JOINT = "cnn", "oracle", "joint"
 DEFAULTS: Mapping[str, Any] = {  # where they differ from those of train-ensemble
     "members": 4,
     "diversity_weight": 0.01,
@@ -34,7 +47,7 @@ DEFAULTS: Mapping[str, Any] = {  # where they differ from those of train-ensembl
     "learning_rate": 2e-3,
     "batch_size": 32,
 }
-LABELLED, UNLABELLED = 256, 512  # states
+DRAW: Mapping[str, Draw] = {"tiles": drawn, "textures": textured}
 RESULTS = "results.csv"
 SCORES = ("ranking", "balanced_accuracy", "at_best")
 COLUMNS = ("entry", "mix", "seed", "member", "factor", *SCORES, "labels")
@@ -48,6 +61,13 @@ class WhichFeatureConfig(EnsembleConfig):
     mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states with crossed factors", low=0.0, high=1.0)
     seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
     factors: tuple[str, ...] = setting(FACTORS, f"planted features, of {', '.join(KNOWN)}", choices=KNOWN)
+    scenes: str = setting(
+        "tiles",
+        "tiles: MiniGrid's; textures: objects of any size at any pixel over textures",
+        choices=("tiles", "textures"),
+    )
+    labelled: int = setting(256, "labelled states", low=4, high=100_000)
+    unlabelled: int = setting(512, "unlabelled states; an oracle has more in proportion", low=1, high=100_000)
     high: float = setting(0.95, "a member owns a factor that it ranks at least this well", low=0.5, high=1.0)
     low: float = setting(0.6, "if it ranks every other factor at most this well, either way round", low=0.5, high=1.0)
 
@@ -59,7 +79,7 @@ def resolved(options: Mapping[str, Any], assignments: Iterable[str] = ()) -> Whi
 
 
 class Entry(NamedTuple):
-    """A method under test: its name as given, its objective (or ``cnn``, ``oracle``), its weight (None: setting's)."""
+    """A method under test: its name as given, its objective (or ``cnn``, ...), its weight (None: setting's)."""
 
     name: str
     objective: str
@@ -85,7 +105,7 @@ def copies(factors: Sequence[str]) -> int:
 
 
 def parse_entry(text: str) -> Entry:
-    """``dbat``, ``module:object``, ``cnn`` or ``oracle``; objectives may have a weight, ``dbat:0.01``.
+    """``dbat``, ``module:object``, ``cnn``, ``oracle`` or ``joint``; objectives may have a weight, ``dbat:0.01``.
 
     An unknown objective, code that was not allowed, or a wrong weight is a ``UserError``.
     """
@@ -94,7 +114,7 @@ def parse_entry(text: str) -> Entry:
         entry = Entry(text, objective, float(last)) if objective else Entry(text, text, None)
     except ValueError:
         entry = Entry(text, text, None)
-    if entry.objective in (CNN, ORACLE):
+    if entry.objective in (CNN, ORACLE, JOINT):
         if entry.weight is not None:
             raise UserError(f"{entry.objective} has no weight", text, f"Give {entry.objective}.")
     else:
@@ -111,7 +131,9 @@ def objectives_in(text: str) -> list[str]:
 def config_of(entry: Entry, config: WhichFeatureConfig) -> WhichFeatureConfig:
     """The settings that the entry's members are trained with."""
     if entry.objective in (CNN, ORACLE):
-        return replace(config, members=1, diversity="none")
+        return replace(config, members=1, diversity="none", proposals="none")
+    if entry.objective == JOINT:
+        return replace(config, diversity="none", proposals="joint")
     weight = {} if entry.weight is None else {"diversity_weight": entry.weight}
     return from_values(WhichFeatureConfig, {**as_dict(config), "diversity": entry.objective, **weight}, entry.name)
 
@@ -121,7 +143,7 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
 
     Entries of one seed have the same states, initial weights and batches.
     """
-    test = crossed_states(copies(config.factors), seed, config.factors)
+    test = crossed_states(copies(config.factors), seed, config.factors, DRAW[config.scenes])
     probabilities = _trained(entry, mix, seed, config_of(entry, config), test)
     ranked = rankings(probabilities, test.factors)
     at_half, at_best = balanced_accuracies(probabilities, test.factors)
@@ -131,16 +153,17 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
 
 def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: Scenes) -> NDArray[np.float32]:
     """Probabilities (N, K) of the trained members on the test states."""
-    names = config.factors
+    names, draw = config.factors, DRAW[config.scenes]
     if entry.objective == ORACLE:
-        crossed = crossed_states(copies(names), seed, names, split=ORACLE)
+        more = max(1, config.unlabelled // WhichFeatureConfig.unlabelled)
+        crossed = crossed_states(copies(names) * more, seed, names, draw, split=ORACLE)
         members = [
             fit(crossed.observations, truth, crossed.observations[:0], config, seed_for(seed, ORACLE, factor))
             for factor, truth in enumerate(crossed.factors.T)
         ]
         return np.concatenate([member.predict(test.observations) for member in members], axis=1)
-    labelled = labelled_states(LABELLED, seed, names)
-    unlabelled = unlabelled_states(UNLABELLED, mix, seed, names).observations
+    labelled = labelled_states(config.labelled, seed, names, draw)
+    unlabelled = unlabelled_states(config.unlabelled, mix, seed, names, draw).observations
     ensemble = fit(labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble"))
     return ensemble.predict(test.observations)
 
@@ -152,7 +175,9 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Scored]:
     """
     entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in config.diversity.split(","))]
     for entry in entries:
-        config_of(entry, config)  # refuses a wrong weight
+        agreements(config_of(entry, config))  # refuse wrong settings
+    if MOVED in config.factors and config.scenes != "tiles":
+        raise UserError(f"{MOVED} needs two frames of tiles", f"scenes={config.scenes}", "Set scenes=tiles.")
     if not config.factors or len(set(config.factors)) < len(config.factors):
         raise UserError("each feature is planted once", f"factors {config.factors}", "Name each once.")
     wanted = [(entry, mix, seed) for seed in config.seeds for mix in config.mix for entry in entries]

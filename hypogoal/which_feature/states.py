@@ -1,9 +1,10 @@
 """Spec H1: scenes with planted factors, drawn with MiniGrid's tiles, and the truth of each factor."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 from minigrid.core.grid import Grid
@@ -38,36 +39,44 @@ class Scenes:
     factors: NDArray[np.bool_]  # (N, F), the requested ones; others are drawn evenly
 
 
-def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
-    """The labelled context: every factor holds in half of the states, the positives, and none in the others."""
+Draw: TypeAlias = Callable[[NDArray[np.bool_], Sequence[str], np.random.Generator], Scenes]
+
+
+def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS, draw: Draw | None = None) -> Scenes:
+    """The labelled context: every factor holds in half of the states, the positives, and none in the others.
+
+    ``draw`` is :func:`drawn` or another function that makes scenes of factors.
+    """
     rng = rng_for(seed, "which-feature", "labelled")
     holds = rng.permutation(np.arange(count) % 2 == 0)
-    return drawn(np.repeat(holds[:, None], len(names), axis=1), names, rng)
+    return (draw or drawn)(np.repeat(holds[:, None], len(names), axis=1), names, rng)
 
 
-def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
+def unlabelled_states(
+    count: int, mix: float, seed: int, names: Sequence[str] = FACTORS, draw: Draw | None = None
+) -> Scenes:
     """States without labels.
 
     ``mix`` is the probability that a state's factors are drawn independently and evenly; else all are one even bit.
     """
     rng = rng_for(seed, "which-feature", "unlabelled")
     independent, joint = rng.random((count, len(names))) < 0.5, rng.random((count, 1)) < 0.5
-    return drawn(np.where(rng.random((count, 1)) < mix, independent, joint), names, rng)
+    return (draw or drawn)(np.where(rng.random((count, 1)) < mix, independent, joint), names, rng)
 
 
-def crossed_states(copies: int, seed: int, names: Sequence[str] = FACTORS, *, split: str = "test") -> Scenes:
+def crossed_states(
+    copies: int, seed: int, names: Sequence[str] = FACTORS, draw: Draw | None = None, *, split: str = "test"
+) -> Scenes:
     """Every combination of factors ``copies`` times, in random order; each ``split`` has its own random numbers."""
     rng = rng_for(seed, "which-feature", split)
     every = np.array(list(product((False, True), repeat=len(names))))
-    return drawn(rng.permutation(np.repeat(every, copies, axis=0)), names, rng)
+    return (draw or drawn)(rng.permutation(np.repeat(every, copies, axis=0)), names, rng)
 
 
 def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Generator) -> Scenes:
     """Scenes with these factors, bool (N, F); everything else is random and independent of them."""
-    count = len(factors)
-    truth = dict(zip(names, factors.T, strict=True))
-    truth |= {name: rng.random(count) < 0.5 for name in FACTORS if name not in truth}
-    colour, shape, place, many = (truth[name].astype(np.int64) for name in FACTORS)
+    count, truth = len(factors), dict(zip(names, factors.T, strict=True))
+    colour, shape, place, many = completed(factors, names, rng)
     rows = np.arange(count)
     x, y = rng.integers(INNER // 2, size=count) + place * (INNER // 2), rng.integers(INNER, size=count)
     up = np.where(y == 0, False, (y == INNER - 1) | (rng.random(count) < 0.5))
@@ -94,6 +103,15 @@ def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Gener
     return Scenes(np.concatenate(frames, axis=-1), factors)
 
 
+def completed(
+    factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Generator
+) -> Iterator[NDArray[np.int64]]:
+    """The ``FACTORS`` of scenes with some of them, bool (N, F), in order, each int64 (N,); others are drawn evenly."""
+    truth = dict(zip(names, factors.T, strict=True))
+    truth |= {name: rng.random(len(factors)) < 0.5 for name in FACTORS if name not in truth}
+    return (truth[name].astype(np.int64) for name in FACTORS)
+
+
 def _image(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Kinds of tiles (N, 16), row by row -> uint8 (N, 48, 48, 3) with walls around."""
     grid = np.full((len(ids), INNER + 2, INNER + 2), WALL)
@@ -101,11 +119,11 @@ def _image(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
     return tiles()[grid].swapaxes(2, 3).reshape(len(ids), SIDE, SIDE, 3)
 
 
-@lru_cache(maxsize=1)
-def tiles() -> NDArray[np.uint8]:
-    """Every kind of tile as MiniGrid draws it, uint8 (kinds, 8, 8, 3)."""
+@lru_cache(maxsize=16)
+def tiles(size: int = TILE) -> NDArray[np.uint8]:
+    """Every kind of tile as MiniGrid draws it, uint8 (kinds, size, size, 3)."""
     objects = [shape(colour) for shape in (Key, Ball) for colour in ("red", "blue")]
     contents = [None, Wall(), None, None, None, None, *objects, *map(Box, BOX_COLOURS), Goal()]
     directions = {AGENT + direction: direction for direction in range(4)}
-    images = [Grid.render_tile(content, directions.get(kind), tile_size=TILE) for kind, content in enumerate(contents)]
+    images = [Grid.render_tile(content, directions.get(kind), tile_size=size) for kind, content in enumerate(contents)]
     return np.stack(images).astype(np.uint8)  # MiniGrid draws in floats, and truncates them when it fills a picture
