@@ -241,6 +241,22 @@ def tables(path: Path) -> Iterator[str]:
     yield from table(["", "all", *every], _differences(test, chosen, tested))
 
 
+def beside_dbat(path: Path, published: Path, steps: int = 150) -> Iterator[str]:
+    """Members taught by proposals minus D-BAT's members with the same seeds, on the test layouts, as a table."""
+    numbers, others = read(path, "test"), read(published, "test")
+    length, seeds = lengths(read(published, "choice"))["dbat"], {seed for _, _, seed in numbers}
+    others = {cell: looks for cell, looks in others.items() if cell[0] == "dbat" and cell[2] in seeds}
+    rows = []
+    for name in CROSSED:
+        for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
+            ours = by_seed(numbers, "joint", steps, SHOWN[name], goals)
+            dbat = by_seed(others, "dbat", length, SHOWN[name], goals)
+            which = "all" if len(goals) > 1 else goals[0]
+            cells = (interval(ours), interval(dbat), difference(ours - dbat))
+            rows.append([name, which, str(len(ours)), *cells])
+    yield from table(["", "sub-goal", "seeds", "joint", "D-BAT", "joint minus it"], rows)
+
+
 def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> Iterator[str]:
     curves = {method: [curve(numbers, method, SHOWN[name]) for name in CROSSED] for method in chosen}
     looks = [step for step in shown if any(step in scores for scores, _ in curves.values())]
@@ -288,7 +304,11 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
+    parser.add_argument("--joint", type=Path, metavar="CSV", help="print cells of joint beside D-BAT's in this file")
     arguments = parser.parse_args()
+    if arguments.joint:
+        print("\n".join(beside_dbat(arguments.csv, arguments.joint)))
+        return
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
         return
