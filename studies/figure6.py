@@ -40,6 +40,7 @@ METHODS = {
     "ppo-paper": "PPO, the paper's setting",
     "dqn-paper": "DQN, the paper's setting",
     "literal": "D-BAT, the paper's networks, 150,000 steps",
+    "literal-none": "the same, networks without memory",
 }
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
 POINTS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1000, 1250, 1500)  # thousands of steps: of a curve
@@ -87,7 +88,7 @@ def method_of(config: Mapping[str, Any], place: str) -> str:
     if config.get("termination") == "oracle":
         return "oracle"
     if config.get("network") == "paper":
-        return "literal"
+        return "literal" if config.get("recurrence") != "none" else "literal-none"
     return "ppo-bonus" if config.get("bonus") else next(name for name in METHODS if f"-{name}-" in f"-{place}-")
 
 
