@@ -1,0 +1,117 @@
+"""Where did the last executions of the best member stop? Figure 5.
+
+python -m studies.ladder_stops docs/results/figure5-ladders.csv --gather runs/ladder-options/executions
+python -m studies.ladder_stops docs/results/figure5-ladders.csv --picture docs/results/figure5-ladders.png --seed 10
+python -m studies.ladder_stops docs/results/figure5-ladders.csv --tables
+
+The executions are those that ``studies.ladder_options`` kept. A row of the CSV is a place where the member stopped whose
+distance to a true base is lowest (the paper's choice), and how often.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.domains.montezuma import DOMAIN
+from hypogoal.evaluation.distance import BEGAN_INSIDE, HIT, counted, fates, rooms_shown, stops_over_rooms
+from hypogoal.options.tables import Executions
+from studies.cells import table
+
+GROUPS, LADDER = 2, "3-9"
+METHODS = {"dbat": "D-BAT", "none": "no diversity", "cnn": "single CNN"}
+NAME = re.compile(rf"options-{GROUPS}-(\w+)-(\d+)-{LADDER}-\d+\.csv")
+COLUMNS = ("method", "seed", "member", "room", "x", "y", "fate", "count")
+Stops = dict[tuple[str, int], NDArray[np.int64]]  # by method and seed: (n, 4), room, x, y and fate of each execution
+
+
+def gather(executions: Path, path: Path) -> None:
+    """Write the stops of the best members into a CSV."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for kept in sorted(executions.iterdir()):
+            if (match := NAME.fullmatch(kept.name)) and match[1] in METHODS:
+                every = Executions.read(kept)
+                members = [every.of(option) for option in np.unique(every.option)]
+                best = min(range(len(members)), key=lambda member: counted(members[member]).mean())
+                places = np.column_stack([members[best].positions(), fates(members[best])]).tolist()
+                for place, count in sorted(Counter(map(tuple, places)).items()):
+                    writer.writerow([match[1], match[2], best, *place, count])
+
+
+def read(path: Path) -> Stops:
+    """The stops in a CSV."""
+    places: dict[tuple[str, int], list[list[int]]] = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            place = [int(row[name]) for name in ("room", "x", "y", "fate")]
+            places.setdefault((row["method"], int(row["seed"])), []).extend([place] * int(row["count"]))
+    return {key: np.array(stops) for key, stops in places.items()}
+
+
+def spread(stops: NDArray[np.int64]) -> float:
+    """How far executions stop from the middle of their set, RAM units: the mean Manhattan distance to the median place of
+    the room in which most stop, over the stops there.
+    """
+    rooms, counts = np.unique(stops[:, 0], return_counts=True)
+    places = stops[stops[:, 0] == rooms[counts.argmax()], 1:3]
+    return float(np.abs(places - np.median(places, axis=0)).sum(axis=1).mean())
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the stops say, as lines of Markdown."""
+    stops = read(path)
+    yield from table(
+        ["", "seed", "at a base", "began inside", "spread", "rooms"],
+        (
+            [
+                title,
+                str(seed),
+                f"{(places[:, 3] == HIT).mean():.2f}",
+                f"{(places[:, 3] == BEGAN_INSIDE).mean():.2f}",
+                f"{spread(places):.1f}",
+                ", ".join(f"{room} ({count})" for room, count in Counter(places[:, 0].tolist()).most_common(3)),
+            ]
+            for method, title in METHODS.items()
+            for (name, seed), places in sorted(stops.items())
+            if name == method
+        ),
+    )
+
+
+def draw(path: Path, seed: int, picture: Path) -> None:
+    """One seed's stops over the rooms, as in the paper."""
+    stops = read(path)
+    shown = [(title, stops[method, seed]) for method, title in METHODS.items() if (method, seed) in stops]
+    rooms = rooms_shown([places[:, 0] for _, places in shown], DOMAIN.rooms_of(LADDER))
+    columns = [(title, places[:, 0], DOMAIN.pixel(places[:, :3]), places[:, 3]) for title, places in shown]
+    stops_over_rooms([(room, DOMAIN.picture(room)) for room in rooms], columns).savefig(picture, dpi=100)
+
+
+def main() -> None:
+    """Gather, draw or print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("csv", type=Path, help="the file of all stops")
+    parser.add_argument("--gather", type=Path, help="the folder of kept executions")
+    parser.add_argument("--picture", type=Path, help="a .png file to draw")
+    parser.add_argument("--seed", type=int, default=10, help="of the picture")
+    parser.add_argument("--tables", action="store_true", help="print the table")
+    arguments = parser.parse_args()
+    if arguments.gather:
+        gather(arguments.gather, arguments.csv)
+    if arguments.picture:
+        draw(arguments.csv, arguments.seed, arguments.picture)
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+
+
+if __name__ == "__main__":
+    main()
