@@ -137,11 +137,11 @@ def packed(parts: Mapping[str, Any], dtype: np.dtype[Any] | None = None) -> Obse
     """Mixed observations (N,) from arrays (N, ...) by key, all that ``dtype`` has if given; else a ``ValueError``."""
     arrays = {key: np.asarray(values) for key, values in parts.items()}
     arrays = {key: values.astype(NUMBERS) if values.dtype == np.float64 else values for key, values in arrays.items()}
-    found = mixed_type({key: (values.dtype, values.shape[1:]) for key, values in arrays.items()})
+    stored = mixed_type({key: (values.dtype, values.shape[1:]) for key, values in arrays.items()})
     lengths = {len(values) for values in arrays.values()}
-    if len(lengths) > 1 or (dtype is not None and found != dtype):
-        raise ValueError(f"{type_text(found)}, of lengths {lengths}")
-    states = np.empty(lengths.pop(), found)
+    if len(lengths) > 1 or (dtype is not None and stored != dtype):
+        raise ValueError(f"{type_text(stored)}, of lengths {lengths}")
+    states = np.empty(lengths.pop(), stored)
     for key, values in arrays.items():
         states[key] = values
     return states

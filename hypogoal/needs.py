@@ -130,8 +130,8 @@ def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
     name = network_for(network, dtype)
     try:
         with torch.device("meta"):
-            known = NETWORKS.keys() >= {*names_in(name)}
-            built = build_network(name, shape, torch_generator(0, "needs"), dtype=dtype) if known else None
+            built_in = NETWORKS.keys() >= {*names_in(name)}
+            built = build_network(name, shape, torch_generator(0, "needs"), dtype=dtype) if built_in else None
     except UserError:
         built = None
     return float(sum(weights.nbytes for weights in built.parameters())) if built else MEMBER

@@ -42,7 +42,7 @@ def described(config_class: type, stage: str, domain: str, preset: str | None = 
     else:
         from hypogoal.domains.base import load_domain
 
-        loaded = load_domain(domain, given=True)
+        loaded = load_domain(domain, by_user=True)
         instead.append((loaded.defaults.get(stage, {}), loaded.sources.get(stage, f"{domain}'s own")))
     if preset is not None:
         values = load_preset(preset, stage, domain, TABLES)
@@ -81,12 +81,12 @@ def configuration(
     from hypogoal.domains.base import defaults_of, load_domain  # loads Gymnasium, not needed to list stages
 
     return resolve(
-        load_domain(domain, given=by_user).config_class if stage == "collect" else CONFIGS[stage],
+        load_domain(domain, by_user=by_user).config_class if stage == "collect" else CONFIGS[stage],
         stage=stage,
         preset=preset,
         options=options,
         assignments=assignments or (),
         domain=domain,
-        defaults={**defaults_of(domain, stage, given=by_user), **(inherited or {})},
+        defaults={**defaults_of(domain, stage, by_user=by_user), **(inherited or {})},
         tables=TABLES,
     )

@@ -11,7 +11,7 @@ VAGUE = frozenset((
     "told", "found", "about", "given", "here", "there", "own", "of", "made", "known", "said", "asked", "what", "one",
     "yes", "chance", "thing", "things", "stuff",
 ))  # fmt: skip
-LIMIT = 0.02
+LIMIT = 0.01
 WORST = 10
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

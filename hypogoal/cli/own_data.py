@@ -204,7 +204,7 @@ def _verdicts(
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
-        loaded = load_domain(domain, given=True)
+        loaded = load_domain(domain, by_user=True)
         yield from check_domain(loaded, config, name=domain, **options)
         seen = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:

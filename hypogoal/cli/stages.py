@@ -158,8 +158,8 @@ def report(
     if figures is None and format_ is not None:
         raise UserError("--format is for --figures", format_, "Give --figures DIR too, or leave it out.")
     if figures is not None and (videos or resume):
-        what = "--videos" if videos else "--resume"
-        raise UserError(f"{what} is for the page, not for --figures", figures, "Give one command for each.")
+        option = "--videos" if videos else "--resume"
+        raise UserError(f"{option} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
         try:
             give(drawn(run, videos=videos, force=force, resume=resume))

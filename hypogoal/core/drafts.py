@@ -72,12 +72,12 @@ def unfinished(out: Path) -> bool:
 
 def drafts_in(path: Path) -> dict[Path, bool]:
     """The outputs at or below a path that have a draft, and whether, as its lock says, a process works on it."""
-    found = {}
+    drafts = {}
     for folder in (draft_folder(path), *sorted(path.rglob(f".*{PARTIAL}"))):
         with contextlib.suppress(UserError), open_file(folder / LOCK, "the lock is", "Remove it.") as file:
             if (folder / BEGUN).is_file():
-                found[folder.with_name(folder.name[1 : -len(PARTIAL)])] = try_lock(file, shared=True) is False
-    return found
+                drafts[folder.with_name(folder.name[1 : -len(PARTIAL)])] = try_lock(file, shared=True) is False
+    return drafts
 
 
 @contextlib.contextmanager

@@ -106,8 +106,8 @@ class Companion:
         try:
             answer = self._connection.recv()
         except (EOFError, ConnectionError):
-            what = "the second process was killed by the system, most likely for lack of memory"
-            raise Killed(what, None, "Free some memory.") from None
+            fault = "the second process was killed by the system, most likely for lack of memory"
+            raise Killed(fault, None, "Free some memory.") from None
         if isinstance(answer, Exception):
             raise answer
         return answer

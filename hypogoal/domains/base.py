@@ -488,14 +488,14 @@ def require_one_kind(engine: Engine) -> None:
         raise UserError("agents see pictures or numbers, not both", ", ".join(keys), do)
 
 
-def load_domain(name: str, *, given: bool = False) -> Domain:
+def load_domain(name: str, *, by_user: bool = False) -> Domain:
     """A domain by name: a built-in one, an installed entry point (group ``hypogoal.domains``) or ``module:object``.
 
-    ``module:object`` runs code, see :mod:`hypogoal.core.own_code`; ``given``: the user gave this name, on the command
+    ``module:object`` runs code, see :mod:`hypogoal.core.own_code`; ``by_user``: the user gave this name, on the command
     line or in a program. Code that the user did not allow, or an object that is no domain, is a ``UserError``.
     """
     try:
-        with own_code.given(*([name] if given else [])):
+        with own_code.given(*([name] if by_user else [])):
             domain = REGISTERED.get(name) or own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
     except UserError:
         if name != IMPORTED:
@@ -507,9 +507,9 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
     return domain
 
 
-def installed_domain(name: str, *, given: bool = False) -> Domain | None:
+def installed_domain(name: str, *, by_user: bool = False) -> Domain | None:
     """The domain, or None if it is not installed: a user's data may name such a one. See :func:`load_domain`."""
-    with own_code.given(*([name] if given else [])):
+    with own_code.given(*([name] if by_user else [])):
         own_code.require_trust(name, "domain")
         try:
             return load_domain(name)
@@ -517,7 +517,7 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
             return None
 
 
-def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str, Any]:
+def defaults_of(domain: str, stage: str, *, by_user: bool = False) -> Mapping[str, Any]:
     """The domain's own defaults for the settings of a stage; see :func:`installed_domain`."""
-    installed = installed_domain(domain, given=given)
+    installed = installed_domain(domain, by_user=by_user)
     return installed.defaults.get(stage, {}) if installed else {}

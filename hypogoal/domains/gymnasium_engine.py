@@ -131,8 +131,8 @@ def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
                 raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
             if reading.fault:
                 if key:
-                    made = reading.picture.expression() if reading.picture else "uint8 (H, W, C)"
-                    do = f"Under that key give {made} of pictures, x.reshape(-1) of numbers."
+                    shown = reading.picture.expression() if reading.picture else "uint8 (H, W, C)"
+                    do = f"Under that key give {shown} of pictures, x.reshape(-1) of numbers."
                     raise UserError(f"observations {reading.fault}", f"{key}, {part.dtype} {part.shape}", do)
                 raise UserError(f"observations {reading.fault}", f"{part.dtype} {part.shape}", _wrapped(reading, name))
             return Reader(part, reading.shape, PICTURE, key=name)

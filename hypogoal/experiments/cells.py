@@ -79,11 +79,11 @@ class Plan:
 
     def from_stage(self, stage: str) -> frozenset[str]:
         """The names of a stage's cells and of those that need them; none is a ``UserError``."""
-        names, made = {*self.of_stage(stage)}, set[Path]()
+        names, outs = {*self.of_stage(stage)}, set[Path]()
         for cell in self.cells:  # those that a cell needs are before it
-            if cell.name in names or not made.isdisjoint(cell.needs):
+            if cell.name in names or not outs.isdisjoint(cell.needs):
                 names.add(cell.name)
-                made.add(cell.out)
+                outs.add(cell.out)
         return frozenset(names)
 
 

@@ -137,8 +137,8 @@ def fit(
     )
     search = None
     if config.proposals == "joint":
-        known, other = view.see(observations, positions_of(origins.labelled)), positions_of(origins.unlabelled)
-        search = Search(known, labels, view.see(unlabelled, other), config, seed_for(seed, "proposals"))
+        seen, elsewhere = view.see(observations, positions_of(origins.labelled)), positions_of(origins.unlabelled)
+        search = Search(seen, labels, view.see(unlabelled, elsewhere), config, seed_for(seed, "proposals"))
         if saved is not None:
             with checkpoints.restoring():
                 search.restore(saved["search"])
@@ -254,7 +254,9 @@ class Round(Resumable):
             if config.unlabelled_bn and len(unlabelled):
                 with self._precision:
                     states.count_in(self.networks, unlabelled, self.changes[1])
-        losses = torch.stack([functional.cross_entropy(known, targets, self.class_weights) for known, *_ in outputs[0]])
+        losses = torch.stack(
+            [functional.cross_entropy(logits, targets, self.class_weights) for logits, *_ in outputs[0]]
+        )
         numbers = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
         if self.objective is not None:
             logits, features = ([torch.stack(group) for group in zip(*each, strict=True)] for each in outputs)

@@ -189,8 +189,8 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
     more: dict[str, Any] = {}
     if isinstance(config, TrainOptionsConfig) and config.play_ahead:
         if not domain.plays_ahead:
-            what = "an engine of this domain plays in the process that learns"
-            raise UserError(what, f"{domain.name}, play_ahead=true", "Leave it out.")
+            fault = "an engine of this domain plays in the process that learns"
+            raise UserError(fault, f"{domain.name}, play_ahead=true", "Leave it out.")
         if allowed(2) < 2:
             raise UserError("play_ahead needs two cores, one is allowed here", f"{CORES}=1", "Leave it out.")
         more["play_ahead"] = True

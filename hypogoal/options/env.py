@@ -183,13 +183,13 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _refuse(self, option: int) -> None:
         """Raise, or warn once, since this option is masked."""
-        what, do = f"option {option} ({self.options.name(option)}) is masked here", "Choose by action_masks()"
+        fault, do = f"option {option} ({self.options.name(option)}) is masked here", "Choose by action_masks()"
         if self.masked == "raise":
-            raise UserError(what, None, f"{do}, as MaskablePPO does, or give OptionEnv masked='run'.")
+            raise UserError(fault, None, f"{do}, as MaskablePPO does, or give OptionEnv masked='run'.")
         if self._warned:
             return
         self._warned = True
-        text = f"{what} and runs all the same. {do}, or give OptionEnv masked='run' to hear no more of it, or 'raise'."
+        text = f"{fault} and runs all the same. {do}, or give OptionEnv masked='run' to hear no more of it, or 'raise'."
         warnings.warn(text, UserWarning, stacklevel=3)
 
     def _current(self) -> Observations:

@@ -134,14 +134,16 @@ class Learner(Part, ABC):
         """Raise a ``UserError`` where it cannot learn with these settings in this engine."""
         for name, value in cls.NEEDS.items():
             if getattr(config, name) != value:
-                what = f"network={config.network} needs {name}={value}"
-                raise UserError(what, f"{name}={getattr(config, name)}", f"Give --set {name}={value}.")
+                fault = f"network={config.network} needs {name}={value}"
+                raise UserError(fault, f"{name}={getattr(config, name)}", f"Give --set {name}={value}.")
 
     @classmethod
     def policies(cls, saved: SavedOptions) -> Policies:
         """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
-        what = "these options need their domain's engine, which is not in the artefact"
-        raise UserError(what, f"network={saved.config['network']}", "Load options of the light or the paper's network.")
+        fault = "these options need their domain's engine, which is not in the artefact"
+        raise UserError(
+            fault, f"network={saved.config['network']}", "Load options of the light or the paper's network."
+        )
 
     @abstractmethod
     def build(self, config: OptionConfig, seed: int) -> None:
@@ -232,8 +234,8 @@ def make_policies(
     Policies that see the window around the agent also need the first ensemble.
     """
     if config["termination"] == ORACLE:
-        what = "these options end at the true sub-goals, which only the domain's engine can see"
-        raise UserError(what, "termination=oracle", "Load options that were trained with learned members.")
+        fault = "these options end at the true sub-goals, which only the domain's engine can see"
+        raise UserError(fault, "termination=oracle", "Load options that were trained with learned members.")
 
     def first_ensemble() -> Ensemble:
         assert ensemble is not None

@@ -68,9 +68,9 @@ class LightLearner(Learner):
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Other members' sub-goals may lie between the first and the last of several steps."""
         if config.n_step > 1 and config.experience != "own":
-            what = "several steps at once are for an option's own member: others' sub-goals may lie among them"
+            fault = "several steps at once are for an option's own member: others' sub-goals may lie among them"
             setting = f"n_step={config.n_step}, experience={config.experience}"
-            raise UserError(what, setting, "Give --set experience=own or --set n_step=1.")
+            raise UserError(fault, setting, "Give --set experience=own or --set n_step=1.")
 
     @classmethod
     def policies(cls, saved: SavedOptions) -> Policies:

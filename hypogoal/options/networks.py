@@ -188,8 +188,8 @@ def embedding_for(
     """
     if name in (GRID, DEEP):
         if standard is not None or any(side % CELL for side in observation_shape[:2]):
-            what = f"only pictures that whole cells of {CELL} x {CELL} pixels fill have a grid"
-            raise UserError(what, f"{setting}={name}, observations {observation_shape}", f"Leave {setting} out.")
+            fault = f"only pictures that whole cells of {CELL} x {CELL} pixels fill have a grid"
+            raise UserError(fault, f"{setting}={name}, observations {observation_shape}", f"Leave {setting} out.")
         return (GridEmbedding if name == GRID else DeepEmbedding)(observation_shape)
     if name != AUTO:
         return OwnEmbedding(name, observation_shape, standard)

@@ -71,12 +71,12 @@ class PlannedLearner(Learner):
 def plan_of(engine: Engine, terminations: Terminations, config: OptionConfig, starts: Ids | None = None) -> Plan:
     """The engine's plan, from these states or where episodes begin; a ``UserError`` where options cannot be planned."""
     if type(terminations) is not Terminations:
-        what = "only options that end at a single positive prediction can be planned"
-        raise UserError(what, f"termination={config.termination}", "Give termination=learned.")
+        fault = "only options that end at a single positive prediction can be planned"
+        raise UserError(fault, f"termination={config.termination}", "Give termination=learned.")
     plan = engine.plan() if starts is None else engine.plan(starts)  # a user's engine may take none
     if plan is None:
-        what = "this domain does not know what each action leads to"
-        raise UserError(what, f"network={config.network}", "Give --set network=light.")
+        fault = "this domain does not know what each action leads to"
+        raise UserError(fault, f"network={config.network}", "Give --set network=light.")
     return plan
 
 

@@ -61,9 +61,9 @@ class AgentCrop(PolicyView):
         """With the ensemble's localiser; a ``UserError`` where it has none, or one that policies must not use."""
         source = ensemble()
         if not isinstance(source.view, AgentView) or source.needs_positions:
-            what = "the agent's place in an observation is not known"
+            fault = "the agent's place in an observation is not known"
             raise UserError(
-                what, "policy_view=agent-crop", "Train the ensemble with view=agent-crop, localiser=learned."
+                fault, "policy_view=agent-crop", "Train the ensemble with view=agent-crop, localiser=learned."
             )
         return cls(shape, source.view.localiser)
 

@@ -57,9 +57,9 @@ class Terminations(Part):
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Raise a ``UserError`` where options cannot be learned that end so."""
         if not cls.SHARED and config.experience != "own":
-            what = "states that other options visit do not say whether an execution has reached its sub-goal"
+            fault = "states that other options visit do not say whether an execution has reached its sub-goal"
             setting = f"termination={config.termination}, experience={config.experience}"
-            raise UserError(what, setting, "Give --set experience=own.")
+            raise UserError(fault, setting, "Give --set experience=own.")
 
     @staticmethod
     def dwell(length: int) -> int:
@@ -279,8 +279,8 @@ def learned_terminations(
 
     def look_at(ids: NDArray[np.int64]) -> tuple[Observations, NDArray[np.int64] | None]:
         if stacked.needs_positions and not engine.position_names:
-            what = "the ensemble needs the agent's positions (localiser=ram)"
-            raise UserError(what, None, "Train it with localiser=learned.")
+            fault = "the ensemble needs the agent's positions (localiser=ram)"
+            raise UserError(fault, None, "Train it with localiser=learned.")
         return engine.images(ids), engine.positions(ids) if stacked.needs_positions else None
 
     knows_cells = stacked.knows_cells and engine.tiles is not None

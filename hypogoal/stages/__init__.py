@@ -29,10 +29,10 @@ def make(
     values = [
         part for value in settings.values() for part in (re.split("[,=]", value) if isinstance(value, str) else ())
     ]
-    trusted = [value for value in defaults_of(domain, stage, given=by_user).values() if isinstance(value, str)]
+    trusted = [value for value in defaults_of(domain, stage, by_user=by_user).values() if isinstance(value, str)]
     first: Any = source
     if stage == "collect":
-        first, rest["name"] = load_domain(domain, given=True), domain
+        first, rest["name"] = load_domain(domain, by_user=True), domain
     with own_code.given(*map(str.strip, values)), own_code.vouched(*trusted):
         return named(stage)(first, config, out, **rest)
 

@@ -90,7 +90,7 @@ def _too_small(domain: str, states: Collected) -> list[str]:
     from hypogoal.hypotheses.config import EnsembleConfig
     from hypogoal.hypotheses.networks import build_network, names_in, network_for
 
-    name = defaults_of(domain, "train-ensemble", given=True).get("network", EnsembleConfig().network)
+    name = defaults_of(domain, "train-ensemble", by_user=True).get("network", EnsembleConfig().network)
     name = network_for(name, states.labelled.observations.dtype)
     try:
         with own_code.vouched(*names_in(name)):  # the domain names it

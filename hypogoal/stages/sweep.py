@@ -37,7 +37,7 @@ AGAIN = "give the same command again to go on"
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
     """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
     if stage == "collect":
-        return load_domain(domain, given=True).config_class
+        return load_domain(domain, by_user=True).config_class
     if stage == "run":
         for name, experiment in EXPERIMENTS.items():
             if domain == experiment.domain and name not in CELLS.values():
@@ -211,8 +211,8 @@ def _speaker(quiet: bool) -> Callable[[str], None]:
 
 def _alone(planned: Plan, cells: Sequence[Cell]) -> Plan:
     """These cells, which wait for none but each other."""
-    made = {cell.out for cell in cells}
-    alone = [replace(cell, needs=tuple(need for need in cell.needs if need in made)) for cell in cells]
+    outs = {cell.out for cell in cells}
+    alone = [replace(cell, needs=tuple(need for need in cell.needs if need in outs)) for cell in cells]
     return replace(planned, cells=alone)
 
 

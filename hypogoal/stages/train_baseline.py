@@ -54,7 +54,7 @@ def train_baseline(
         raise UserError(fault, taught.path, "Name its domain.")
     inputs = [path for path in (data, ensemble) if path]
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
-    played = load_domain(domain, given=True)
+    played = load_domain(domain, by_user=True)
     lived: dict[str, Any] = played.world(taught.config["domain_config"]) if taught else {}
     if data:
         dataset = open_dataset(data)

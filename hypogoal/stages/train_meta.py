@@ -55,8 +55,8 @@ def train_meta(
     if practice:
         check_fit(practice, source, config, FIXED)
     elif load_learner(config.network).ONCE:
-        what = "these options learn in train-options alone"
-        raise UserError(what, f"network={config.network}", "Train them there, then give --options.")
+        fault = "these options learn in train-options alone"
+        raise UserError(fault, f"network={config.network}", "Train them there, then give --options.")
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])

@@ -49,8 +49,8 @@ def train_options(
     practice = open_artefact(options, "options").whole() if options else None
     if practice:
         if load_learner(config.network).ONCE:
-            what = "these options learn once and for all"
-            raise UserError(what, f"network={config.network}", "Train them anew, without --options.")
+            fault = "these options learn once and for all"
+            raise UserError(fault, f"network={config.network}", "Train them anew, without --options.")
         check_fit(practice, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)

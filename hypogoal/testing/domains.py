@@ -151,8 +151,8 @@ class _Contract:
         promise(shape == tuple(self.domain.observation_shape), text, "Make them agree.")
         dtype = engine.observation_dtype
         text = f"observations are {dtype} in the engine, {self.domain.observation_dtype} in the domain"
-        known = dtype in (PICTURE, NUMBERS) or dtype.names is not None
-        promise(dtype == self.domain.observation_dtype and known, text, "Give uint8 or float32.")
+        allowed = dtype in (PICTURE, NUMBERS) or dtype.names is not None
+        promise(dtype == self.domain.observation_dtype and allowed, text, "Give uint8 or float32.")
         text = f"observation_shape is {shape}"
         promise(len(shape) == 3 or dtype != PICTURE, text, "Pictures are (height, width, channels).")
         if self.domain.doubt:

@@ -53,9 +53,9 @@ def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
 def test_what_is_no_domain_is_refused() -> None:
     """Spec B6, G2: one line that says what a domain needs."""
     with pytest.raises(UserError, match="not a domain"):
-        load_domain("own_domain:CorridorConfig", given=True)
+        load_domain("own_domain:CorridorConfig", by_user=True)
     with pytest.raises(UserError, match="cannot be loaded"):
-        load_domain("own_domain:NOTHING", given=True)
+        load_domain("own_domain:NOTHING", by_user=True)
 
 
 @pytest.mark.parametrize("agent", ["ppo", "dqn"])

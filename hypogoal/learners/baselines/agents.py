@@ -110,8 +110,8 @@ def check_finite(model: BaseAlgorithm, step: int) -> None:
 def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int, device: str = "cpu") -> BaseAlgorithm:
     """A fresh agent; a ``UserError`` where PPO has more environments than steps between two updates."""
     if isinstance(chosen, PPOSettings) and env.num_envs > chosen.rollout:
-        what = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
-        raise UserError(what, f"environments={env.num_envs}", f"Give --set environments={chosen.rollout} or fewer.")
+        fault = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
+        raise UserError(fault, f"environments={env.num_envs}", f"Give --set environments={chosen.rollout} or fewer.")
     seen: dict[str, Any] = {"net_arch": [FEATURES, FEATURES]}  # of numbers
     if env.observation_space.dtype == PICTURE:
         network = {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL}
