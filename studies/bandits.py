@@ -8,17 +8,15 @@ The first path is the folder of ``hypogoal run which-feature``, whose ensembles 
 
 from __future__ import annotations
 
-import argparse
-import csv
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hypogoal.cli import main as hypogoal
-from studies.cells import Row, interval, run_cells, table
+from studies.cells import Jobs, Row, interval, parser_of, read_rows, run_cells, table
 
 CHOOSERS = {"thompson": "Thompson sampling", "ppo": "PPO", "random": "uniform-random"}
 # By name as in the CSV; Exp3 is gone, since it was slower than Thompson sampling: for the rows that were made with it.
@@ -45,16 +43,14 @@ def run_cell(run: Path, method: str, truth: str, chooser: str, seed: str) -> lis
         ]
         if hypogoal(command):
             raise SystemExit(f"failed: {' '.join(command)}")
-        with (out / "episodes.csv").open(encoding="utf-8", newline="") as file:
-            solved = np.array([float(row["reward"]) > 0 for row in csv.DictReader(file)])
+        solved = np.array([float(row["reward"]) > 0 for row in read_rows(out / "episodes.csv")])
     place = {"method": method, "truth": truth, "chooser": chooser, "seed": seed}
     return [place | {"step": end, "success": float(solved[end - WINDOW : end].mean())} for end in ENDS]
 
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     yield f"Share of the last {WINDOW} episodes solved, by episodes so far: mean with a 95 % interval."
     yield ""
     lines = []
@@ -73,14 +69,10 @@ def tables(path: Path) -> Iterator[str]:
 
 def main() -> None:
     """Run the cells that are not in the file yet, or draw the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("run", type=Path, nargs="?", help="the folder of hypogoal run which-feature")
-    parser.add_argument("csv", type=Path, help="the file of all cells")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__, run="the folder of hypogoal run which-feature").parse_args()
     if not arguments.tables:
         seeds = sorted(path.name.rpartition("-")[2] for path in (arguments.run / "ensemble").glob("method-dbat-seed-*"))
-        jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+        jobs: Jobs = {
             (method, truth, chooser, seed): partial(run_cell, arguments.run, method, truth, chooser, seed)
             for seed in seeds
             for method in METHODS

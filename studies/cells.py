@@ -7,7 +7,7 @@ import csv
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,23 +19,51 @@ from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, RESAMPLES, student_inter
 
 Row = dict[str, Any]
 Cell = tuple[str, ...]
+Jobs: TypeAlias = dict[Cell, Callable[[], list[Row]]]  # what makes a cell's rows
 
 
-def parser_of(doc: str | None, seeds: str) -> argparse.ArgumentParser:
-    """The arguments that all such experiments share; ``doc`` is the module's, ``seeds`` the default."""
+def parser_of(doc: str | None, seeds: str = "", *, run: str = "") -> argparse.ArgumentParser:
+    """The arguments that such experiments share; ``doc`` is the module's, ``seeds`` the default of those that train.
+
+    ``run`` is the help of an argument before the CSV, for those that gather.
+    """
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    if run:
+        parser.add_argument("run", type=Path, nargs="?", help=run)
     parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
-    parser.add_argument("--seeds", type=parse_integers, default=parse_integers(seeds), help="0-9 or 0,2,5")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
+    if seeds:
+        parser.add_argument("--seeds", type=parse_integers, default=parse_integers(seeds), help="0-9 or 0,2,5")
+        parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     return parser
+
+
+def printed(arguments: argparse.Namespace, tables: Callable[[Path], Iterable[str]]) -> bool:
+    """Print the tables where ``--tables`` asks for nothing else; whether it does."""
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+    return bool(arguments.tables)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV with a header."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV with a header."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def run_cells(
     path: Path,
     columns: Sequence[str],
     keys: Sequence[str],
-    jobs: Mapping[Cell, Callable[[], list[Row]]],
+    jobs: Jobs,
     steps: Callable[[Cell], Sequence[int]],
     workers: int,
 ) -> None:
@@ -52,9 +80,8 @@ def run_cells(
     if not path.exists():
         path.write_text(",".join(columns) + "\n", encoding="utf-8")
     finished: dict[Cell, set[int]] = defaultdict(set)
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            finished[tuple(row[key] for key in keys)].add(int(row["step"]))
+    for row in read_rows(path):
+        finished[tuple(row[key] for key in keys)].add(int(row["step"]))
     cells = [cell for cell in jobs if not finished[cell].issuperset(steps(cell))]
     with Progress(path.stem, len(cells)) as progress:
 

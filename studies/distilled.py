@@ -12,7 +12,7 @@ the new layouts themselves, each then played alone as in ``studies.many_layouts`
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from hypogoal.options.networks import apply_to_states
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Cell, Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, run_cells, table
 from studies.many_layouts import ENSEMBLE_STEPS, KEYS, WHERE, new_layouts, of_seeds, picked, read, tried_out
 
 FIRST = 6000  # new layouts begin here; those from 5000 on were seen while settings were chosen
@@ -247,13 +247,12 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(PUBLISHED), help=f"of {', '.join(METHODS)}")
     parser.add_argument("--choosing", action="store_true", help="play the layouts on which settings are chosen")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
     if not (arguments.work / "data.h5").exists():
         collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", quiet=True)
     step = CHOOSE if arguments.choosing else STEP
-    jobs: dict[Cell, Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (method, str(seed)): partial(run_cell, arguments.work, method, seed, step)
         for seed in arguments.seeds
         for method in arguments.methods.split(",")

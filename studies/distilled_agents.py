@@ -12,12 +12,11 @@ layouts. There nothing is cut at 1.5 shortest paths, but success within them is 
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -50,7 +49,7 @@ from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.networks import GRID, GridEmbedding
 from hypogoal.options.tables import Episodes
 from hypogoal.stages.train_meta import train_meta
-from studies.cells import Cell, Row, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table
 from studies.distilled import FIRST, ensemble_of, options_of
 from studies.many_layouts import new_layouts
 
@@ -193,10 +192,9 @@ def scored(
 def read(path: Path) -> dict[tuple[str, str], list[dict[str, float]]]:
     """The numbers of all cells, by world and options."""
     cells: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            numbers = {name: float(row[name]) for name in COLUMNS[len(KEYS) :] if row[name]}
-            cells[row["world"], row["options"]].append(numbers)
+    for row in read_rows(path):
+        numbers = {name: float(row[name]) for name in COLUMNS[len(KEYS) :] if row[name]}
+        cells[row["world"], row["options"]].append(numbers)
     return cells
 
 
@@ -249,10 +247,9 @@ def main() -> None:
     parser.add_argument("--worlds", default=",".join(WORLDS), help=f"of {', '.join(WORLDS)}")
     parser.add_argument("--options", default=",".join(OPTIONS), help=f"of {', '.join(OPTIONS)}; or {PIXELS}")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
-    jobs: dict[Cell, Callable[[], list[Row]]] = {}
+    jobs: Jobs = {}
     for world in arguments.worlds.split(","):
         for options in arguments.options.split(","):
             for place, number in enumerate(arguments.seeds if world.startswith("many") else LAYOUTS[world]):

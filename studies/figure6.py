@@ -8,8 +8,6 @@ python -m studies.figure6 --tables --picture docs/results/figure6.png docs/resul
 
 from __future__ import annotations
 
-import argparse
-import csv
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -27,7 +25,7 @@ from hypogoal.evaluation.frozen import ENVIRONMENTS, play
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
-from studies.cells import interval, table
+from studies.cells import interval, parser_of, read_rows, table, write_rows
 
 METHODS = {
     "dbat-k3": "D-BAT, K = 3",
@@ -61,9 +59,8 @@ def collect(run: Path, path: Path) -> None:
     """A row for every number of every finished agent, those that are there first."""
     rows_of: dict[tuple[str, ...], list[dict[str, str]]] = {}
     if path.exists():
-        with path.open(encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                rows_of.setdefault((row["method"], row["layout"]), []).append(row)
+        for row in read_rows(path):
+            rows_of.setdefault((row["method"], row["layout"]), []).append(row)
     for kind in ("meta", "baseline"):
         for artefact in find_artefacts(run, kind):
             read = read_run(artefact, artefact.path.name)
@@ -76,11 +73,8 @@ def collect(run: Path, path: Path) -> None:
                     for chooser, name, value in _numbers(artefact, read)
                 ]
     order = list(METHODS)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for place in sorted(rows_of, key=lambda key: (order.index(key[0]), int(key[1]))):
-            writer.writerows(rows_of[place])
+    places = sorted(rows_of, key=lambda key: (order.index(key[0]), int(key[1])))
+    write_rows(path, COLUMNS, [row for place in places for row in rows_of[place]])
 
 
 def method_of(config: Mapping[str, Any], place: str) -> str:
@@ -128,8 +122,7 @@ def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: f
 
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     methods = [method for method in METHODS if any(row["method"] == method for row in rows)]
     layouts = sorted({row["layout"] for row in rows}, key=int)
 
@@ -192,8 +185,7 @@ def tables(path: Path) -> Iterator[str]:
 
 def draw(path: Path, out: Path) -> None:
     """The curves: means over the layouts of each method, in the last 100 episodes before a step."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     figure, places = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
     titles = {"success": "share of episodes solved", "length": "episode length / shortest path"}
     for axes, (quantity, title) in zip(places, titles.items(), strict=True):
@@ -224,10 +216,7 @@ def _thousands(steps: float) -> str:
 
 def main() -> None:
     """Take the numbers of a run, or draw the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
-    parser.add_argument("csv", type=Path, help="the file of rows")
-    parser.add_argument("--tables", action="store_true", help="print the tables only")
+    parser = parser_of(__doc__, run="the folder of the sweep")
     parser.add_argument("--picture", type=Path, help="draw the curves, a .png file")
     arguments = parser.parse_args()
     if not arguments.tables:

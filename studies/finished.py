@@ -6,7 +6,6 @@ python -m studies.finished docs/results/finished-episodes.csv --tables    print 
 
 from __future__ import annotations
 
-import argparse
 import csv
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.learners.episodes import LAST
-from studies.cells import table
+from studies.cells import parser_of, read_rows, table
 
 ENVIRONMENTS, REPETITIONS, CHANGE = 16, 400, 40_000  # steps, of all environments together, like all steps here
 CAPS = (57, 500)  # steps of a failed episode; a solved one takes 20 to 40
@@ -60,8 +59,7 @@ def simulate() -> Iterator[tuple[str, ...]]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     for changes, steps in ((False, LOOKS), (True, AFTER)):
         axis = f"steps after the share changed, at {CHANGE:,}" if changes else "steps since the beginning"
         yield f"Share solved of the last {LAST} that ended / of the last {LAST} begun a cap ago or longer, by {axis}:"
@@ -81,10 +79,7 @@ def tables(path: Path) -> Iterator[str]:
 
 def main() -> None:
     """Simulate, or print the tables only."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of rows")
-    parser.add_argument("--tables", action="store_true", help="print the tables only")
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__).parse_args()
     if not arguments.tables:
         with arguments.csv.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *simulate()])

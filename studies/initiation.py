@@ -8,8 +8,6 @@ reads the artefacts ``RUNS/meta/{anywhere,learned}-LAYOUT`` and ``RUNS/ladder/{a
 
 from __future__ import annotations
 
-import argparse
-import csv
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +16,7 @@ import numpy as np
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.evaluation.curves import read_run, run_numbers
 from hypogoal.options.tables import Executions
-from studies.cells import table
+from studies.cells import parser_of, read_rows, table, write_rows
 
 SWITCH = ("anywhere", "learned")
 COLUMNS = ("task", "layout", "seed", "initiation", "quantity", "value")
@@ -46,11 +44,10 @@ def gather(runs: Path) -> Iterator[dict[str, str | float | int]]:
 
 def cells_of(path: Path) -> Cells:
     """The value of each (task, layout or seed, initiation, quantity)."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return {
-            (row["task"], int(row["layout"] or row["seed"]), row["initiation"], row["quantity"]): float(row["value"])
-            for row in csv.DictReader(file)
-        }
+    return {
+        (row["task"], int(row["layout"] or row["seed"]), row["initiation"], row["quantity"]): float(row["value"])
+        for row in read_rows(path)
+    }
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -74,15 +71,11 @@ def _steps(cells: Cells, task: str, place: int) -> list[str]:
 
 def main() -> None:
     """Gather, or print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells")
+    parser = parser_of(__doc__)
     parser.add_argument("--runs", type=Path, help="the folder with the runs' artefacts")
     arguments = parser.parse_args()
     if arguments.runs:
-        with arguments.csv.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(gather(arguments.runs))
+        write_rows(arguments.csv, COLUMNS, gather(arguments.runs))
     print("\n".join(tables(arguments.csv)))
 
 

@@ -9,9 +9,8 @@ from those of layout 0, half of them positives where there are so many. Kept and
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import Watcher, fit
-from studies.cells import Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 from studies.hypotheses import Looked, settings_of, states_of
 
 LABELS = (5, 10, 20, 50, 200, 0)  # 0: all of them
@@ -82,8 +81,7 @@ def run_cell(count: int, method: str, sub_goal: str, seed: int) -> list[Row]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     for name, title in (("ranking", "Ranking"), ("balanced_accuracy", "Balanced accuracy at 0.5")):
         yield f"{title} of the cross-fitted best member, mean over sub-goals with a 95 % interval over seeds."
         yield ""
@@ -134,10 +132,9 @@ def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "0-4")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
-    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (str(count), method, sub_goal, str(seed)): partial(run_cell, count, method, sub_goal, seed)
         for seed in arguments.seeds
         for count in LABELS

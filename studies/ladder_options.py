@@ -9,7 +9,6 @@ rows of the CSV. Kept and gone on with as in ``studies.hypotheses``; ``--tables`
 
 from __future__ import annotations
 
-import csv
 import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -31,7 +30,7 @@ from hypogoal.options.tables import Executions
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, read_rows, run_cells, table
 from studies.ladders import read as read_lengths
 
 Settings = dict[str, Any]
@@ -143,13 +142,12 @@ Distances = dict[tuple[str, str], dict[int, NDArray[np.float64]]]  # by method a
 def read(path: Path, groups: int, name: str = "distance") -> Distances:
     """A number of the cells of one N."""
     numbers: Distances = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            if int(row["groups"]) == groups:
-                method = row["method"] if row["method"] != CARRIED else f"{CARRIED}-{row['step']}"
-                seeds = numbers.setdefault((method, row["ladder"]), {})
-                seed = int(row["seed"])
-                seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name] or "nan"))
+    for row in read_rows(path):
+        if int(row["groups"]) == groups:
+            method = row["method"] if row["method"] != CARRIED else f"{CARRIED}-{row['step']}"
+            seeds = numbers.setdefault((method, row["ladder"]), {})
+            seed = int(row["seed"])
+            seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name] or "nan"))
     return numbers
 
 
@@ -360,7 +358,7 @@ def main() -> None:
     ]
     if arguments.workers > 1:  # else each when it is needed
         in_processes(ensembles, arguments.workers, lambda *_: None)
-    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (str(groups), method, str(seed), ladder): partial(run_cell, work, groups, method, seed, ladder)
         for groups in arguments.groups
         for seed in arguments.seeds

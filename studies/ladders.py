@@ -10,9 +10,8 @@ kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws them.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
 from hypogoal.hypotheses.training import Watcher, fit
-from studies.cells import Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -140,13 +139,12 @@ Numbers = dict[str, Seeds]  # by method
 def read(path: Path, groups: int, sub_goal: str | None = None) -> Numbers:
     """The cells of one N, and of one sub-goal where a file has several; only seeds that every method has."""
     numbers: Numbers = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            if int(row["groups"]) == groups and row.get("sub_goal") == sub_goal:
-                steps = numbers.setdefault(row["method"], {}).setdefault(int(row["seed"]), {})
-                columns = steps.setdefault(int(row["step"]), {})
-                for name in COLUMNS[len(KEYS) :]:
-                    columns[name] = np.append(columns.get(name, np.empty(0)), float(row[name] or "nan"))
+    for row in read_rows(path):
+        if int(row["groups"]) == groups and row.get("sub_goal") == sub_goal:
+            steps = numbers.setdefault(row["method"], {}).setdefault(int(row["seed"]), {})
+            columns = steps.setdefault(int(row["step"]), {})
+            for name in COLUMNS[len(KEYS) :]:
+                columns[name] = np.append(columns.get(name, np.empty(0)), float(row[name] or "nan"))
     shared = set.intersection(*map(set, numbers.values())) if numbers else set()
     return {method: {seed: seeds[seed] for seed in sorted(shared)} for method, seeds in numbers.items()}
 
@@ -273,11 +271,10 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
     looks = tuple(step for step in LOOKS if step <= arguments.until)
-    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (str(groups), method, str(seed)): partial(run_cell, groups, method, seed, looks)
         for groups in arguments.groups
         for seed in arguments.seeds

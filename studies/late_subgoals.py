@@ -32,7 +32,7 @@ from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.meta.training import assemble
 from hypogoal.options.loop import OptionLoop
-from studies.cells import table
+from studies.cells import read_rows, table, write_rows
 
 PRACTICE, STEPS, LOOK = 40_000, 150_000, 1_000  # environment steps: of train-options; in all; between two looks
 CHOOSING = tuple(range(210, 214))  # layouts on which settings were chosen
@@ -116,8 +116,7 @@ def members(runs: Path, layout: int, seed: int) -> Iterator[dict[str, Any]]:
 
 def tables(path: Path) -> Iterator[str]:
     """Every agent, layout by layout; then each setting beside its control, over the layouts that have both."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     found = {(row["setting"], int(row["layout"]), int(row["seed"])): row for row in rows}
     settings = [name for name in SETTINGS if any(row["setting"] == name for row in rows)]
     agents = sorted({agent[1:] for agent in found}, key=lambda agent: (agent[0] not in CHOOSING, agent))
@@ -194,11 +193,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.runs and arguments.members:
         prepare("cpu")
-        with arguments.csv.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, OF_MEMBERS, lineterminator="\n")
-            writer.writeheader()
-            for seed, layout in product(arguments.seeds, arguments.layouts):
-                writer.writerows(members(arguments.runs, layout, seed))
+        places = product(arguments.seeds, arguments.layouts)
+        rows = (row for seed, layout in places for row in members(arguments.runs, layout, seed))
+        write_rows(arguments.csv, OF_MEMBERS, rows)
         return
     if arguments.runs:
         prepare("cpu")

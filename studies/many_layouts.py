@@ -15,11 +15,10 @@ convolutions over the cells, are what we tried where learning failed.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +40,7 @@ from hypogoal.meta.training import assemble
 from hypogoal.options.loop import OptionLoop
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
-from studies.cells import Cell, Row, interval, parser_of, run_cells, table
+from studies.cells import Cell, Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table
 
 TRAINED, FIRST, TRIED = "1000-1999", 5000, 100  # layouts to learn in; where the new ones begin, and how many
 LEARNT = (0, 1, 2)  # layouts of the states that ensembles learn from
@@ -140,10 +139,9 @@ Found = dict[tuple[str, int, str], dict[int, dict[str, NDArray[np.float64]]]]
 def read(path: Path, name: str) -> Found:
     """A number of all cells."""
     numbers: Found = defaultdict(lambda: defaultdict(dict))
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            of_seed = numbers[row["method"], int(row["step"]), row["layouts"]][int(row["seed"])]
-            of_seed[row["sub_goal"]] = np.append(of_seed.get(row["sub_goal"], np.empty(0)), float(row[name]))
+    for row in read_rows(path):
+        of_seed = numbers[row["method"], int(row["step"]), row["layouts"]][int(row["seed"])]
+        of_seed[row["sub_goal"]] = np.append(of_seed.get(row["sub_goal"], np.empty(0)), float(row[name]))
     return numbers
 
 
@@ -204,8 +202,7 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
     parser.add_argument("--looks", type=parse_integers, default=LOOKS, help="environment steps at which to look")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
     if not (arguments.work / "data.h5").exists():
         collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", quiet=True)
@@ -214,7 +211,7 @@ def main() -> None:
     def looks_of(cell: Cell) -> tuple[int, ...]:
         return PLANNED if cell[0] == "planned" else looks
 
-    jobs: dict[Cell, Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (method, str(seed)): partial(run_cell, arguments.work, method, seed, looks_of((method, str(seed))))
         for seed in arguments.seeds
         for method in arguments.methods.split(",")

@@ -6,7 +6,6 @@ python -m studies.picture docs/results.png
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,14 +13,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from studies.cells import read_rows
+
 RESULTS = Path("docs/results")
 INK, PALE, GREY = "#0b5394", "#9fc5e8", "#8a8a8a"
 
 
 def solved(name: str, chooser: str = "agent", **wanted: str) -> list[float]:
     """The share of episodes solved, of each row that fits."""
-    with (RESULTS / name).open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(RESULTS / name)
     wanted |= {"quantity": "success", "chooser": chooser}
     return [float(row["value"]) for row in rows if all(row[key] == value for key, value in wanted.items())]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies import ladders
-from studies.cells import Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, run_cells, table
 from studies.ladders import LOOKS, Seeds, crossed, read
 
 UNTIL = 450
@@ -59,11 +59,10 @@ def main() -> None:
     parser = parser_of(__doc__, "0-9")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
     looks = tuple(step for step in LOOKS if step <= UNTIL)
-    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (str(groups), f"{method} {precision}", str(seed)): partial(run_cell, groups, method, precision, seed, looks)
         for method in arguments.methods.split(",")
         for groups in (1, 2)

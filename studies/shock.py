@@ -11,7 +11,6 @@ it prints the tables of the file.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -27,7 +26,7 @@ from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.tables import Episodes
-from studies.cells import table
+from studies.cells import read_rows, table, write_rows
 
 AT, STEPS, SPAN = 40_000, 80_000, 10_000  # environment steps: of the shock, of a run, of a row
 MEMBERS, LOST = 3, 2
@@ -117,8 +116,7 @@ def gather(run: Path) -> Iterator[dict[str, str | int | float]]:
 
 def tables(path: Path) -> Iterator[str]:
     """Solved in each span of steps, mean over agents, and how many agents recover; layouts from 300 on come first."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["quantity"] == "success"]
+    rows = [row for row in read_rows(path) if row["quantity"] == "success"]
     solved: dict[tuple[bool, str], dict[int, list[float]]] = {}
     for row in rows:
         chosen_on = int(row["layout"]) < FIRST
@@ -150,11 +148,7 @@ def main() -> None:
     if not runs:
         print("\n".join(tables(path)))
         return
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for run in runs:
-            writer.writerows(gather(run))
+    write_rows(path, COLUMNS, (row for run in runs for row in gather(run)))
 
 
 if __name__ == "__main__":

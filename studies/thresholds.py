@@ -10,7 +10,6 @@ positives.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -29,7 +28,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, member_scores
 from hypogoal.hypotheses.thresholds import unlabelled_split
 from hypogoal.hypotheses.training import Watcher, fit
-from studies.cells import Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 from studies.hypotheses import METHODS, states_of
 
 Probabilities = NDArray[np.float64]  # of one member
@@ -113,8 +112,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    with path.open(encoding="utf-8", newline="") as file:
-        every = list(csv.DictReader(file))
+    every = read_rows(path)
     choice, test = ([row for row in every if row["layouts"] == layouts] for layouts in ("choice", "test"))
     yield f"Mean member's balanced accuracy: {_seeds(choice)} for choosing, {_seeds(test)} for the test."
     yield ""
@@ -169,10 +167,9 @@ def main() -> None:
     parser = parser_of(__doc__, "0-4")
     parser.add_argument("--layouts", choices=("choice", "test"), default="test")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
-    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+    jobs: Jobs = {
         (arguments.layouts, method, sub_goal, str(seed)): partial(run_cell, arguments.layouts, method, sub_goal, seed)
         for seed in arguments.seeds
         for method in TRAINED

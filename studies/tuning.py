@@ -11,7 +11,6 @@ them.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import tempfile
 import time
@@ -33,7 +32,7 @@ from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.meta.training import judged
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
-from studies.cells import Cell, Row, parser_of, run_cells, table
+from studies.cells import Jobs, Row, parser_of, printed, read_rows, run_cells, table
 
 Settings = PPOSettings | DQNSettings
 Draw = Callable[[np.random.Generator], float | int | str]
@@ -171,9 +170,8 @@ Found = dict[tuple[str, int], dict[int, list[dict[str, str]]]]  # by agent and s
 def read(path: Path) -> Found:
     """The trials there are."""
     search: Found = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            search.setdefault((row["agent"], int(row["step"])), {}).setdefault(int(row["trial"]), []).append(row)
+    for row in read_rows(path):
+        search.setdefault((row["agent"], int(row["step"])), {}).setdefault(int(row["trial"]), []).append(row)
     return search
 
 
@@ -269,7 +267,7 @@ def _numbers(rows: list[dict[str, str]]) -> list[str]:
     return [f"{mean(rows, 'solved'):.3f}", places, f"{mean(rows, 'first'):,.0f}"]
 
 
-def trials(agent: str, numbers: Iterable[int], steps: int) -> dict[Cell, Callable[[], list[Row]]]:
+def trials(agent: str, numbers: Iterable[int], steps: int) -> Jobs:
     """What makes the rows of each of these trials."""
     return {(agent, str(trial), str(steps)): partial(run_trial, agent, trial, steps) for trial in numbers}
 
@@ -277,11 +275,10 @@ def trials(agent: str, numbers: Iterable[int], steps: int) -> dict[Cell, Callabl
 def main() -> None:
     """Run the trials that are not in the file yet."""
     arguments = parser_of(__doc__, "0").parse_args()
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
 
-    def run(jobs: Mapping[Cell, Callable[[], list[Row]]]) -> None:
+    def run(jobs: Jobs) -> None:
         run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda cell: (int(cell[2]),), arguments.workers)
 
     def search(agent: str) -> None:
