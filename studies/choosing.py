@@ -11,6 +11,7 @@ python -m studies.choosing --tables docs/results/choosing-doorkey.csv
 
 from __future__ import annotations
 
+import argparse
 import csv
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
 from hypogoal.evaluation.curves import LEARNED
-from studies.cells import interval, parser_of, read_rows, table
+from studies.cells import interval, table
 
 METHODS = {  # by what the names of artefacts have in them, the longest first
     "dbat-truth-shape": "shape: D-BAT, K = 3",
@@ -98,12 +99,14 @@ def _played(artefact: Artefact) -> list[dict[str, str]]:
 
 def _read(path: Path) -> list[dict[str, str]]:
     """The rows; in files from before there was a policy all options are planned."""
-    rows = read_rows(path)
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
     return [{"policy": "" if row["method"] in BASELINES else PLANNED, **row} for row in rows]
 
 
 def _numbers(run: Path) -> list[dict[str, str]]:
-    return read_rows(run / "evaluation" / "numbers.csv")
+    with (run / "evaluation" / "numbers.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -205,8 +208,11 @@ def _reached(shares: NDArray[np.float64]) -> str:
 
 def main() -> None:
     """Take the numbers of a run, or draw the tables."""
-    parser = parser_of(__doc__, run="the folder of the sweep")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
+    parser.add_argument("csv", type=Path, help="the file of rows")
     parser.add_argument("--baselines", type=Path, help="the folder of the sweep of baselines")
+    parser.add_argument("--tables", action="store_true", help="print the tables only")
     arguments = parser.parse_args()
     if not arguments.tables:
         collect(arguments.run, arguments.csv, arguments.baselines)

@@ -16,6 +16,7 @@ prints the tables of all cells that there are, as Markdown.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
@@ -38,7 +39,7 @@ from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.scores import cross_fitted
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.stages.train_ensemble import score_rows
-from studies.cells import Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -142,7 +143,8 @@ Numbers = dict[Cell, dict[int, dict[str, NDArray[np.float64]]]]  # by step and c
 def read(path: Path, layouts: str) -> Numbers:
     """The finished seeds of some layouts: for each cell, step and column the members' numbers (K,)."""
     numbers: Numbers = {}
-    rows = [row for row in read_rows(path) if row["layouts"] == layouts]
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["layouts"] == layouts]
     for row in rows:
         steps = numbers.setdefault((row["method"], row["sub_goal"], int(row["seed"])), {})
         columns = steps.setdefault(int(row["step"]), {name: np.empty(0) for name in COLUMNS[len(KEYS) :]})
@@ -307,7 +309,8 @@ def main() -> None:
     if arguments.joint:
         print("\n".join(beside_dbat(arguments.csv, arguments.joint)))
         return
-    if printed(arguments, tables):
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
         return
     methods = arguments.methods.split(",")
     chosen = lengths(read(arguments.csv, "choice")) if arguments.chosen else {}
