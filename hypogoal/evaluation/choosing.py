@@ -155,7 +155,7 @@ def view(work: Work) -> dict[str, Any]:
     """Over runs each agent, and ``uniform``: uniform-random choice among its own options."""
     rows = select(work.rows, scope=FROZEN)
     agents = [row for row in rows if row.method != UNIFORM]
-    by_agent = replace(TABLE, by={"name": lambda row: work.agent_of(row.artefact)}, cell=lambda key: (*key, "uniform"))
+    by_agent = replace(TABLE, by={"name": lambda row: work.agent_of[row.artefact]}, cell=lambda key: (*key, "uniform"))
     uniform = {entry["name"]: entry for entry in tabulate(select(rows, method=UNIFORM), by_agent)}
     table = tabulate(agents, TABLE)
     for entry in table:

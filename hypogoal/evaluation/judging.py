@@ -155,12 +155,9 @@ class Work:
         return ensemble_names(configs), method_names(configs)
 
     @cached_property
-    def _agent_names(self) -> dict[str, str]:
+    def agent_of(self) -> dict[str, str]:
+        """The names of agents by their artefacts' paths."""
         return {run.path: name for name, runs in self.agents.items() for run in runs}
-
-    def agent_of(self, path: str) -> str:
-        """The name of the agent whose artefact has this path."""
-        return self._agent_names[path]
 
     def artefact(self, path: str) -> Artefact:
         """The agent's artefact of this path in the run."""

@@ -33,11 +33,6 @@ PARTS = (
 QUESTIONS: list[Question] = [part.QUESTION for part in PARTS]
 
 
-def task_first() -> list[Question]:
-    """In the order of the page: the verdict needs all other numbers, its task comes before them."""
-    return [QUESTIONS[-1], *QUESTIONS[:-1]]
-
-
 def agents_last() -> list[Question]:
     """In the order in which lines are told: where a page begins with the agents, a terminal ends with them."""
     return [*QUESTIONS[1:], QUESTIONS[0]]
@@ -73,7 +68,8 @@ def render(material: Material, version: str) -> str:
     count = len(metrics["provenance"]["artefacts"])
     evaluated = f"{count} artefact{'' if count == 1 else 's'} evaluated"
     subtitle = f"{listed(domains_of(metrics))}; {evaluated}; hypogoal {version}"
-    sections = [section for question in task_first() for section in question.sections(material)]
+    # The verdict needs all other numbers, its task comes before them.
+    sections = [part for question in (QUESTIONS[-1], *QUESTIONS[:-1]) for part in question.sections(material)]
     sections.sort(key=itemgetter("folded"))  # what is open comes first
     lead = {
         "task": " ".join(metrics.get("verdict", {}).get("task", [])),

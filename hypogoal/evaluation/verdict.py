@@ -102,7 +102,8 @@ def findings(work: Work) -> Iterator[Finding]:
     several = [name for name, runs in agents.items() if runs[0].config["members"] > 1]
     single = [name for name, runs in agents.items() if runs[0].config["members"] == 1]
     played_on = partial(select, work.rows, quantity="success", sub_goal="")
-    frozen, trained = played_on(scope=FROZEN) or played_on(scope=NEW_LAYOUTS), at_the_end(work.rows)
+    frozen = played_on(scope=FROZEN) or played_on(scope=NEW_LAYOUTS)
+    trained = played_on(scope="", step="", member="")  # each run's last episodes of training
     uniform = select(frozen, method=UNIFORM)
     learning = [row for name, kind in kinds.items() if kind == RANDOM for row in select(trained, method=name)]
     for name in several:
@@ -117,11 +118,6 @@ def findings(work: Work) -> Iterator[Finding]:
             rows = frozen if played and select(frozen, method=other) else trained
             pairs = paired(select(rows, method=name), select(rows, method=other), "layout", "seed")
             yield from filter(None, [compare(HYPOTHESES, title, ONE, pairs)])
-
-
-def at_the_end(rows: Iterable[Row]) -> list[Row]:
-    """Each run's share of solved episodes among its last of training."""
-    return select(rows, quantity="success", scope="", step="", member="")
 
 
 def on_ladders(work: Work) -> Iterator[Finding]:
@@ -275,8 +271,8 @@ def verdict(metrics: Metrics) -> list[str]:
     if not comparisons and metrics["agents"]:
         best = [agent for agent in metrics["agents"] if agent["success"]["mean"] is not None][:1]
         for agent in best:
-            share = percent(agent["success"]["mean"])
-            lines.append(f"{_capital(titled(agent['name']))}: {share} of the last training episodes solved.")
+            share, name = percent(agent["success"]["mean"]), titled(agent["name"])
+            lines.append(f"{name[:1].upper()}{name[1:]}: {share} of the last training episodes solved.")
         lines.append(
             "Whether hypotheses mattered is unknown: the run has neither uniform-random choice nor an agent with one "
             "classifier to compare with."
@@ -286,10 +282,6 @@ def verdict(metrics: Metrics) -> list[str]:
         lines += options or ["No agent has been trained yet, so no reward has shown which hypotheses transfer."]
         lines += [] if options else list(_of_members(metrics))
     return lines
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _of_options(metrics: Metrics) -> Iterator[str]:

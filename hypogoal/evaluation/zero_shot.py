@@ -118,7 +118,7 @@ def rows(work: Work) -> Iterator[Row]:
             joined = {name: np.concatenate([part[key][name] for part in parts]).tolist() for name in parts[0][key]}
             of_option = len(key) > 1
             where = {"sub_goal": key[0], "member": int(key[1])} if of_option else {}
-            method = UNIFORM if key[0] == UNIFORM else work.agent_of(path)
+            method = UNIFORM if key[0] == UNIFORM else work.agent_of[path]
             for index, layout in enumerate(work.layouts):
                 numbers = {name: joined[name][index] for name in (OF_OPTIONS if of_option else OF_AGENTS)}
                 yield from rows_of(numbers, method=method, **where, layout=layout, **place)
@@ -134,7 +134,7 @@ def view(work: Work) -> dict[str, Any]:
         return {}
 
     def agent(row: Row) -> str:
-        return work.agent_of(row.artefact)
+        return work.agent_of[row.artefact]
 
     rows = select(work.rows, scope=SCOPE)
     by_chooser = Table(

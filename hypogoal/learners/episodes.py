@@ -42,6 +42,14 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
             self.append((self.steps, length, reward, int(terminated), int(succeeded)))
         self._length[over], self._reward[over] = 0, 0.0
 
+    def counts(self) -> dict[str, int]:
+        """Environment steps and episodes so far."""
+        return {"steps": self.steps, "episodes": len(self)}
+
+    def recent(self) -> dict[str, float]:
+        """Success and length over the last episodes."""
+        return {"success": self.success(), "length": self.length()}
+
     def success(self) -> float:
         """Share of the last episodes that succeeded, see ``Step``; NaN before the first."""
         last = self[-LAST:]

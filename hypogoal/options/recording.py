@@ -96,8 +96,7 @@ class Recorder(Resumable):
     def recent(self, *, restarted: bool) -> dict[str, float]:
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
         if not restarted:
-            episodes = self.episodes
-            return {"success": episodes.success(), "length": episodes.length()} if episodes else {}
+            return self.episodes.recent() if self.episodes else {}
         rows = self._executions()
         names = ("reached", "terminated", "duration") if rows else ()
         return {name: sum(getattr(row, name) for row in rows) / len(rows) for name in names}

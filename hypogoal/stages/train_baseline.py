@@ -95,5 +95,4 @@ def train_baseline(
         Episodes.of_rows(env.episodes).write(work.folder)
         save_tensors(work.folder / "policy.safetensors", weights(agent))
         write_layout(work.folder, engine, config.layout_seed, config.random_episodes, seed, **begins)
-    counts = {"steps": env.episodes.steps, "episodes": len(env.episodes)}
-    return counts | {"success": env.episodes.success(), "length": env.episodes.length()}
+    return env.episodes.counts() | env.episodes.recent()

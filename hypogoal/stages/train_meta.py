@@ -74,8 +74,7 @@ def train_meta(
                 recorder.episodes.extend(Episodes.read(practice.path / Episodes.FILE).rows())
         train(loop, config.steps, work.log, work.progress, work.checkpoints)
         write_trained(work.folder, loop, domain, source.config, config, seed)
-    counts = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
-    return counts | {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
+    return recorder.episodes.counts() | recorder.episodes.recent()
 
 
 def steps_spent(practice: Artefact | None) -> dict[str, int]:

@@ -73,11 +73,8 @@ def train_options(
         write_trained(work.folder, loop, domain, source.config, config, seed)
         if config.until:
             settings |= {"ended_at": recorder.steps, "until_reached": solved}  # for the manifest, which comes last
-    counts: dict[str, Any] = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
-    if config.restart_options:
-        counts |= recorder.recent(restarted=True)
-    else:
-        counts |= {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
+    recent = recorder.recent(restarted=True) if config.restart_options else recorder.episodes.recent()
+    counts: dict[str, Any] = {**recorder.episodes.counts(), **recent}
     if config.until:
         goal = f"until={config.until:g}"
         counts["ended"] = f"by {goal}" if solved else f"by the limit, {goal} not reached"
