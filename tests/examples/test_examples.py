@@ -7,13 +7,15 @@ import csv
 import json
 import runpy
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from openings import agrees
 from PIL import Image
+from safetensors.torch import load_file
 from test_docs import blocks, commands
+from torch import nn
 
 from hypogoal import OptionEnv, load_ensemble, load_options
 from hypogoal.cli import main
@@ -210,7 +212,7 @@ def test_key_corridor_goes_through_all_stages(
 
 
 def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec A1-A8, B6, C5, F2: the example's own commands; the page's lines rebuild a member without hypogoal."""
+    """Spec A1-A8, B6, C5, F2: the example's own commands; torch and safetensors alone rebuild a member."""
     example = EXAMPLES / "frozen_backbone.py"
     text = example.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 40
@@ -235,10 +237,18 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
     assert worst < 1e-3
     assert "Attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
     agrees(run, "Take the red key, open the red door", "One run is not evidence")
-    found: dict[str, Any] = {}
-    exec(compile(blocks(EXAMPLES.parent / "docs" / "formats.md", "python")[4], "formats.md", "exec"), found)
-    logits = load_ensemble(run / "ensemble", "collect-red-key").logits(found["images"].numpy())[:, 0]
-    np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-5)
+    member = nn.ModuleDict({"trunk": runpy.run_path(example.name)["vit"]((64, 64, 3)).eval()})
+    member["heads"] = nn.Sequential(nn.Linear(96, 64), nn.ReLU(), nn.Linear(64, 2))
+    weights = load_file(run / "ensemble" / "collect-red-key.safetensors")
+    for part, network in member.items():  # as docs/formats.md names them
+        prefix = f"{part}.0."
+        network.load_state_dict(
+            {name[len(prefix) :]: value for name, value in weights.items() if name.startswith(prefix)}
+        )
+    images = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
+    logits = member["heads"](member["trunk"](images.permute(0, 3, 1, 2) / 255))
+    expected = load_ensemble(run / "ensemble", "collect-red-key").logits(images.numpy())[:, 0]
+    np.testing.assert_allclose(logits.detach().numpy(), expected, atol=1e-5)
 
 
 @pytest.mark.atari
