@@ -1,4 +1,4 @@
-"""Published tables are drawn from the committed cells (Spec F5)."""
+"""Published tables are drawn from the committed cells (Spec F5, H7)."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator

@@ -1,4 +1,4 @@
-"""The benchmark from the command line: real trainings, short."""
+"""The benchmark from the command line: real trainings, short (Spec H1)."""
 
 from __future__ import annotations
 
