@@ -4,8 +4,8 @@ python -m studies.ladder_stops docs/results/figure5-ladders.csv --gather runs/la
 python -m studies.ladder_stops docs/results/figure5-ladders.csv --picture docs/results/figure5-ladders.png --seed 10
 python -m studies.ladder_stops docs/results/figure5-ladders.csv --tables
 
-The executions are those that ``studies.ladder_options`` kept. A row of the CSV is a place where the member stopped whose
-distance to a true base is lowest (the paper's choice), and how often.
+The executions are those that ``studies.ladder_options`` kept. A row of the CSV is a place where the member stopped
+whose distance to a true base is lowest (the paper's choice), and how often.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ def read(path: Path) -> Stops:
 
 
 def spread(stops: NDArray[np.int64]) -> float:
-    """How far executions stop from the middle of their set, RAM units: the mean Manhattan distance to the median place of
-    the room in which most stop, over the stops there.
+    """How far executions stop from the middle of their set, RAM units.
+
+    The mean Manhattan distance to the median place of the room in which most stop, over the stops there.
     """
     rooms, counts = np.unique(stops[:, 0], return_counts=True)
     places = stops[stops[:, 0] == rooms[counts.argmax()], 1:3]
