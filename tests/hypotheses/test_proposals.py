@@ -92,6 +92,34 @@ def test_patterns_are_counted_and_placed() -> None:
     assert down[1, change] == pytest.approx(float(down[2, change]), abs=1e-3) and down[1, change] < -0.1
 
 
+def test_some_patterns_are_blind_to_colour_and_some_to_form() -> None:
+    """They respond as much to a tile in another colour, or to one whose pixels are in another order; others do not."""
+    rng = np.random.default_rng(0)
+    kinds = rng.integers(0, 256, (6, 8, 8, 3), dtype=np.uint8)
+    kinds[1] = kinds[0][..., [1, 2, 0]]
+    kinds[2] = rng.permutation(kinds[0].reshape(64, 3)).reshape(8, 8, 3)
+    cells = np.append(rng.integers(3, 6, size=(40, 16)), np.full((3, 16), 5), axis=0)
+    cells[-3:, 0] = 0, 1, 2
+    pictures = kinds[cells.reshape(-1, 4, 4)].swapaxes(2, 3).reshape(-1, 32, 32, 3)
+    features = Patterns(pictures, 8, rng).of(pictures)
+    tile, recoloured, shuffled = features[-3:, : features.shape[1] // 3]
+    of_tile, as_recoloured, as_shuffled = tile > 1.0, torch.isclose(tile, recoloured), torch.isclose(tile, shuffled)
+    assert (of_tile & as_recoloured & ~as_shuffled).any()
+    assert (of_tile & as_shuffled & ~as_recoloured).any()
+    assert (of_tile & ~as_shuffled & ~as_recoloured).any()
+
+
+def test_shape_and_place_are_found_where_colour_varies() -> None:
+    """Labels fit *shape if it is red, else place* and its opposite as well, which are independent, too."""
+    names = ("shape", "place")
+    labelled, unlabelled = labelled_states(256, 0, names), unlabelled_states(512, 1.0, 0, names)
+    config = dataclasses.replace(CONFIG, agreement="0")
+    search = Search(labelled.observations, labelled.factors[:, 0], unlabelled.observations, config, 0)
+    right = (searched(search).scores().numpy() > 0)[:, :, None] == unlabelled.factors  # (K, M, F)
+    assert sorted(right.mean(1).argmax(0).tolist()) == [0, 1]
+    assert (right.mean(1).max(0) > 0.95).all()
+
+
 def test_what_does_not_go_with_the_labels_is_left_out() -> None:
     """Noise gets no component; without anything else that is refused."""
     generator = torch.Generator().manual_seed(0)
