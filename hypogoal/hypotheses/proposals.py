@@ -23,7 +23,7 @@ from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, at_once
 
-AUTO = "auto"  # the agreement with the least loss
+AUTO = "auto"  # an agreement that no higher one is worth
 AGREEMENTS = (0.0, 0.25, 0.5, 0.75)
 STEPS = 400  # of a search with one agreement
 MOST = 8  # proposals: the table of their predictions has 2^K cells
@@ -37,6 +37,7 @@ NOISE = 2.4  # standard errors: a correlation with the label up to here counts a
 KEPT = 0.999  # share of the variance in the principal components
 RATE, SPREAD = 0.05, 0.7  # Adam's rate; deviation of the logarithm of a start's metric
 TOGETHER, BALANCE, L2 = 3.0, 4.0, 1e-3  # weights of terms of the loss
+WORTH = 2.0  # times less loss: a higher agreement asks less of proposals, so a little less loss says nothing
 RAMP = STEPS // 4  # steps until the first has its full weight
 FLOOR = 0.02  # added to expected shares: a cell hardly expected must not outweigh the others
 
@@ -248,10 +249,10 @@ class Search(Resumable):
             yield self.done
 
     def _keep(self, agreement: float) -> None:
-        """Remember the best of the sets, if none before was better."""
+        """Remember the best of the sets, unless one with a lower agreement has little more loss."""
         with torch.no_grad():
             loss, number = self.losses(agreement, TOGETHER).min(0)
-            if loss.item() < self.loss:
+            if loss.item() < self.loss / WORTH:
                 self.loss, self.agreement = loss.item(), agreement
                 self.best = [values.unflatten(0, (-1, self.members))[number].clone() for values in self.parameters]
 

@@ -18,7 +18,7 @@ from hypogoal.hypotheses import proposals
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.proposals import Patterns, Search, agreements, components, table
 from hypogoal.hypotheses.training import Round, Watcher, fit
-from hypogoal.which_feature.states import labelled_states, unlabelled_states
+from hypogoal.which_feature.states import FACTORS, labelled_states, unlabelled_states
 
 NAMES = ("colour", "place")
 CONFIG = EnsembleConfig(
@@ -39,13 +39,14 @@ def searched(search: Search) -> Search:
 
 
 @pytest.mark.parametrize(("mix", "agreement"), [(1.0, 0.0), (0.5, 0.5)])
+@pytest.mark.parametrize("names", [FACTORS, ("shape", "place")])
 def test_the_loss_says_in_how_many_states_features_agree(
-    mix: float, agreement: float, monkeypatch: pytest.MonkeyPatch
+    mix: float, agreement: float, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of four; it need not be given."""
+    """Of four or two; it need not be given."""
     monkeypatch.setattr(proposals, "AGREEMENTS", (0.0, 0.5))
-    scenes = labelled_states(256, 0), unlabelled_states(512, mix, 0)
-    config = dataclasses.replace(CONFIG, members=4, restarts=16)
+    scenes = labelled_states(256, 0, names), unlabelled_states(512, mix, 0, names)
+    config = dataclasses.replace(CONFIG, members=len(names), restarts=16)
     search = Search(scenes[0].observations, scenes[0].factors[:, 0], scenes[1].observations, config, 3)
     assert searched(search).agreement == agreement
 
