@@ -63,22 +63,28 @@ PER_SIDE = SIDE // TILE
 
 
 def without_hue(pictures: Pictures, rng: np.random.Generator) -> Pictures:
-    """Channels in random order: no member can tell red from blue."""
-    order = rng.permuted(np.tile(np.arange(3), (len(pictures), 1)), axis=1)
-    return np.take_along_axis(pictures, order[:, None, None], axis=3)
+    """The channels of each tile in random order; in one order for all tiles the red agent would show what was red."""
+    tiles = _tiles(pictures)
+    order = rng.permuted(np.tile(np.arange(3), (*tiles.shape[:2], 1)), axis=2)
+    return _picture(np.take_along_axis(tiles, order[:, :, None, None], axis=4))
 
 
 def without_place(pictures: Pictures, rng: np.random.Generator) -> Pictures:
     """Tiles in random order."""
+    tiles = _tiles(pictures)
+    order = rng.permuted(np.tile(np.arange(tiles.shape[1]), (len(tiles), 1)), axis=1)
+    return _picture(np.take_along_axis(tiles, order[..., None, None, None], axis=1))
+
+
+def _tiles(pictures: Pictures) -> Pictures:
+    """The pictures' tiles (N, 36, 8, 8, 3), row by row."""
     rows = pictures.reshape(-1, PER_SIDE, TILE, PER_SIDE, TILE, 3).swapaxes(2, 3)
-    tiles = rows.reshape(-1, PER_SIDE**2, TILE, TILE, 3)
-    order = rng.permuted(np.tile(np.arange(PER_SIDE**2), (len(pictures), 1)), axis=1)
-    return (
-        np.take_along_axis(tiles, order[..., None, None, None], axis=1)
-        .reshape(rows.shape)
-        .swapaxes(2, 3)
-        .reshape(pictures.shape)
-    )
+    return rows.reshape(-1, PER_SIDE**2, TILE, TILE, 3)
+
+
+def _picture(tiles: Pictures) -> Pictures:
+    """The reverse of :func:`_tiles`."""
+    return tiles.reshape(-1, PER_SIDE, PER_SIDE, TILE, TILE, 3).swapaxes(2, 3).reshape(-1, SIDE, SIDE, 3)
 
 
 def without_form(pictures: Pictures, rng: np.random.Generator) -> Pictures:
