@@ -4,6 +4,8 @@ hypogoal run doorkey --preset choosing --out runs/choosing
 python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run which-feature --out runs/which-feature
 python -m studies.choosing runs/which-feature docs/results/which-feature-rooms.csv
+hypogoal run which-feature --preset four --out runs/four
+python -m studies.choosing runs/four docs/results/which-feature-four.csv
 hypogoal sweep examples.preference:preference --out runs/preference
 python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
 python -m studies.choosing --tables docs/results/choosing-doorkey.csv
@@ -23,17 +25,27 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
 from hypogoal.evaluation.curves import LEARNED
-from studies.cells import interval, table
+from hypogoal.which_feature.states import FACTORS
+from studies.cells import difference, interval, table
 
-METHODS = {  # by what the names of artefacts have in them, the longest first
-    "dbat-truth-shape": "shape: D-BAT, K = 3",
-    "divdis-truth-shape": "shape: DivDis, K = 3",
-    "none-truth-shape": "shape: no diversity, K = 3",
-    "one-truth-shape": "shape: one classifier, K = 1",
-    "dbat-truth-place": "place: D-BAT, K = 3",
-    "divdis-truth-place": "place: DivDis, K = 3",
-    "none-truth-place": "place: no diversity, K = 3",
-    "one-truth-place": "place: one classifier, K = 1",
+ENSEMBLES = {
+    "joint": "joint, K = 2",
+    "dbat": "D-BAT, K = 3",
+    "divdis": "DivDis, K = 3",
+    "none": "no diversity, K = 3",
+    "one": "one classifier, K = 1",
+}
+FOUR = {
+    "joint": "joint, K = 4",
+    "dbat": "D-BAT, K = 5",
+    "none": "no diversity, K = 5",
+    "one": "one classifier, K = 1",
+}
+IN_ROOMS = {
+    f"{method}-truth-{truth}": f"{truth}: {title}"
+    for truth, (method, title) in product(("shape", "place", "colour", "count"), ENSEMBLES.items())
+}
+METHODS = IN_ROOMS | {  # by what the names of artefacts have in them, the longest first
     "dbat-k3": "D-BAT, K = 3",
     "none-k3": "no diversity, K = 3",
     "dbat": "D-BAT, K = 6",
@@ -50,8 +62,15 @@ PRACTICE, PRACTISED = (
     "practised",
 )  # steps in the plain world, and whether uniform-random choice solved it by then
 MOST_LAYOUTS = 10  # side by side in a table; more are in the rows alone
-ROOMS = {"third": "", "second": "-second", "first": "-first"}  # settings, by what their files' names end in
+ROOMS = {  # columns, by what their files' names end in
+    "seeds 400 to 409": "-joint",
+    "third setting": "",
+    "second setting": "-second",
+    "first setting": "-first",
+}
 COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
+HIGH = 0.9
+SHARES = "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
 SHOWN = {"success": "solved", "within_rho": "within-rho", "pair": "better of two", "score": "score"}
 
 
@@ -168,31 +187,97 @@ def tables(path: Path) -> Iterator[str]:
         yield from by_layout(practice, practised)
 
 
+def solved_by(rows: list[dict[str, str]], method: str, chooser: str) -> NDArray[np.float64]:
+    """The share of episodes solved in each room, by seed."""
+    wanted = (method, chooser, "success")
+    return np.array([float(r["value"]) for r in rows if (r["method"], r["chooser"], r["quantity"]) == wanted])
+
+
+def _shown(rows: list[dict[str, str]], method: str) -> str:
+    solved, uniform = (solved_by(rows, method, chooser) for chooser in ("agent", "uniform"))
+    return f"{interval(solved, 2)} ({(solved >= HIGH).sum()}) / {uniform.mean():.2f}" if len(solved) else "-"
+
+
 def rooms(path: Path) -> Iterator[str]:
-    """Three settings side by side, and the seeds of the third; every other number is in the rows."""
+    """Settings side by side, joint beside D-BAT, and the seeds of the third; every other number is in the rows."""
     settings = {which: _read(path.with_stem(path.stem + suffix)) for which, suffix in ROOMS.items()}
-
-    def values_of(rows: list[dict[str, str]], method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
-        wanted = (method, chooser, quantity)
-        return np.array([float(r["value"]) for r in rows if (r["method"], r["chooser"], r["quantity"]) == wanted])
-
-    def shown(rows: list[dict[str, str]], method: str) -> str:
-        solved, uniform = (values_of(rows, method, chooser, "success") for chooser in ("agent", "uniform"))
-        many = f"({(solved >= 0.9).sum()})"
-        return f"{interval(solved, 2)} {many} / {uniform.mean():.2f}" if len(solved) else "-"
-
-    methods = [method for method in METHODS if any(row["method"] == method for row in settings["first"])]
-    yield "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
+    methods = [method for method in IN_ROOMS if any(len(solved_by(r, method, "agent")) for r in settings.values())]
+    yield SHARES
     yield ""
-    titles = [f"{which} setting" for which in settings]
-    yield from table(["", *titles], ([METHODS[m], *(shown(rows, m) for rows in settings.values())] for m in methods))
-    yield "Seed by seed, the third setting: the agent."
+    yield from table(["", *settings], ([METHODS[m], *(_shown(rows, m) for rows in settings.values())] for m in methods))
+    newest = settings["seeds 400 to 409"]
+    yield "Joint minus the other, seed by seed, with Student's interval."
     yield ""
-    third = settings["third"]
-    seeds = sorted({row["layout"] for row in third}, key=int)
-    complete = [method for method in methods if len(values_of(third, method, "agent", "success"))]
     yield from table(
-        ["", *seeds], ([METHODS[m], *(f"{v:.2f}" for v in values_of(third, m, "agent", "success"))] for m in complete)
+        ["", "shape", "place"],
+        (
+            [
+                title,
+                *(
+                    difference(
+                        solved_by(newest, f"joint-truth-{truth}", "agent")
+                        - solved_by(newest, f"{method}-truth-{truth}", "agent"),
+                        2,
+                    )
+                    for truth in ("shape", "place")
+                ),
+            ]
+            for method, title in ENSEMBLES.items()
+            if method != "joint" and len(solved_by(newest, f"{method}-truth-shape", "agent"))
+        ),
+    )
+    for which in ("seeds 400 to 409", "third setting"):
+        rows = settings[which]
+        yield f"Seed by seed, {which}: the agent."
+        yield ""
+        seeds = sorted({row["layout"] for row in rows}, key=int)
+        yield from table(
+            ["", *seeds],
+            (
+                [METHODS[m], *(f"{v:.2f}" for v in solved_by(rows, m, "agent"))]
+                for m in methods
+                if len(solved_by(rows, m, "agent"))
+            ),
+        )
+
+
+def four(path: Path) -> Iterator[str]:
+    """One ensemble, four tasks: by the rewarded feature, and on how many seeds an ensemble serves how many of them."""
+    rows = _read(path)
+    solved = {
+        method: np.stack([solved_by(rows, f"{method}-truth-{truth}", "agent") for truth in FACTORS]) for method in FOUR
+    }
+    served = {method: (shares >= HIGH).sum(axis=0) for method, shares in solved.items()}
+    yield SHARES
+    yield ""
+    yield from table(
+        ["", *FACTORS, "tasks at .9, mean", "fewest to most", "seeds with all four"],
+        (
+            [
+                title,
+                *(_shown(rows, f"{method}-truth-{truth}") for truth in FACTORS),
+                f"{served[method].mean():.1f}",
+                f"{served[method].min()} to {served[method].max()}",
+                f"{(served[method] == len(FACTORS)).sum()} of {len(served[method])}",
+            ]
+            for method, title in FOUR.items()
+        ),
+    )
+    yield "Joint minus the other, seed by seed: the mean of the four tasks, with Student's interval."
+    yield ""
+    yield from table(
+        ["", "joint minus it"],
+        (
+            [FOUR[method], difference((solved["joint"] - shares).mean(axis=0), 2)]
+            for method, shares in solved.items()
+            if method != "joint"
+        ),
+    )
+    yield "Joint, seed by seed."
+    yield ""
+    seeds = sorted({row["layout"] for row in rows}, key=int)
+    yield from table(
+        ["", *seeds], ([truth, *(f"{v:.2f}" for v in solved["joint"][place])] for place, truth in enumerate(FACTORS))
     )
 
 
@@ -216,7 +301,10 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.tables:
         collect(arguments.run, arguments.csv, arguments.baselines)
-    drawn = rooms if arguments.csv.stem == "which-feature-rooms" else tables
+    if arguments.csv.stem.startswith("which-feature-rooms"):
+        arguments.csv, drawn = arguments.csv.with_stem("which-feature-rooms"), rooms
+    else:
+        drawn = four if arguments.csv.stem == "which-feature-four" else tables
     print("\n".join(drawn(arguments.csv)))
 
 

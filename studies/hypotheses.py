@@ -20,8 +20,10 @@ import csv
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
+from unittest import mock
 
 import numpy as np
 import torch
@@ -33,7 +35,7 @@ from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from hypogoal.hypotheses import patches
+from hypogoal.hypotheses import patches, proposals
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.scores import cross_fitted
@@ -48,7 +50,11 @@ METHODS: dict[str, dict[str, Any]] = {
     "say-no": {"diversity": "say-no"},
     "cnn": {"members": 1, "diversity": "none"},
 }
-OTHERS: dict[str, dict[str, Any]] = {"joint": {"diversity": "none", "proposals": "joint"}}
+ALONE = "alone"  # proposals one by one: the terms of their independence are left out
+OTHERS: dict[str, dict[str, Any]] = {
+    "joint": {"diversity": "none", "proposals": "joint"},
+    ALONE: {"diversity": "none", "proposals": "joint", "agreement": "0"},
+}
 WEIGHTS = (1e-5, 1e-4, 1e-3, 1e-2)
 LOOKS = (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1300, 1600, 2000, 2600)
 LONG = (150, 600, 1000, 2600)  # looks at the seed that was trained longer
@@ -125,14 +131,15 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
             row |= {f"{name}{half}": scores[name] for name in (OF_HALVES if half else OF_ALL)}
 
     config = dataclasses.replace(EnsembleConfig(steps=looks[-1]), **settings_of(method))
-    fit(
-        data.labelled.observations,
-        data.labelled.labels[:, column],
-        data.unlabelled.observations,
-        config,
-        seed_for(seed, "ensemble", sub_goal),
-        Watcher(look=look, look_at=looks),
-    )
+    with mock.patch.object(proposals, "TOGETHER", 0.0 if method == ALONE else proposals.TOGETHER):
+        fit(
+            data.labelled.observations,
+            data.labelled.labels[:, column],
+            data.unlabelled.observations,
+            config,
+            seed_for(seed, "ensemble", sub_goal),
+            Watcher(look=look, look_at=looks),
+        )
     return list(rows.values())
 
 
@@ -241,20 +248,29 @@ def tables(path: Path) -> Iterator[str]:
     yield from table(["", "all", *every], _differences(test, chosen, tested))
 
 
-def beside_dbat(path: Path, published: Path, steps: int = 150) -> Iterator[str]:
-    """Members taught by proposals minus D-BAT's members with the same seeds, on the test layouts, as a table."""
-    numbers, others = read(path, "test"), read(published, "test")
-    length, seeds = lengths(read(published, "choice"))["dbat"], {seed for _, _, seed in numbers}
-    others = {cell: looks for cell, looks in others.items() if cell[0] == "dbat" and cell[2] in seeds}
-    rows = []
+def beside_others(path: Path, published: Path, steps: int = 150) -> Iterator[str]:
+    """Members taught by proposals minus others of the same seeds, on the test layouts: a table for each score."""
+    numbers, every = read(path, "test") | read(published, "test"), DOMAIN.sub_goals
+    chosen = lengths(read(published, "choice")) | dict.fromkeys(OTHERS, steps)
+    seeds = {method: {seed for name, _, seed in numbers if name == method} for method in chosen}
+
+    def both(name: str, methods: tuple[str, str], goals: Sequence[str]) -> list[NDArray[np.float64]]:
+        shared = set.intersection(*(seeds[method] for method in methods))
+        cells = {cell: looks for cell, looks in numbers.items() if cell[2] in shared}
+        return [by_seed(cells, method, chosen[method], SHOWN[name], goals) for method in methods]
+
     for name in CROSSED:
-        for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
-            ours = by_seed(numbers, "joint", steps, SHOWN[name], goals)
-            dbat = by_seed(others, "dbat", length, SHOWN[name], goals)
-            which = "all" if len(goals) > 1 else goals[0]
-            cells = (interval(ours), interval(dbat), difference(ours - dbat))
-            rows.append([name, which, str(len(ours)), *cells])
-    yield from table(["", "sub-goal", "seeds", "joint", "D-BAT", "joint minus it"], rows)
+        yield f"{name}: its mean, the other's, and differences seed by seed, over sub-goals and for each."
+        yield ""
+        rows = []
+        for methods in (methods for methods in product(OTHERS, chosen) if len(set(methods)) == 2):
+            scores = both(name, methods, every)
+            goals = ([goal] for goal in every)
+            differences = (difference(ours - theirs) for ours, theirs in (both(name, methods, goal) for goal in goals))
+            if len(scores[0]):
+                means = (str(len(scores[0])), *map(interval, scores), difference(scores[0] - scores[1]))
+                rows.append([" minus ".join(methods), *means, *differences])
+        yield from table(["", "seeds", "its", "the other's", "difference", *every], rows)
 
 
 def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> Iterator[str]:
@@ -304,10 +320,10 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
-    parser.add_argument("--joint", type=Path, metavar="CSV", help="print cells of joint beside D-BAT's in this file")
+    parser.add_argument("--joint", type=Path, metavar="CSV", help="print cells of joint beside those in this file")
     arguments = parser.parse_args()
     if arguments.joint:
-        print("\n".join(beside_dbat(arguments.csv, arguments.joint)))
+        print("\n".join(beside_others(arguments.csv, arguments.joint)))
         return
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,8 @@ TEN = CSV.with_name("which-feature-ten.csv")  # seeds 400 to 409
 TEXTURES = CSV.with_name("which-feature-textures.csv")  # the same, other scenes
 TWO = CSV.with_name("which-feature-two.csv")
 SEQUENTIAL = CSV.with_name("which-feature-two-sequential.csv")  # members one after the other
+TWO_TEN = CSV.with_name("which-feature-two-ten.csv")  # seeds 400 to 409
+GIVEN = CSV.with_name("which-feature-two-given.csv")  # the same, joint with the agreement given
 LONG = CSV.with_name("which-feature-long.csv")  # cells of 600 steps instead of 150
 
 
@@ -98,7 +101,9 @@ def tables_of_two(path: Path) -> Iterator[str]:
         for mix in (0.5, 1.0):
             test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS and cell.mix == mix]
             boards[f"{title}, mix {mix:g}"] = test
-    yield from _side_by_side("Test", boards)
+    yield from _side_by_side("Test on five seeds", boards)
+    given = [replace(cell, entry="joint, agreement given") for cell in read_cells(GIVEN)]
+    yield from _against("joint", _by_mix([*read_cells(TWO_TEN), *given]))
 
 
 def _by_mix(cells: Iterable[Scored]) -> dict[str, list[Scored]]:

@@ -29,6 +29,7 @@ from studies import (
     shock,
     thresholds,
     tuning,
+    ways,
     which_feature,
 )
 from studies.cells import difference, interval, run_cells
@@ -59,6 +60,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "which-feature-bandits": bandits.tables,
     "which-feature-rooms": choosing.rooms,
     "which-feature-two": which_feature.tables_of_two,
+    "which-feature-ways": ways.tables,
 }
 
 

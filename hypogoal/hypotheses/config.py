@@ -28,7 +28,7 @@ class EnsembleConfig:
     agreement: str = setting(
         "auto",
         "share of unlabelled states in which all features agree as in labelled ones (proposals=joint): a number from 0 "
-        "to below 1; auto: of 0, .25, .5 and .75 the one whose proposals have the least loss",
+        "to below 1; auto: 0, or .25, .5, .75 where that halves the least loss of proposals",
         source=BEYOND,
     )
     pattern_stride: int = setting(

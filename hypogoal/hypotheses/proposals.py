@@ -23,7 +23,7 @@ from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, at_once
 
-AUTO = "auto"  # the agreement with the least loss
+AUTO = "auto"  # an agreement that no higher one is worth
 AGREEMENTS = (0.0, 0.25, 0.5, 0.75)
 STEPS = 400  # of a search with one agreement
 MOST = 8  # proposals: the table of their predictions has 2^K cells
@@ -37,6 +37,7 @@ NOISE = 2.4  # standard errors: a correlation with the label up to here counts a
 KEPT = 0.999  # share of the variance in the principal components
 RATE, SPREAD = 0.05, 0.7  # Adam's rate; deviation of the logarithm of a start's metric
 TOGETHER, BALANCE, L2 = 3.0, 4.0, 1e-3  # weights of terms of the loss
+WORTH = 2.0  # times less loss: a higher agreement asks less of proposals, so a little less loss says nothing
 RAMP = STEPS // 4  # steps until the first has its full weight
 FLOOR = 0.02  # added to expected shares: a cell hardly expected must not outweigh the others
 
@@ -65,10 +66,19 @@ def search_steps(config: EnsembleConfig) -> int:
     return STEPS * len(agreements(config))
 
 
+def views(channels: int) -> tuple[Tensor, ...]:
+    """What filters see of a patch, each a matrix (d, v): all of it, the mean of its channels, that of its pixels."""
+    of_channels, of_pixels = (torch.full((count, 1), 1 / count) for count in (channels, SIDE**2))
+    grey, colour = torch.kron(of_channels, torch.eye(SIDE**2)), torch.kron(torch.eye(channels), of_pixels)
+    return torch.eye(channels * SIDE**2), grey, colour
+
+
 class Patterns:
     """Features of pictures, without labels: how much there is of each pattern, and on which side.
 
-    Filters are patches of the pictures (N, h, w, C) themselves, whitened (Coates and Ng 2011).
+    Filters are patches of the pictures (N, h, w, C) themselves, whitened (Coates and Ng 2011), in three :func:`views`:
+    as they are, without colour, and their mean colour alone. Only with filters that are blind to colour is *a ball*
+    simpler than *a ball if it is red, else on the right*, which fits labels and independence as well.
     """
 
     def __init__(self, pictures: NDArray[np.uint8], stride: int, rng: np.random.Generator):
@@ -80,16 +90,24 @@ class Patterns:
         some = as_input(torch.from_numpy(pictures[rng.permutation(len(pictures))[:512]]))
         patches = functional.unfold(some, SIDE, stride=stride).mT.reshape(-1, channels * SIDE**2)
         patches = patches[torch.from_numpy(rng.permutation(len(patches))[:SAMPLED])]
-        centre = patches.mean(0)
-        values, vectors = torch.linalg.eigh((patches - centre).T @ (patches - centre) / len(patches))
+        silent = SILENT if stride >= SIDE else OVERLAPPING
+        weights, biases = zip(*(self._filters(patches, view, silent, rng) for view in views(channels)), strict=True)
+        self.weight, self.bias = torch.cat(weights).view(-1, channels, SIDE, SIDE), torch.cat(biases)
+
+    @staticmethod
+    def _filters(patches: Tensor, view: Tensor, silent: float, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Weights (F, d) and biases (F,) of filters that see patches (P, d) through a view (d, v)."""
+        seen = patches @ view
+        centre = seen.mean(0)
+        values, vectors = torch.linalg.eigh((seen - centre).T @ (seen - centre) / len(seen))
         whitening = vectors * (values + 0.01 * values[-1]).clamp(min=1e-9).rsqrt() @ vectors.T
-        distinct = torch.unique(((patches - centre) @ whitening * 1e3).round(), dim=0)
+        distinct = torch.unique(((seen - centre) @ whitening * 1e3).round(), dim=0)
         if len(distinct) > FILTERS:
             most = max(FILTERS, int(STRIKING * len(distinct)))
             distinct = distinct[distinct.norm(dim=1).argsort(descending=True, stable=True)[:most]]
         filters = functional.normalize(distinct[torch.from_numpy(rng.permutation(len(distinct))[:FILTERS])], dim=1)
-        self.weight = (filters @ whitening).view(-1, channels, SIDE, SIDE)
-        self.bias = -(filters @ whitening @ centre) - (SILENT if stride >= SIDE else OVERLAPPING)
+        filters = filters @ whitening
+        return filters @ view.T, -(filters @ centre) - silent
 
     def of(self, pictures: NDArray[np.uint8]) -> Tensor:
         """The features (N, 3 F): each filter's responses summed, right minus left, and bottom minus top."""
@@ -231,10 +249,10 @@ class Search(Resumable):
             yield self.done
 
     def _keep(self, agreement: float) -> None:
-        """Remember the best of the sets, if none before was better."""
+        """Remember the best of the sets, unless one with a lower agreement has little more loss."""
         with torch.no_grad():
             loss, number = self.losses(agreement, TOGETHER).min(0)
-            if loss.item() < self.loss:
+            if loss.item() < self.loss / WORTH:
                 self.loss, self.agreement = loss.item(), agreement
                 self.best = [values.unflatten(0, (-1, self.members))[number].clone() for values in self.parameters]
 

@@ -144,11 +144,15 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
     Entries of one seed have the same states, initial weights and batches.
     """
     test = crossed_states(copies(config.factors), seed, config.factors, DRAW[config.scenes])
-    probabilities = _trained(entry, mix, seed, config_of(entry, config), test)
+    return scored(entry.name, mix, seed, _trained(entry, mix, seed, config_of(entry, config), test), test)
+
+
+def scored(entry: str, mix: float, seed: int, probabilities: NDArray[np.float32], test: Scenes) -> Scored:
+    """The scores of members by their probabilities (N, K) on crossed states."""
     ranked = rankings(probabilities, test.factors)
     at_half, at_best = balanced_accuracies(probabilities, test.factors)
     labels = labels_needed(probabilities, test.factors, ranked, rng_for(seed, "which-feature", "labels"))
-    return Scored(entry.name, mix, seed, ranked, at_half, at_best, labels)
+    return Scored(entry, mix, seed, ranked, at_half, at_best, labels)
 
 
 def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: Scenes) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from hypogoal.hypotheses import proposals
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.proposals import Patterns, Search, agreements, components, table
 from hypogoal.hypotheses.training import Round, Watcher, fit
-from hypogoal.which_feature.states import labelled_states, unlabelled_states
+from hypogoal.which_feature.states import FACTORS, labelled_states, unlabelled_states
 
 NAMES = ("colour", "place")
 CONFIG = EnsembleConfig(
@@ -39,13 +39,14 @@ def searched(search: Search) -> Search:
 
 
 @pytest.mark.parametrize(("mix", "agreement"), [(1.0, 0.0), (0.5, 0.5)])
+@pytest.mark.parametrize("names", [FACTORS, ("shape", "place")])
 def test_the_loss_says_in_how_many_states_features_agree(
-    mix: float, agreement: float, monkeypatch: pytest.MonkeyPatch
+    mix: float, agreement: float, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of four; it need not be given."""
+    """Of four or two; it need not be given."""
     monkeypatch.setattr(proposals, "AGREEMENTS", (0.0, 0.5))
-    scenes = labelled_states(256, 0), unlabelled_states(512, mix, 0)
-    config = dataclasses.replace(CONFIG, members=4, restarts=16)
+    scenes = labelled_states(256, 0, names), unlabelled_states(512, mix, 0, names)
+    config = dataclasses.replace(CONFIG, members=len(names), restarts=16)
     search = Search(scenes[0].observations, scenes[0].factors[:, 0], scenes[1].observations, config, 3)
     assert searched(search).agreement == agreement
 
@@ -90,6 +91,34 @@ def test_patterns_are_counted_and_placed() -> None:
     assert torch.allclose(whole[1], whole[2], atol=1e-3)
     assert across[1, change] > 0.1 and across[2, change] < -0.1
     assert down[1, change] == pytest.approx(float(down[2, change]), abs=1e-3) and down[1, change] < -0.1
+
+
+def test_some_patterns_are_blind_to_colour_and_some_to_form() -> None:
+    """They respond as much to a tile in another colour, or to one whose pixels are in another order; others do not."""
+    rng = np.random.default_rng(0)
+    kinds = rng.integers(0, 256, (6, 8, 8, 3), dtype=np.uint8)
+    kinds[1] = kinds[0][..., [1, 2, 0]]
+    kinds[2] = rng.permutation(kinds[0].reshape(64, 3)).reshape(8, 8, 3)
+    cells = np.append(rng.integers(3, 6, size=(40, 16)), np.full((3, 16), 5), axis=0)
+    cells[-3:, 0] = 0, 1, 2
+    pictures = kinds[cells.reshape(-1, 4, 4)].swapaxes(2, 3).reshape(-1, 32, 32, 3)
+    features = Patterns(pictures, 8, rng).of(pictures)
+    tile, recoloured, shuffled = features[-3:, : features.shape[1] // 3]
+    of_tile, as_recoloured, as_shuffled = tile > 1.0, torch.isclose(tile, recoloured), torch.isclose(tile, shuffled)
+    assert (of_tile & as_recoloured & ~as_shuffled).any()
+    assert (of_tile & as_shuffled & ~as_recoloured).any()
+    assert (of_tile & ~as_shuffled & ~as_recoloured).any()
+
+
+def test_shape_and_place_are_found_where_colour_varies() -> None:
+    """Labels fit *shape if it is red, else place* and its opposite as well, which are independent, too."""
+    names = ("shape", "place")
+    labelled, unlabelled = labelled_states(256, 0, names), unlabelled_states(512, 1.0, 0, names)
+    config = dataclasses.replace(CONFIG, agreement="0")
+    search = Search(labelled.observations, labelled.factors[:, 0], unlabelled.observations, config, 0)
+    right = (searched(search).scores().numpy() > 0)[:, :, None] == unlabelled.factors  # (K, M, F)
+    assert sorted(right.mean(1).argmax(0).tolist()) == [0, 1]
+    assert (right.mean(1).max(0) > 0.95).all()
 
 
 def test_what_does_not_go_with_the_labels_is_left_out() -> None:
