@@ -135,12 +135,10 @@ def lines_of(found: Sequence[dict[str, Any]]) -> list[str]:
     lines = []
     for part in found:
         worst = max(part["members"], key=lambda row: row["false_positives"])
-        many = "their threshold" if len(part["members"]) > 1 else "its threshold"
         lines.append(
             f"{part['sub_goal']}: members disagree in {part['disagreement']:.1%} of {part['unlabelled']:,} unlabelled "
-            f"states; "
-            f"{worst['false_positives']} of {worst['negatives']} known negatives are above {many} "
-            f"(member {worst['member']}, the highest {worst['highest_negative']:.2f})"
+            f"states; of {worst['negatives']} known failures member {worst['member']} predicts "
+            f"{worst['false_positives']} positive (highest probability {worst['highest_negative']:.2f})"
         )
     return lines
 
