@@ -77,7 +77,8 @@ def test_every_kind_has_a_card(tmp_path: Path) -> None:
 
     texts = tomllib.loads((Path(hypogoal.__file__).parent / "cards.toml").read_text(encoding="utf-8"))
     kinds = texts.keys() - {"text"}
-    assert {"ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit"} == kinds
+    audits = {"audit", "recorded-audit"}
+    assert {"ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison"} | audits == kinds
     options = {"sub_goals": ["one"], "termination": "learned"}
     for kind in ("options", "report"):
         with create_artefact(tmp_path / kind, kind=kind, config=options, seed=0) as folder:

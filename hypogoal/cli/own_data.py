@@ -32,7 +32,10 @@ def import_(
     ] = None,
     label: Annotated[
         list[str] | None,
-        Option(metavar="NAME=RULE", help="Episodes: a column, last:N frames, FILE.csv; Minari: MODULE:FUNCTION."),
+        Option(
+            metavar="NAME=RULE",
+            help="Episodes: a column, last:N frames, FILE.csv; Minari: MODULE:FUNCTION; data file: FILE.csv.",
+        ),
     ] = None,
     key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
     every: Annotated[int, Option(min=1, help="Episodes: take every N-th frame.")] = 1,
@@ -122,6 +125,10 @@ def export(
 def label(
     source: Annotated[str, Argument(help=f"To look at: a data file, .npz file or folder of images; to play: {PLAYED}")],
     out: Annotated[Path, Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
+    next_: Annotated[
+        int, Option("--next", min=0, help="Of an audit's folder: the first N states to label; --out is a .csv file.")
+    ] = 0,
+    sub_goal: Annotated[str | None, Option(help="Of an audit of several sub-goals: which.")] = None,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
     arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
@@ -135,7 +142,15 @@ def label(
     """
     from hypogoal.core import own_code
     from hypogoal.stages.label import label as stage
+    from hypogoal.stages.label import label_next
 
+    if next_:
+        counts, data, goal = label_next(Path(source), out, count=next_, sub_goal=sub_goal, resume=resume)
+        say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
+        more = data.with_name(f"{data.stem}-more.h5")
+        cli.print_next(False, "import", data, "--label", f"{goal}={out}", "--out", more)
+        give(out)
+        return
     with own_code.given(source):
         counts = stage(
             source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout,

@@ -9,6 +9,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from hypogoal.cli import common as cli
+from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import draw, give, say
 from hypogoal.settings import configuration
 from hypogoal.stages import domain_of, inherited_of
@@ -100,21 +101,48 @@ def train_baseline(
 def audit(
     call: cli.StageCall,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
-    domain: Annotated[str, Option(help=f"Where to play: {cli.DOMAINS}", autocompletion=cli.offer("domain"))],
-    sub_goal: Annotated[str, Option(help="The domain's sub-goal that is the truth.")],
+    domain: Annotated[
+        str | None,
+        Option(help="Where to play; without it, look at recorded data.", autocompletion=cli.offer("domain")),
+    ] = None,
+    sub_goal: Annotated[str | None, Option(help="The domain's sub-goal that is the truth.")] = None,
     member: Annotated[int, Option(min=0, help="Which member of the ensemble.")] = 0,
 ) -> None:
-    """How often, and where, do policies fool a success classifier?"""
+    """How often, and where, do policies fool a success classifier?
+
+    Without --domain: where do members disagree on the data that they were
+    trained with, which failures come first, which states to label next?
+    """
     from hypogoal.core import own_code
     from hypogoal.evaluation.audit import lines_of
     from hypogoal.stages.audit import audit as audited
 
+    if domain is None:
+        _audit_recorded(call, classifier, sub_goal)
+        return
+    if sub_goal is None:
+        raise UserError("which sub-goal is the truth?", domain, "Give --sub-goal NAME.")
     config = call.config(domain, by_user=True)
     with own_code.given(classifier, domain):
         rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member, **call.how)
     for line in () if call.how["quiet"] else lines_of(rates):
         say(line)
     call.end({})
+
+
+def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None) -> None:
+    from hypogoal.stages.audit_recorded import audit_recorded, lines_of
+
+    if not Path(source).is_dir() or call.settings or call.preset or call.how["resume"]:
+        do = "Give --domain and --sub-goal, or an ensemble's folder and no settings."
+        raise UserError("recorded data are audited of ensembles, without settings", source, do)
+    how = {name: call.how[name] for name in ("force", "quiet", "device")}
+    found = audit_recorded(Path(source), call.out, sub_goal=sub_goal, **how)
+    for line in () if call.how["quiet"] else lines_of(found):
+        say(line)
+    table = call.out / "labels.csv"
+    cli.print_next(call.how["quiet"], "label", call.out, "--next", 20, "--out", table)
+    give(call.out / "index.html")
 
 
 @cli.command(cli.MAKE, "evaluate runs/mine")

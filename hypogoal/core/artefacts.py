@@ -51,7 +51,7 @@ class Artefact:
 
     @property
     def kind(self) -> str:
-        """ensemble, options, meta, baseline, evaluation, report, comparison or audit."""
+        """ensemble, options, meta, baseline, evaluation, report, comparison, audit or recorded-audit."""
         return str(self.manifest["kind"])
 
     @property
@@ -154,11 +154,16 @@ def check_kind(out: Path, kind: str) -> None:
             reason = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
             raise UserError(f"the existing output is not of kind {kind!r}: {reason}", out, AWAY)
         return
-    with open_file(out, "the existing output is", AWAY) as file:
+    if not begins_as(out, kind):
+        raise UserError(f"the existing output is not of kind {kind!r}: another file", out, AWAY)
+
+
+def begins_as(path: Path, kind: str) -> bool:
+    """Whether a file begins as those of a kind do, data or arrays, even if the rest is cut off."""
+    with open_file(path, "the file is", AWAY) as file:
         begin = file.read(FRONT)
     signature, content = SIGNATURES.get(kind, (b"", b""))
-    if not signature or not begin.startswith(signature) or content not in begin:
-        raise UserError(f"the existing output is not of kind {kind!r}: another file", out, AWAY)
+    return bool(signature) and begin.startswith(signature) and content in begin
 
 
 def _manifest_kind(folder: Path) -> str:

@@ -23,6 +23,7 @@ from hypogoal.dataset import open_dataset
 from hypogoal.domains.gymnasium_engine import begun, make_checked, reader_of, stepped
 from hypogoal.own_data.arrays import read_states
 from hypogoal.own_data.images import image_files, read_image, size_text
+from hypogoal.own_data.marks import MarkedTable
 
 KINDS = ("positive", "negative", "unlabelled")
 HEIGHT = 520  # pixels of a picture, about
@@ -116,7 +117,7 @@ def _encoded(state: NDArray[np.uint8]) -> tuple[str, bytes]:
     return ".npy", file.getvalue()
 
 
-def mark_states(source: Source, marks: Marks, sub_goal: str) -> None:
+def mark_states(source: Source, marks: Marks | MarkedTable, sub_goal: str) -> None:
     """Show the states of ``source`` and mark them by keyboard until the window is closed.
 
     A missing screen or pygame is a ``UserError``.
@@ -144,7 +145,12 @@ def mark_states(source: Source, marks: Marks, sub_goal: str) -> None:
 
 
 def _lines(
-    source: Source, marks: Marks, sub_goal: str, mode: str | None, keys: dict[str, str], current: str | None
+    source: Source,
+    marks: Marks | MarkedTable,
+    sub_goal: str,
+    mode: str | None,
+    keys: dict[str, str],
+    current: str | None,
 ) -> list[tuple[str, tuple[int, int, int]]]:
     """The lines below the picture, each with its colour."""
     counts = ", ".join(f"{count} {kind}" for kind, count in marks.counts().items())

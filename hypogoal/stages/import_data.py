@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core import own_code
-from hypogoal.core.artefacts import ARRAYS, DATA, claim
+from hypogoal.core.artefacts import ARRAYS, DATA, begins_as, claim
 from hypogoal.core.errors import UserError, printable
 from hypogoal.core.files import replacing
 from hypogoal.core.own_code import load_own
@@ -16,6 +16,7 @@ from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays, write_arrays
 from hypogoal.own_data.images import read_images
 from hypogoal.own_data.lerobot import INFO, LeRobot
+from hypogoal.own_data.marks import with_marks
 from hypogoal.own_data.minari import MINARI, read_minari
 from hypogoal.own_data.parts import Resize, collected_of, resize_of
 from hypogoal.own_data.recordings import Recording, recorded_parts
@@ -43,15 +44,18 @@ def import_data(
     """Write the states of ``source`` into the data file ``out``; returns numbers of states and positives.
 
     ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or episodes: a folder with a Minari
-    dataset, a LeRobotDataset or mp4 files, or an HDF5 file of robomimic's. ``sub_goals`` are names in the order of the
-    labels' columns. For episodes ``labels`` maps sub-goals to what labels them: in a Minari dataset
-    ``module:function``, from an observation to a truth value, else see :func:`recorded_parts`; ``keys`` select parts of
-    observations, and ``every`` n-th frame is taken. Without held-out states a ``share`` of the labelled ones is held
-    out by ``seed``. ``resize``: at most so many pixels on the longer side of pictures; 0: unchanged. ``stack``: axes of
-    frames and colours become channels. ``domain`` is for later stages. Errors: see ``hypogoal.own_data``.
+    dataset, a LeRobotDataset or mp4 files, or an HDF5 file of robomimic's. Or it is a data file, and ``labels`` maps
+    its sub-goal to a table of :mod:`hypogoal.own_data.marks`, whose states move to the labelled ones. ``sub_goals`` are
+    names in the order of the labels' columns. For episodes ``labels`` maps sub-goals to what labels them: in a Minari
+    dataset ``module:function``, from an observation to a truth value, else see :func:`recorded_parts`; ``keys`` select
+    parts of observations, and ``every`` n-th frame is taken. Without held-out states a ``share`` of the labelled ones
+    is held out by ``seed``. ``resize``: at most so many pixels on the longer side of pictures; 0: unchanged. ``stack``:
+    axes of frames and colours become channels. ``domain`` is for later stages. Errors: see ``hypogoal.own_data``.
     """
     rules = labels or {}
     claim(out, kind=DATA, inputs=[source], force=force)
+    if source.is_file() and begins_as(source, DATA):
+        return _marked(source, out, rules, seed=seed, force=force)
     if (source / MINARI).exists():
         functions = [load_own(name, "label function", LABELS, {}) for name in rules.values()]
         parts, sub_goals = read_minari(source, functions, keys=keys, seed=seed), tuple(rules)
@@ -73,6 +77,18 @@ def import_data(
     config |= ({"labels": dict(rules)} if rules else {}) | ({"resize": resize} if resize else {})
     config |= {"every": every} if every > 1 else {}
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
+    return open_dataset(out).counts()
+
+
+def _marked(source: Path, out: Path, rules: Mapping[str, str], *, seed: int, force: bool) -> dict[str, Any]:
+    """Write a data file's states again, with those labelled that a table labels."""
+    dataset = open_dataset(source)
+    if len(rules) != 1:
+        raise UserError("a data file has labels already", source, "Give --label NAME=TABLE.csv for more of them.")
+    [(sub_goal, table)] = rules.items()
+    collected, count = with_marks(dataset, Path(table), sub_goal)
+    config = dataset.config | {"marked": dataset.config.get("marked", 0) + count}
+    write_dataset(out, collected, domain=dataset.domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()
 
 

@@ -9,12 +9,15 @@ from typing import Any
 import gymnasium
 
 from hypogoal.core import own_code
+from hypogoal.core.artefacts import DATA, open_artefact
 from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.dataset import require_names
+from hypogoal.dataset import digest, open_dataset, require_names
 from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS, Domain
+from hypogoal.evaluation.recorded import picture_of
 from hypogoal.own_data.marking import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
+from hypogoal.own_data.marks import MarkedTable, read_marks
 
 HELD_OUT = "heldout"
 
@@ -57,6 +60,42 @@ def label(
                 played = [{"layout_seed": seed, "actions": actions} for seed, actions in states.recorded if actions]
                 replace_text(record, json.dumps(played) + "\n")
         return marks.counts()
+
+
+def label_next(
+    audit: Path, out: Path, *, count: int, sub_goal: str | None = None, resume: bool = False
+) -> tuple[dict[str, int], Path, str]:
+    """Show the first ``count`` states that an audit of recorded data proposes and save a person's marks in a table.
+
+    Returns the number of marked states of each kind, the data file and the sub-goal. ``out`` is the table, a .csv file
+    for ``import``; with ``resume`` its marks are kept. Something else than such an audit, an unknown sub-goal, data
+    that are gone or no pictures, and a missing screen are a ``UserError``.
+    """
+    artefact = open_artefact(audit, "recorded-audit").whole()
+    goals = artefact.config["sub_goals"]
+    if (sub_goal or goals[0]) not in goals or (sub_goal is None and len(goals) > 1):
+        raise UserError("which sub-goal?", audit, f"Give --sub-goal, one of {', '.join(goals)}.")
+    goal, data = sub_goal or goals[0], artefact.input(DATA)
+    if out.suffix != ".csv":
+        raise UserError("--next writes a table", out, "Give --out NAME.csv.")
+    if out.exists() and not resume:
+        raise UserError("the table exists already", out, "Give --resume to continue it, or another --out.")
+    rows = read_marks(out if out.exists() else audit / "next" / f"{goal}.csv")[:count]
+    states = open_dataset(data).unlabelled()
+    places = [int(row["row"]) for row in rows]
+    if any(
+        place >= len(states) or digest(states[place]).hex() != row["digest"]
+        for place, row in zip(places, rows, strict=True)
+    ):
+        raise UserError("the table is of other data", out, "Give another --out.")
+    pictures = [picture for place in places if (picture := picture_of(states[place])) is not None]
+    if len(pictures) < len(places) or not places:
+        raise UserError("only states with pictures can be shown", data, "Fill in the labels of its table by a script.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with sole_writer(out):
+        marks = MarkedTable(out, rows, pictures)
+        mark_states(Recorded(pictures), marks, goal)
+        return marks.counts(), data, goal
 
 
 def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:

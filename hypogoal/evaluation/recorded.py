@@ -1,0 +1,190 @@
+"""What recorded states say about a success classifier, without a simulator: where members disagree, which failures a
+policy would be drawn to, what a prediction hangs on, and which states to label next (Spec I6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
+
+from hypogoal.dataset import PICTURE, Observations, States, fields_of, numbers_of, standard_of, standardised
+from hypogoal.domains.observations import resized_picture
+from hypogoal.evaluation.pictures import brightness, reduced
+from hypogoal.hypotheses.thresholds import log_odds_of
+
+GRID = 16  # areas along a side of a picture, whose means are compared
+DIRECTIONS = 16  # of the states' largest variance
+NEIGHBOURS = 10  # whose distance says how dense states are
+MOST = 4_000  # states that are compared, spread evenly
+PATCHES = 6  # along a side of a picture
+FRAME = (240, 160, 0)  # around the patch that turns a prediction
+Predict = Callable[[Observations], NDArray[np.floating]]  # observations (N, *obs) -> probabilities (N, K)
+
+
+def spread(count: int, most: int = MOST) -> NDArray[np.int64]:
+    """All rows of ``count``, or ``most`` spread evenly."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
+def sketches_of(observations: Observations) -> NDArray[np.float64]:
+    """Observations (N, *obs) as few numbers (N, D), alike where states look alike: the directions of largest variance.
+
+    A picture counts as much as all numbers together.
+    """
+    numbers = numbers_of(observations)
+    parts = [standardised(numbers, *standard_of(numbers.shape[1:], numbers))]
+    for key, (dtype, shape) in fields_of(observations.shape[1:], observations.dtype).items():
+        if dtype == PICTURE:
+            pictures = observations[key] if key else observations
+            sides = [min(GRID, side) for side in shape[:2]]
+            parts.append(np.stack([resized_picture(picture, *sides).ravel() for picture in pictures]) / 255.0)
+    weighed = [part / (np.sqrt(part.var(0).sum()) or 1.0) for part in parts if part.shape[1]]
+    values = np.concatenate(weighed, axis=1).astype(np.float64)
+    values -= values.mean(0)
+    _, directions = np.linalg.eigh(values.T @ values)
+    return values @ directions[:, ::-1][:, :DIRECTIONS]
+
+
+def disagreement(probabilities: NDArray[np.floating], thresholds: NDArray[np.floating]) -> NDArray[np.float64]:
+    """How much members' predictions (N, K) differ, 0 to 1: the mean over pairs, each about its own threshold (K,).
+
+    Of one member how near it is to its threshold, 1 there.
+    """
+    about = 1 / (1 + np.exp(log_odds_of(thresholds) - log_odds_of(probabilities)))
+    if about.shape[1] == 1:
+        return 1 - np.abs(2 * about[:, 0] - 1)
+    pairs = combinations(range(about.shape[1]), 2)
+    return np.mean([np.abs(about[:, first] - about[:, second]) for first, second in pairs], axis=0)
+
+
+def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """The rows of ``count`` states to label next, best first: disputed, like many others, unlike those before.
+
+    The score (N,) times the density (1 where the ten nearest are as far as usual) times how far the nearest row before
+    is (0 there, 1 at the usual distance of two states).
+    """
+    count, neighbours = min(count, len(scores)), min(NEIGHBOURS + 1, len(scores))
+    near = KDTree(sketches).query(sketches, neighbours)[0].reshape(len(scores), -1).mean(1)
+    values = scores * np.exp(1 - near / (np.median(near) or 1.0))
+    some = sketches[spread(len(sketches), 500)]
+    usual = float(np.median(cdist(some, some))) or 1.0
+    rows: list[int] = []
+    apart = np.ones(len(scores))
+    for _ in range(count):
+        left = np.where(np.isin(np.arange(len(scores)), rows), -1.0, values * apart)
+        rows.append(int(left.argmax()))
+        distance = np.linalg.norm(sketches - sketches[rows[-1]], axis=1) / usual
+        apart = np.minimum(apart, 1 - np.exp(-(distance**2)))
+    return np.array(rows, np.int64)
+
+
+def tempting(states: States, probabilities: NDArray[np.floating], count: int) -> NDArray[np.int64]:
+    """The rows of the negatives that a member scores (N,) highest, highest first: where a policy would be drawn to."""
+    negatives = np.flatnonzero(~states.labels)
+    return negatives[np.argsort(-probabilities[negatives], kind="stable")][:count]
+
+
+def opposite_pairs(
+    sketches: NDArray[np.float64], positive: NDArray[np.bool_], count: int
+) -> list[tuple[int, int, float]]:
+    """The nearest states with opposite predictions (N,): rows of a positive and a negative, distance; each once."""
+    positives, negatives = np.flatnonzero(positive), np.flatnonzero(~positive)
+    if not len(positives) or not len(negatives):
+        return []
+    distances, nearest = KDTree(sketches[negatives]).query(sketches[positives])
+    pairs, taken = [], set()
+    for row in np.argsort(distances, kind="stable"):
+        if (other := int(negatives[nearest[row]])) not in taken:
+            taken.add(other)
+            pairs.append((int(positives[row]), other, float(distances[row])))
+    return pairs[:count]
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The patch whose exchange lowers a member's probability most."""
+
+    key: str  # of the picture, empty if it is the whole observation
+    box: tuple[int, int, int, int]  # top, left, bottom, right: pixels
+    before: float
+    after: float
+
+
+def turning_patch(state: Observations, other: Observations, member: int, predict: Predict) -> Turned | None:
+    """Which of 6 x 6 patches of ``state`` (*obs) says most of a member's positive prediction: exchanged for the same
+    patch of ``other`` (*obs), it lowers the probability most. None without pictures.
+    """
+    boxes = list(_boxes(state))
+    changed = np.repeat(state[None], len(boxes) + 1, axis=0)
+    for number, (key, (top, left, bottom, right)) in enumerate(boxes):
+        pictures, source = (changed[key], other[key]) if key else (changed, other)
+        pictures[number, top:bottom, left:right] = source[top:bottom, left:right]
+    if not boxes:
+        return None
+    *after, before = predict(changed)[:, member].tolist()
+    lowest = int(np.argmin(after))
+    return Turned(*boxes[lowest], before, after[lowest])
+
+
+def _boxes(state: Observations) -> Iterator[tuple[str, tuple[int, int, int, int]]]:
+    for key, (dtype, shape) in fields_of(state.shape, state.dtype).items():
+        if dtype == PICTURE:
+            rows, columns = (np.linspace(0, side, min(PATCHES, side) + 1).astype(int).tolist() for side in shape[:2])
+            for top, bottom in pairwise(rows):
+                for left, right in pairwise(columns):
+                    yield key, (top, left, bottom, right)
+
+
+def picture_of(state: Observations, turned: Turned | None = None) -> NDArray[np.uint8] | None:
+    """A state's pictures side by side, uint8 (H, W, 3), the patch that turned a prediction framed; None without any."""
+    parts = []
+    for key, (dtype, _) in fields_of(state.shape, state.dtype).items():
+        if dtype == PICTURE:
+            picture = np.array(state[key] if key else state)
+            coloured = picture if picture.shape[2] == 3 else np.repeat(brightness(picture)[..., None], 3, axis=2)
+            if turned and key == turned.key:
+                top, left, bottom, right = turned.box
+                width = max(1, max(coloured.shape[:2]) // 64)
+                for rows, columns in (
+                    (slice(top, top + width), slice(left, right)),
+                    (slice(bottom - width, bottom), slice(left, right)),
+                    (slice(top, bottom), slice(left, left + width)),
+                    (slice(top, bottom), slice(right - width, right)),
+                ):
+                    coloured[rows, columns] = FRAME
+            parts.append(reduced(coloured))
+    if not parts:
+        return None
+    height = max(len(part) for part in parts)
+    padded = [np.pad(part, ((0, height - len(part)), (0, 0), (0, 0)), constant_values=255) for part in parts]
+    return np.concatenate(padded, axis=1)
+
+
+def member_findings(
+    known: States, known_scores: NDArray[np.floating], scores: NDArray[np.floating], thresholds: Sequence[float]
+) -> list[dict[str, Any]]:
+    """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
+    positive, found = scores > np.asarray(thresholds), []
+    negatives = ~known.labels
+    for member, threshold in enumerate(thresholds):
+        wrong = known_scores[negatives, member] > threshold
+        others = np.delete(positive, member, axis=1).any(1)
+        found.append(
+            {
+                "member": member,
+                "threshold": float(threshold),
+                "negatives": int(negatives.sum()),
+                "false_positives": int(wrong.sum()),
+                "highest_negative": float(known_scores[negatives, member].max(initial=0.0)),
+                "positive_unlabelled": float(positive[:, member].mean()),
+                "positive_alone": float((positive[:, member] & ~others).mean()),
+            }
+        )
+    return found

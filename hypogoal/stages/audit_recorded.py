@@ -1,0 +1,224 @@
+"""Spec I6: an audit of an ensemble on its recorded data, where there is no simulator to play in."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.cards import create_artefact
+from hypogoal.core.artefacts import Artefact, claim, open_artefact, versions
+from hypogoal.core.compute import prepare
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import write_table
+from hypogoal.core.progress import Progress
+from hypogoal.dataset import Observations, States, digest, joined, open_dataset
+from hypogoal.evaluation import page, recorded
+from hypogoal.evaluation.numbers import plain
+from hypogoal.evaluation.page import Block
+from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
+from hypogoal.own_data.marks import COLUMNS
+
+SHOWN = 4  # negatives and pairs of a member on the page
+NEXT = 100  # states in the table of those to label next; the page shows
+CARDS = 20
+
+
+@dataclass(frozen=True)
+class Look:
+    """One sub-goal's ensemble on its data."""
+
+    sub_goal: str
+    ensemble: Ensemble
+    known: States  # labelled and held out
+    known_scores: NDArray[np.float32]  # (N, K)
+    unlabelled: Observations  # (M, *obs)
+    scores: NDArray[np.float32]  # (M, K)
+
+    @property
+    def thresholds(self) -> NDArray[np.float32]:
+        """Of the members, (K,)."""
+        return self.ensemble.thresholds.cpu().numpy()
+
+
+def audit_recorded(
+    source: Path,
+    out: Path,
+    *,
+    sub_goal: str | None = None,
+    force: bool = False,
+    quiet: bool = False,
+    device: str = "auto",
+) -> list[dict[str, Any]]:
+    """Audit the members of the ensemble artefact ``source`` on the data file that it was trained on; write ``out``.
+
+    ``audit.json``, the page ``index.html`` and, for each sub-goal (or the one that is named), ``next/SUB_GOAL.csv``:
+    the unlabelled states to label next, best first. Returns each sub-goal's part of ``audit.json``. An unknown
+    sub-goal, data that are gone or have no unlabelled states, and an ``out`` that exists are a ``UserError``.
+    """
+    device, artefact = prepare(device), open_artefact(source, "ensemble").whole()
+    goals = artefact.config["sub_goals"]
+    if sub_goal is not None and sub_goal not in goals:
+        raise UserError("unknown sub-goal", sub_goal, f"{source} has {', '.join(goals)}.")
+    goals = [sub_goal] if sub_goal is not None else goals
+    data = artefact.input("data")
+    out = claim(out, kind="recorded-audit", inputs=[source, data], force=force)
+    card: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": list(goals)}, "seed": 0}
+    with (
+        create_artefact(out, **card, inputs=[source, data], force=force) as folder,
+        Progress("audit", len(goals), quiet=quiet) as progress,
+    ):
+        (folder / "next").mkdir()
+        found, sections = [], []
+        for goal in goals:
+            look = look_at(artefact, data, goal, device)
+            part, section = findings(look, folder / "next" / f"{goal}.csv")
+            found.append(part)
+            sections.append(section)
+            progress.advance()
+        (folder / "audit.json").write_text(json.dumps(plain({"sub_goals": found}), indent=1) + "\n", encoding="utf-8")
+        lead = {"task": "", "verdict": lines_of(found), "baselines": "", "films": [], "question": ""}
+        version = versions().get("hypogoal", "unknown")
+        text = page.draw_page(
+            f"hypogoal: audit of {source.name}", f"recorded data; hypogoal {version}", sections, version, lead
+        )
+        (folder / "index.html").write_text(text, encoding="utf-8")
+    return found
+
+
+def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
+    """The members' predictions of all labelled and held-out states, and of unlabelled ones spread over the file."""
+    dataset, ensemble = open_dataset(data), read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
+    if ensemble.needs_positions:
+        raise UserError("members need the agent's positions (localiser=ram)", artefact.path, "Train with another view.")
+    parts = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
+    known = joined([States(part.observations, part.labels) for part in parts])
+    unlabelled = dataset.unlabelled()
+    if not len(unlabelled):
+        raise UserError("there are no unlabelled states to audit on", data, "Import or collect some.")
+    return Look(
+        sub_goal, ensemble, known, ensemble.predict(known.observations), unlabelled, ensemble.predict(unlabelled)
+    )
+
+
+def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
+    """A sub-goal's numbers and its section of the page; the states to label next go into ``table``."""
+    rows = recorded.spread(len(look.unlabelled))  # the states that are compared
+    states, scores = look.unlabelled[rows], look.scores[rows]
+    sketches = recorded.sketches_of(states)
+    disputed = recorded.disagreement(scores, look.thresholds)
+    following = recorded.to_label(disputed, sketches, NEXT)
+    members = recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist())
+    positive = scores > look.thresholds
+    disagree = (positive.any(1) & ~positive.all(1)).mean()
+    write_table(
+        table,
+        COLUMNS,
+        [[int(rows[row]), digest(states[row]).hex(), "", round(float(disputed[row]), 4)] for row in following],
+    )
+    numbers = {
+        "sub_goal": look.sub_goal,
+        "known": len(look.known.labels),
+        "unlabelled": len(look.unlabelled),
+        "disagreement": float(disagree),
+        "members": members,
+        "next": [int(rows[row]) for row in following[:CARDS]],
+    }
+    return numbers, _section(look, numbers, rows, sketches, following, disputed)
+
+
+def lines_of(found: Sequence[dict[str, Any]]) -> list[str]:
+    """The findings in a few lines, for the page and the terminal."""
+    lines = []
+    for part in found:
+        worst = max(part["members"], key=lambda row: row["false_positives"])
+        lines.append(
+            f"{part['sub_goal']}: members disagree in {part['disagreement']:.1%} of {part['unlabelled']:,} unlabelled "
+            f"states; of {worst['negatives']} known failures member {worst['member']} predicts "
+            f"{worst['false_positives']} positive (highest probability {worst['highest_negative']:.2f})"
+        )
+    return lines
+
+
+def _section(
+    look: Look,
+    numbers: dict[str, Any],
+    rows: NDArray[np.int64],
+    sketches: NDArray[np.float64],
+    following: NDArray[np.int64],
+    disputed: NDArray[np.float64],
+) -> Block:
+    columns = [
+        page.label("member", lambda row: str(row["member"])),
+        page.number("threshold", "threshold", page.fixed, 2),
+        page.number("false positives", lambda row: f"{row['false_positives']} of {row['negatives']}"),
+        page.number("highest negative", "highest_negative", page.fixed, 2),
+        page.number("positive, unlabelled", "positive_unlabelled", page.percent),
+        page.number("alone", "positive_alone", page.percent),
+    ]
+    caption = (
+        "False positives among labelled and held-out states. Highest negative: the probability of the failure that a "
+        "policy would be drawn to first. Alone: unlabelled states that no other member predicts positive."
+    )
+    blocks: list[Block] = [page.table(columns, numbers["members"], caption=caption, heading="Members")]
+    titles = [f"state {rows[row]}, disagreement {disputed[row]:.2f}" for row in following[:CARDS]]
+    shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in following[:CARDS]]
+    blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
+    for member in range(len(look.ensemble)):
+        blocks += _drawn_to(look, member) + _pairs(look, member, rows, sketches)
+    paragraphs = [
+        f"{len(look.known.labels):,} labelled and held-out states, {len(look.unlabelled):,} unlabelled ones. "
+        f"Members disagree in {numbers['disagreement']:.1%} of the unlabelled states."
+    ]
+    return page.section(page.slug(look.sub_goal), look.sub_goal, paragraphs, blocks)
+
+
+def _cards(look: Look, heading: str, states: Any) -> list[Block]:
+    """Cards of states, each a title, an observation and its scores (K,); none of states without pictures."""
+    cards = []
+    for title, state, scores, *turned in states:
+        picture = recorded.picture_of(state, *turned)
+        if picture is None:
+            return []
+        lines = [
+            {"class": "yes" if score > threshold else "no", "text": f"member {member}: {score:.2f}"}
+            for member, (score, threshold) in enumerate(zip(scores.tolist(), look.thresholds.tolist(), strict=True))
+        ]
+        cards.append({"png": page.encoded(page.image_png(picture)), "alt": title, "title": title, "lines": lines})
+    return [{"kind": "cards", "heading": heading, "cards": cards, "small": True}] if cards else []
+
+
+def _drawn_to(look: Look, member: int) -> list[Block]:
+    """The known failures that a member scores highest, with the patch that says most of it."""
+    tempting = recorded.tempting(look.known, look.known_scores[:, member], SHOWN)
+    threshold = look.thresholds[member]
+    rejected = np.flatnonzero(look.scores[:, member] <= threshold)
+
+    def shown() -> Iterator[tuple[Any, ...]]:
+        for row in tempting:
+            state, scores = look.known.observations[row], look.known_scores[row]
+            turned = None
+            if scores[member] > threshold and len(rejected):
+                some = rejected[recorded.spread(len(rejected), 500)]
+                sketches = recorded.sketches_of(np.concatenate([state[None], look.unlabelled[some]]))
+                nearest = some[np.linalg.norm(sketches[1:] - sketches[0], axis=1).argmin()]
+                turned = recorded.turning_patch(state, look.unlabelled[nearest], member, look.ensemble.predict)
+            title = "a failure" if turned is None else f"a false positive; {turned.after:.2f} without the framed patch"
+            yield title, state, scores, turned
+
+    return _cards(look, f"Member {member}: failures that a policy would be drawn to", shown())
+
+
+def _pairs(look: Look, member: int, rows: NDArray[np.int64], sketches: NDArray[np.float64]) -> list[Block]:
+    """The nearest unlabelled states with opposite predictions of a member, side by side."""
+    positive = look.scores[rows, member] > look.thresholds[member]
+    pairs = recorded.opposite_pairs(sketches, positive, SHOWN)
+    states = [
+        (f"pair {number}, state {rows[row]}", look.unlabelled[rows[row]], look.scores[rows[row]])
+        for number, (first, second, _) in enumerate(pairs, 1)
+        for row in (first, second)
+    ]
+    return _cards(look, f"Member {member}: nearest states with opposite predictions", states)

@@ -1,0 +1,95 @@
+"""What recorded states say about a classifier, on cases worked by hand (Spec I6)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hypogoal.dataset import States, packed
+from hypogoal.evaluation.recorded import (
+    disagreement,
+    member_findings,
+    opposite_pairs,
+    picture_of,
+    sketches_of,
+    tempting,
+    to_label,
+    turning_patch,
+)
+
+
+def test_members_disagree_about_their_own_thresholds() -> None:
+    """0 where both say the same, 1 where they are sure of opposites; of one member how near it is to its threshold."""
+    both = np.array([[0.5, 0.9], [1.0, 0.0], [0.999, 0.9999]])
+    found = disagreement(both, np.array([0.5, 0.9]))
+    np.testing.assert_allclose(found[:2], [0.0, 1.0], atol=1e-6)
+    assert found[2] < 0.01
+    np.testing.assert_allclose(disagreement(np.array([[0.9], [1.0]]), np.array([0.9])), [1.0, 0.0], atol=1e-6)
+    pairs = disagreement(np.array([[0.0, 0.0, 1.0]]), np.full(3, 0.5))
+    np.testing.assert_allclose(pairs, [2 / 3], atol=1e-6)  # two of three pairs
+
+
+def test_states_to_label_are_disputed_common_and_unlike_each_other() -> None:
+    """Two crowds that are disputed get one each before either gets a second; a stray state comes after, others last."""
+    rng = np.random.default_rng(0)
+    crowds = [rng.normal(place, 0.1, (20, 2)) for place in ((0, 0), (5, 0), (0, 5))]
+    sketches = np.concatenate([*crowds, [[40.0, 40.0]]])
+    scores = np.repeat([0.9, 0.0, 0.8, 0.95], [20, 20, 20, 1])
+    rows = to_label(scores, sketches, 4)
+    assert sorted(row // 20 for row in rows[:2].tolist()) == [0, 2]
+    assert 60 not in rows.tolist(), "whatever its score, nothing else is like it"
+    assert len({*rows.tolist()}) == 4 and all(scores[rows] > 0)
+    np.testing.assert_array_equal(to_label(np.ones(3), sketches[:3], 9).shape, (3,))
+    np.testing.assert_array_equal(to_label(np.ones(1), sketches[:1], 1), [0])
+
+
+def test_a_policy_is_drawn_to_the_negatives_that_score_highest() -> None:
+    states = States(np.zeros((5, 2), np.float32), np.array([True, False, False, True, False]))
+    np.testing.assert_array_equal(tempting(states, np.array([0.99, 0.2, 0.7, 0.1, 0.4]), 2), [2, 4])
+    scores = np.array([[0.9, 0.9], [0.2, 0.6], [0.7, 0.1], [0.1, 0.1], [0.4, 0.4]])
+    first, second = member_findings(states, scores, np.array([[0.9, 0.1], [0.9, 0.9], [0.1, 0.1]]), [0.5, 0.5])
+    assert (first["negatives"], first["false_positives"], first["highest_negative"]) == (3, 1, 0.7)
+    assert (second["false_positives"], second["highest_negative"]) == (1, 0.6)
+    assert first["positive_unlabelled"] == pytest.approx(2 / 3) and first["positive_alone"] == pytest.approx(1 / 3)
+    assert second["positive_alone"] == 0
+
+
+def test_nearest_states_with_opposite_predictions() -> None:
+    places = np.array([[0.0], [1.0], [1.1], [5.0], [5.5]])
+    pairs = opposite_pairs(places, np.array([True, True, False, False, True]), 5)
+    assert [pair[:2] for pair in pairs] == [(1, 2), (4, 3)], "each negative once, the nearest first"
+    np.testing.assert_allclose([pair[2] for pair in pairs], [0.1, 0.5])
+    assert opposite_pairs(places, np.ones(5, bool), 2) == []
+
+
+def test_the_patch_that_says_it_is_found() -> None:
+    """A member that looks at one corner of one camera is positive until that corner is exchanged."""
+    bright, dark = (np.full((1, 12, 12, 3), level, np.uint8) for level in (200, 0))
+    state, other = (packed({"a": cam, "b": cam, "x": np.zeros((1, 2), np.float32)})[0:1] for cam in (bright, dark))
+
+    def predict(states: np.ndarray) -> np.ndarray:
+        corner = states["b"][:, 10:12, 0:2].mean((1, 2, 3)) / 255
+        return np.stack([np.zeros(len(states)), corner], axis=1)
+
+    turned = turning_patch(state[0], other[0], 1, predict)
+    assert turned is not None and (turned.key, turned.box) == ("b", (10, 0, 12, 2))
+    assert turned.before == pytest.approx(200 / 255) and turned.after == 0
+    drawn = picture_of(state[0], turned)
+    assert drawn is not None and drawn.shape == (12, 24, 3)
+    assert (drawn[:10] == 200).all() and (drawn[10:, 12:14] != 200).any(), "the frame is in the second camera"
+    numbers = np.zeros(3, np.float32)
+    assert turning_patch(numbers, numbers, 0, predict) is None and picture_of(numbers) is None
+
+
+def test_sketches_are_alike_where_states_are() -> None:
+    """Pictures and numbers count alike, whatever their sizes and units."""
+    rng = np.random.default_rng(0)
+    kinds = np.arange(40) % 4
+    cameras = rng.integers(0, 20, (40, 32, 32, 3), dtype=np.uint8)
+    cameras[kinds % 2 == 1, :16] += 200
+    numbers = rng.normal(0, 10, (40, 3)).astype(np.float32)
+    numbers[kinds >= 2] += 1e4
+    sketches = sketches_of(packed({"camera": cameras, "numbers": numbers}))
+    distance = np.linalg.norm(sketches[:, None] - sketches[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    np.testing.assert_array_equal(kinds[distance.argmin(1)], kinds)

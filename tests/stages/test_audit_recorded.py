@@ -1,0 +1,126 @@
+"""An audit of recorded data, labels for what it proposes, and their way back into the data (Spec I6)."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from keyboard import label
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.dataset import digest, open_dataset
+from hypogoal.own_data.marks import read_marks
+from tests.own_data import mixed
+
+GOAL = "door-open"
+
+
+@pytest.fixture(scope="module")
+def audited(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data of two cameras and a state, an ensemble, and its audit."""
+    folder = tmp_path_factory.mktemp("recorded")
+    np.savez(folder / "states.npz", **mixed.arrays())
+    words = ["--sub-goal", GOAL, "--out", str(folder / "data.h5"), "-q"]
+    assert main(["import", str(folder / "states.npz"), *words]) == 0
+    few = [word for setting in ("steps=8", "members=2") for word in ("--set", setting)]
+    assert main(["train-ensemble", str(folder / "data.h5"), "--out", str(folder / "ensemble"), "-q", *few]) == 0
+    assert main(["audit", str(folder / "ensemble"), "--out", str(folder / "audit")]) == 0
+    return folder
+
+
+def test_an_audit_of_recorded_data(audited: Path) -> None:
+    """Numbers, the table and the page; the rows are states of the file, each once, disputed ones first."""
+    audit, data = audited / "audit", open_dataset(audited / "data.h5")
+    artefact = open_artefact(audit, "recorded-audit").whole()
+    assert artefact.manifest["files"].keys() == {"audit.json", "index.html", f"next/{GOAL}.csv", "README.md"}
+    [part] = json.loads((audit / "audit.json").read_text())["sub_goals"]
+    assert (part["sub_goal"], part["known"], part["unlabelled"], len(part["members"])) == (GOAL, 56, 20, 2)
+    rows = read_marks(audit / "next" / f"{GOAL}.csv")
+    places = [int(row["row"]) for row in rows]
+    assert sorted(places) == list(range(20)) and places == part["next"]
+    assert all(digest(data.unlabelled()[place]).hex() == row["digest"] for place, row in zip(places, rows, strict=True))
+    page = (audit / "index.html").read_text()
+    assert "To label next" in page and page.count("data:image/png") >= 20
+    assert "Content-Security-Policy" in page and "http" not in page.replace("http-equiv", "")
+
+
+def test_what_is_labelled_next_becomes_data(
+    audited: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The window shows the first states of the table; marks are saved at once; ``import`` moves these states."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    table, more = tmp_path / "labels.csv", tmp_path / "more.h5"
+    assert label("p n p backspace n", str(audited / "audit"), "--next", "4", "--out", str(table)) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "1 positive, 2 negative" and printed[-1] == str(table)
+    rows = read_marks(table)
+    assert [row["label"] for row in rows] == ["1", "0", "", "0"]
+    assert main(["label", str(audited / "audit"), "--next", "4", "--out", str(table)]) == 2, "it exists"
+    assert "the table exists already" in capsys.readouterr().err
+    assert label("right right p", str(audited / "audit"), "--next", "4", "--out", str(table), "--resume") == 0
+    rows = read_marks(table)
+    assert [row["label"] for row in rows] == ["1", "0", "1", "0"]
+    assert main(["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", "--out", str(more), "-q"]) == 0
+    before, after = open_dataset(audited / "data.h5"), open_dataset(more)
+    places = [int(row["row"]) for row in rows]
+    labelled = after.labelled(GOAL)
+    np.testing.assert_array_equal(labelled.observations[-4:], before.unlabelled()[places])
+    assert labelled.labels[-4:].tolist() == [True, False, True, False] and len(labelled.labels) == 44
+    np.testing.assert_array_equal(after.unlabelled(), np.delete(before.unlabelled(), places))
+    np.testing.assert_array_equal(after.heldout(GOAL).observations, before.heldout(GOAL).observations)
+    few = ["--set", "steps=2", "--set", "members=2"]
+    assert main(["train-ensemble", str(more), "--out", str(tmp_path / "ensemble"), "-q", *few]) == 0
+
+
+def damaged(table: Path, out: Path, **cells: str) -> Path:
+    """A copy of a table whose first row has other cells."""
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    rows[0] |= cells
+    with out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("cells", "says"),
+    [
+        ({"label": "maybe"}, "this is no row and label"),
+        ({"row": "-1", "label": "1"}, "this is no row and label"),
+        ({"row": "20", "label": "1"}, "the table is of other data"),
+        ({"digest": "00" * 16, "label": "1"}, "the table is of other data"),
+        ({}, "the table has no label yet"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_refused(
+    audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], cells: dict[str, str], says: str
+) -> None:
+    table = damaged(audited / "audit/next" / f"{GOAL}.csv", tmp_path / "labels.csv", **cells)
+    out = tmp_path / "more.h5"
+    assert main(["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1 and not out.exists()
+
+
+def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No ensemble, settings, an unknown sub-goal, data that are gone, no unlabelled states; nothing is left behind."""
+    ensemble, out = str(audited / "ensemble"), tmp_path / "audit"
+    for words, says in [
+        (["mine:classify"], "recorded data are audited of ensembles"),
+        ([ensemble, "--set", "steps=3"], "without settings"),
+        ([ensemble, "--sub-goal", "other"], "unknown sub-goal"),
+        ([ensemble, "--domain", "doorkey"], "which sub-goal is the truth?"),
+        ([str(audited / "audit")], "but ensemble is needed"),
+    ]:
+        assert main(["audit", *words, "--out", str(out)]) == 2
+        error = capsys.readouterr().err
+        assert says in error and error.count("\n") == 1 and not out.exists()
+    assert main(["label", ensemble, "--next", "3", "--out", str(tmp_path / "labels.csv")]) == 2
+    assert "but recorded-audit is needed" in capsys.readouterr().err
+    assert main(["label", str(audited / "audit"), "--next", "3", "--out", str(tmp_path / "labels")]) == 2
+    assert "--next writes a table" in capsys.readouterr().err
