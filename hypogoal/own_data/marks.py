@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from hypogoal.dataset import Collected, Dataset, States, digest, joined
 COLUMNS = ("row", "digest", "label", "disagreement")
 REQUIRED = COLUMNS[:3]
 MOST_BYTES = 1 << 26
+PLACE = re.compile(r"[0-9]{1,12}")
 LABELS = {"positive": "1", "negative": "0"}
 DO = "Give a table from 'audit', with 1 or 0 as labels."
 
@@ -28,21 +30,21 @@ DO = "Give a table from 'audit', with 1 or 0 as labels."
 def read_marks(path: Path) -> list[dict[str, str]]:
     """The rows of a table; one that is missing or damaged is a ``UserError``."""
     text = read_text(path, "the table of labels is", DO, MOST_BYTES)
-    reader = csv.DictReader(text.splitlines())
-    if not set(REQUIRED) <= set(reader.fieldnames or ()):
-        raise UserError(f"a table of labels has the columns {', '.join(REQUIRED)}", path, DO)
     try:
+        reader = csv.DictReader(text.splitlines())
+        if not set(REQUIRED) <= set(reader.fieldnames or ()):
+            raise UserError(f"a table of labels has the columns {', '.join(REQUIRED)}", path, DO)
         rows = [{name: row[name].strip() for name in COLUMNS if row.get(name) is not None} for row in reader]
     except (csv.Error, AttributeError):
         raise UserError("the table of labels is damaged", path, DO) from None
     for number, row in enumerate(rows, 2):
-        if not set(REQUIRED) <= set(row) or not row["row"].isdecimal() or row["label"] not in ("", "0", "1"):
+        if not set(REQUIRED) <= set(row) or not PLACE.fullmatch(row["row"]) or row["label"] not in ("", "0", "1"):
             raise UserError("this is no row and label", f"{path}, line {number}", DO)
     return rows
 
 
 class MarkedTable:
-    """Marks of the first ``count`` states of a table, in the place of ``Marks``' files; each is saved at once."""
+    """Marks of a table's states, of which the first are shown, instead of ``Marks``' files; each is saved at once."""
 
     kinds = tuple(LABELS)
 

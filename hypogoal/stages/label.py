@@ -76,16 +76,21 @@ def label_next(
     if (sub_goal or goals[0]) not in goals or (sub_goal is None and len(goals) > 1):
         raise UserError("which sub-goal?", audit, f"Give --sub-goal, one of {', '.join(goals)}.")
     goal, data = sub_goal or goals[0], artefact.input(DATA)
+    if len(open_dataset(data).sub_goals) > 1:
+        raise UserError("a table labels data of one sub-goal, its own", data, "Import the states for each by itself.")
     if out.suffix != ".csv":
         raise UserError("--next writes a table", out, "Give --out NAME.csv.")
     if out.exists() and not resume:
         raise UserError("the table exists already", out, "Give --resume to continue it, or another --out.")
-    rows = read_marks(out if out.exists() else audit / "next" / f"{goal}.csv")[:count]
+    rows = read_marks(audit / "next" / f"{goal}.csv")
+    given = {row["digest"]: row["label"] for row in read_marks(out)} if out.exists() else {}
+    for row in rows:
+        row["label"] = given.get(row["digest"], "")
     states = open_dataset(data).unlabelled()
-    places = [int(row["row"]) for row in rows]
+    places = [int(row["row"]) for row in rows[:count]]
     if any(
         place >= len(states) or digest(states[place]).hex() != row["digest"]
-        for place, row in zip(places, rows, strict=True)
+        for place, row in zip(places, rows, strict=False)
     ):
         raise UserError("the table is of other data", out, "Give another --out.")
     pictures = [picture for place in places if (picture := picture_of(states[place])) is not None]

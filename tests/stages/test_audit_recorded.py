@@ -58,11 +58,13 @@ def test_what_is_labelled_next_becomes_data(
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == "1 positive, 2 negative" and printed[-1] == str(table)
     rows = read_marks(table)
-    assert [row["label"] for row in rows] == ["1", "0", "", "0"]
+    assert [row["label"] for row in rows] == ["1", "0", "", "0", *[""] * 16]
+    assert label("", str(audited / "audit"), "--next", "1", "--out", str(table), "--resume") == 0
+    assert read_marks(table) == rows, "labels of states that are not shown stay"
     assert main(["label", str(audited / "audit"), "--next", "4", "--out", str(table)]) == 2, "it exists"
     assert "the table exists already" in capsys.readouterr().err
     assert label("right right p", str(audited / "audit"), "--next", "4", "--out", str(table), "--resume") == 0
-    rows = read_marks(table)
+    rows = read_marks(table)[:4]
     assert [row["label"] for row in rows] == ["1", "0", "1", "0"]
     assert main(["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", "--out", str(more), "-q"]) == 0
     before, after = open_dataset(audited / "data.h5"), open_dataset(more)
@@ -92,6 +94,7 @@ def damaged(table: Path, out: Path, **cells: str) -> Path:
     [
         ({"label": "maybe"}, "this is no row and label"),
         ({"row": "-1", "label": "1"}, "this is no row and label"),
+        ({"row": "9" * 5000, "label": "1"}, "this is no row and label"),
         ({"row": "20", "label": "1"}, "the table is of other data"),
         ({"digest": "00" * 16, "label": "1"}, "the table is of other data"),
         ({}, "the table has no label yet"),
@@ -108,7 +111,7 @@ def test_a_table_that_does_not_fit_is_refused(
 
 
 def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """No ensemble, settings, an unknown sub-goal, data that are gone, no unlabelled states; nothing is left behind."""
+    """No ensemble, settings, an unknown sub-goal, another artefact; nothing is left behind."""
     ensemble, out = str(audited / "ensemble"), tmp_path / "audit"
     for words, says in [
         (["mine:classify"], "recorded data are audited of ensembles"),
