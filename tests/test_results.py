@@ -58,6 +58,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "tuning-baselines": tuning.tables,
     "which-feature": which_feature.tables,
     "which-feature-bandits": bandits.tables,
+    "which-feature-four": choosing.four,
     "which-feature-rooms": choosing.rooms,
     "which-feature-two": which_feature.tables_of_two,
     "which-feature-ways": ways.tables,
