@@ -460,6 +460,11 @@ class Dataset:
         return hdf5.open_hdf5(self.path, "the data file", RECOLLECT)
 
 
+def spread_rows(count: int, most: int) -> NDArray[np.int64]:
+    """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
 def _spread(length: int, count: int) -> list[slice]:
     """Blocks of about ``count`` of ``length`` rows."""
     blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # blocks do not overlap

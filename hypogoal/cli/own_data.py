@@ -128,7 +128,6 @@ def label(
     next_: Annotated[
         int, Option("--next", min=0, help="Of an audit's folder: the first N states to label; --out is a .csv file.")
     ] = 0,
-    sub_goal: Annotated[str | None, Option(help="Of an audit of several sub-goals: which.")] = None,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
     arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
@@ -145,7 +144,7 @@ def label(
     from hypogoal.stages.label import label_next
 
     if next_:
-        counts, data, goal = label_next(Path(source), out, count=next_, sub_goal=sub_goal, resume=resume)
+        counts, data, goal = label_next(Path(source), out, count=next_, resume=resume)
         say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
         more = data.with_name(f"{data.stem}-more.h5")
         cli.print_next(False, "import", data, "--label", f"{goal}={out}", "--out", more)

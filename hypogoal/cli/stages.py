@@ -106,7 +106,7 @@ def audit(
         Option(help="Where to play; without it, look at recorded data.", autocompletion=cli.offer("domain")),
     ] = None,
     sub_goal: Annotated[str | None, Option(help="The domain's sub-goal that is the truth.")] = None,
-    member: Annotated[int, Option(min=0, help="Which member of the ensemble.")] = 0,
+    member: Annotated[int | None, Option(min=0, help="Which member of the ensemble. Default: 0.")] = None,
 ) -> None:
     """How often, and where, do policies fool a success classifier?
 
@@ -118,30 +118,30 @@ def audit(
     from hypogoal.stages.audit import audit as audited
 
     if domain is None:
-        _audit_recorded(call, classifier, sub_goal)
+        _audit_recorded(call, classifier, sub_goal, member)
         return
     if sub_goal is None:
         raise UserError("which sub-goal is the truth?", domain, "Give --sub-goal NAME.")
     config = call.config(domain, by_user=True)
     with own_code.given(classifier, domain):
-        rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member, **call.how)
+        rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member or 0, **call.how)
     for line in () if call.how["quiet"] else lines_of(rates):
         say(line)
     call.end({})
 
 
-def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None) -> None:
+def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, member: int | None) -> None:
     from hypogoal.stages.audit_recorded import audit_recorded, lines_of
 
-    if not Path(source).is_dir() or call.settings or call.preset or call.how["resume"]:
-        do = "Give --domain and --sub-goal, or an ensemble's folder and no settings."
-        raise UserError("recorded data are audited of ensembles, without settings", source, do)
+    if not Path(source).is_dir() or member is not None or call.settings or call.preset or call.how["resume"]:
+        do = "Give --domain and --sub-goal; or an ensemble's folder alone."
+        raise UserError("on recorded data an audit takes an ensemble, all members, without settings", source, do)
     how = {name: call.how[name] for name in ("force", "quiet", "device")}
-    found = audit_recorded(Path(source), call.out, sub_goal=sub_goal, **how)
-    for line in () if call.how["quiet"] else lines_of(found):
+    parts = audit_recorded(Path(source), call.out, sub_goal=sub_goal, **how)
+    for line in () if call.how["quiet"] else lines_of(parts):
         say(line)
-    table = call.out / "labels.csv"
-    cli.print_next(call.how["quiet"], "label", call.out, "--next", 20, "--out", table)
+    table = call.out.with_name("labels.csv")  # the audit's own folder is sealed
+    cli.print_next(call.how["quiet"] or len(parts) > 1, "label", call.out, "--next", 20, "--out", table)
     give(call.out / "index.html")
 
 

@@ -158,9 +158,9 @@ def check_kind(out: Path, kind: str) -> None:
         raise UserError(f"the existing output is not of kind {kind!r}: another file", out, AWAY)
 
 
-def begins_as(path: Path, kind: str) -> bool:
-    """Whether a file begins as those of a kind do, data or arrays, even if the rest is cut off."""
-    with open_file(path, "the file is", AWAY) as file:
+def begins_as(path: Path, kind: str, do: str = AWAY) -> bool:
+    """Whether a file begins as those of a kind, data or arrays; ``do`` is the advice where it cannot be read."""
+    with open_file(path, THE_FILE, do) as file:
         begin = file.read(FRONT)
     signature, content = SIGNATURES.get(kind, (b"", b""))
     return bool(signature) and begin.startswith(signature) and content in begin

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from hypogoal.dataset import PICTURE, Observations, States, fields_of, numbers_of, standard_of, standardised
+from hypogoal.dataset import (
+    PICTURE,
+    Observations,
+    States,
+    fields_of,
+    numbers_of,
+    spread_rows,
+    standard_of,
+    standardised,
+)
 from hypogoal.domains.observations import resized_picture
 from hypogoal.evaluation.pictures import brightness, reduced
 from hypogoal.hypotheses.thresholds import log_odds_of
@@ -22,15 +31,10 @@ from hypogoal.hypotheses.thresholds import log_odds_of
 GRID = 16  # areas along a side of a picture, whose means are compared
 DIRECTIONS = 16  # of the states' largest variance
 NEIGHBOURS = 10  # whose distance says how dense states are
-MOST = 4_000  # states that are compared, spread evenly
+SAMPLE = 500  # states whose usual distance is taken
 PATCHES = 6  # along a side of a picture
 FRAME = (240, 160, 0)  # around the patch that turns a prediction
 Predict = Callable[[Observations], NDArray[np.floating]]  # observations (N, *obs) -> probabilities (N, K)
-
-
-def spread(count: int, most: int = MOST) -> NDArray[np.int64]:
-    """All rows of ``count``, or ``most`` spread evenly."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
 
 
 def sketches_of(observations: Observations) -> NDArray[np.float64]:
@@ -57,11 +61,11 @@ def disagreement(probabilities: NDArray[np.floating], thresholds: NDArray[np.flo
 
     Of one member how near it is to its threshold, 1 there.
     """
-    about = 1 / (1 + np.exp(log_odds_of(thresholds) - log_odds_of(probabilities)))
-    if about.shape[1] == 1:
-        return 1 - np.abs(2 * about[:, 0] - 1)
-    pairs = combinations(range(about.shape[1]), 2)
-    return np.mean([np.abs(about[:, first] - about[:, second]) for first, second in pairs], axis=0)
+    centred = 1 / (1 + np.exp(log_odds_of(thresholds) - log_odds_of(probabilities)))
+    if centred.shape[1] == 1:
+        return 1 - np.abs(2 * centred[:, 0] - 1)
+    pairs = combinations(range(centred.shape[1]), 2)
+    return np.mean([np.abs(centred[:, first] - centred[:, second]) for first, second in pairs], axis=0)
 
 
 def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: int) -> NDArray[np.int64]:
@@ -73,13 +77,13 @@ def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: 
     count, neighbours = min(count, len(scores)), min(NEIGHBOURS + 1, len(scores))
     near = KDTree(sketches).query(sketches, neighbours)[0].reshape(len(scores), -1).mean(1)
     values = scores * np.exp(1 - near / (np.median(near) or 1.0))
-    some = sketches[spread(len(sketches), 500)]
+    some = sketches[spread_rows(len(sketches), SAMPLE)]
     usual = float(np.median(cdist(some, some))) or 1.0
     rows: list[int] = []
     apart = np.ones(len(scores))
     for _ in range(count):
-        left = np.where(np.isin(np.arange(len(scores)), rows), -1.0, values * apart)
-        rows.append(int(left.argmax()))
+        remaining = np.where(np.isin(np.arange(len(scores)), rows), -1.0, values * apart)
+        rows.append(int(remaining.argmax()))
         distance = np.linalg.norm(sketches - sketches[rows[-1]], axis=1) / usual
         apart = np.minimum(apart, 1 - np.exp(-(distance**2)))
     return np.array(rows, np.int64)
@@ -171,12 +175,12 @@ def member_findings(
     known: States, known_scores: NDArray[np.floating], scores: NDArray[np.floating], thresholds: Sequence[float]
 ) -> list[dict[str, Any]]:
     """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
-    positive, found = scores > np.asarray(thresholds), []
+    positive, rows = scores > np.asarray(thresholds), []
     negatives = ~known.labels
     for member, threshold in enumerate(thresholds):
         wrong = known_scores[negatives, member] > threshold
         others = np.delete(positive, member, axis=1).any(1)
-        found.append(
+        rows.append(
             {
                 "member": member,
                 "threshold": float(threshold),
@@ -187,4 +191,4 @@ def member_findings(
                 "positive_alone": float((positive[:, member] & ~others).mean()),
             }
         )
-    return found
+    return rows

@@ -9,14 +9,13 @@ import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, write_table
-from hypogoal.dataset import Collected, Dataset, States, digest, joined
+from hypogoal.dataset import NUMBERS, Collected, Dataset, States, digest, joined
 
 # The row among the unlabelled states, its :func:`hypogoal.dataset.digest`, its label: 1, 0 or nothing yet.
 COLUMNS = ("row", "digest", "label", "disagreement")
@@ -91,7 +90,7 @@ class MarkedTable:
 def with_marks(dataset: Dataset, marks: Path, sub_goal: str) -> tuple[Collected, int]:
     """The states of a data file, those that ``marks`` labels moved to the labelled ones; and how many these are.
 
-    A table of other data, one without a label, or data of several sub-goals is a ``UserError``.
+    A table of other data, that names a state twice or has no label, and data of several sub-goals are a ``UserError``.
     """
     if dataset.sub_goals != (sub_goal,):
         do = f"It has {', '.join(dataset.sub_goals)}."
@@ -105,20 +104,24 @@ def with_marks(dataset: Dataset, marks: Path, sub_goal: str) -> tuple[Collected,
     if not fits or any(
         digest(observations[place]).hex() != row["digest"] for place, row in zip(chosen, rows, strict=True)
     ):
-        raise UserError("the table is of other data", marks, f"Audit an ensemble of {dataset.path.name} again.")
+        raise UserError(
+            "the table is of other data, or names a state twice",
+            marks,
+            f"Audit an ensemble of {dataset.path.name} again.",
+        )
     before = dataset.labelled(sub_goal)
     shared = before.origins.keys() & origins.keys()
     first = States(before.observations, before.labels, {name: before.origins[name] for name in shared})
     new = States(observations[chosen], labels, {name: origins[name][chosen] for name in shared})
-    left = np.ones(len(observations), np.bool_)
-    left[chosen] = False
+    kept = np.ones(len(observations), np.bool_)
+    kept[chosen] = False
     labelled, heldout = joined([first, new]), dataset.heldout(sub_goal)
     rest = States(
-        observations[left],
-        np.zeros((left.sum(), 1), np.bool_),
-        {name: values[left] for name, values in origins.items()},
+        observations[kept],
+        np.zeros((kept.sum(), 1), np.bool_),
+        {name: values[kept] for name, values in origins.items()},
     )
-    features: Any = tuple(dataset.features()) if _named(dataset) else ()
+    features = tuple(dataset.features()) if dataset.observation_dtype == NUMBERS else ()
     return Collected(
         dataset.observation_shape, (sub_goal,), _columns(labelled), rest, _columns(heldout), features
     ), len(rows)
@@ -126,8 +129,3 @@ def with_marks(dataset: Dataset, marks: Path, sub_goal: str) -> tuple[Collected,
 
 def _columns(states: States) -> States:
     return States(states.observations, states.labels[:, None], states.origins)
-
-
-def _named(dataset: Dataset) -> bool:
-    names = dataset.features()
-    return not dataset.observation_dtype.names and names != [f"x{number}" for number in range(len(names))]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import PICTURE, Observations, States, digest
+from hypogoal.dataset import PICTURE, Observations, States, digest, spread_rows
 from hypogoal.domains.observations import resized_picture
 
 GRID = 16  # areas along each side of a picture, whose mean brightness is compared
@@ -59,7 +59,7 @@ def near_duplicates(labelled: States, heldout: States, goals: Sequence[str], nam
     if labelled.observations.dtype != PICTURE:
         return []
     lines = []
-    rows, test_rows = (_spread(len(states.labels)) for states in (labelled, heldout))
+    rows, test_rows = (spread_rows(len(states.labels), MOST_COMPARED) for states in (labelled, heldout))
     sketches, tests = _sketches(labelled.observations[rows]), _sketches(heldout.observations[test_rows])
     nearest = _nearest(tests, sketches)
     near = np.flatnonzero(nearest >= 0)
@@ -84,11 +84,6 @@ def _pair(looks: Looks, labels: NDArray[np.bool_], look: Any, name: Name) -> str
     """The names of the first positive and the first negative with this hash."""
     positive, negative = (int(np.flatnonzero((looks == look) & kind)[0]) for kind in (labels, ~labels))
     return f"{name(positive)} and {name(negative)}"
-
-
-def _spread(count: int) -> NDArray[np.int64]:
-    """All rows of ``count``, or ``MOST_COMPARED`` spread evenly."""
-    return np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(np.int64)
 
 
 def _sketches(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -15,16 +15,17 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import Observations, States, digest, joined, open_dataset
+from hypogoal.dataset import Observations, States, digest, joined, open_dataset, spread_rows
 from hypogoal.evaluation import page, recorded
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Block
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.own_data.marks import COLUMNS
 
+COMPARED = 4_000  # unlabelled states, spread over the file
 SHOWN = 4  # negatives and pairs of a member on the page
-NEXT = 100  # states in the table of those to label next; the page shows
-CARDS = 20
+NEXT, CARDS = 100, 20  # states to label next in the table, and on the page
+REJECTED = 500  # states among which the nearest is sought that a member rejects
 
 
 @dataclass(frozen=True)
@@ -72,25 +73,25 @@ def audit_recorded(
         Progress("audit", len(goals), quiet=quiet) as progress,
     ):
         (folder / "next").mkdir()
-        found, sections = [], []
+        parts, sections = [], []
         for goal in goals:
             look = look_at(artefact, data, goal, device)
             part, section = findings(look, folder / "next" / f"{goal}.csv")
-            found.append(part)
+            parts.append(part)
             sections.append(section)
             progress.advance()
-        (folder / "audit.json").write_text(json.dumps(plain({"sub_goals": found}), indent=1) + "\n", encoding="utf-8")
-        lead = {"task": "", "verdict": lines_of(found), "baselines": "", "films": [], "question": ""}
+        (folder / "audit.json").write_text(json.dumps(plain({"sub_goals": parts}), indent=1) + "\n", encoding="utf-8")
+        lead = {"task": "", "verdict": lines_of(parts), "baselines": "", "films": [], "question": ""}
         version = versions().get("hypogoal", "unknown")
         text = page.draw_page(
             f"hypogoal: audit of {source.name}", f"recorded data; hypogoal {version}", sections, version, lead
         )
         (folder / "index.html").write_text(text, encoding="utf-8")
-    return found
+    return parts
 
 
 def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
-    """The members' predictions of all labelled and held-out states, and of unlabelled ones spread over the file."""
+    """The members' predictions of all states of the data file."""
     dataset, ensemble = open_dataset(data), read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
     if ensemble.needs_positions:
         raise UserError("members need the agent's positions (localiser=ram)", artefact.path, "Train with another view.")
@@ -106,18 +107,18 @@ def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
 
 def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
     """A sub-goal's numbers and its section of the page; the states to label next go into ``table``."""
-    rows = recorded.spread(len(look.unlabelled))  # the states that are compared
+    rows = spread_rows(len(look.unlabelled), COMPARED)  # the states that are compared
     states, scores = look.unlabelled[rows], look.scores[rows]
     sketches = recorded.sketches_of(states)
     disputed = recorded.disagreement(scores, look.thresholds)
-    following = recorded.to_label(disputed, sketches, NEXT)
+    proposed = recorded.to_label(disputed, sketches, NEXT)
     members = recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist())
     positive = scores > look.thresholds
     disagree = (positive.any(1) & ~positive.all(1)).mean()
     write_table(
         table,
         COLUMNS,
-        [[int(rows[row]), digest(states[row]).hex(), "", round(float(disputed[row]), 4)] for row in following],
+        [[int(rows[row]), digest(states[row]).hex(), "", round(float(disputed[row]), 4)] for row in proposed],
     )
     numbers = {
         "sub_goal": look.sub_goal,
@@ -125,15 +126,15 @@ def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
         "unlabelled": len(look.unlabelled),
         "disagreement": float(disagree),
         "members": members,
-        "next": [int(rows[row]) for row in following[:CARDS]],
+        "next": [int(rows[row]) for row in proposed[:CARDS]],
     }
-    return numbers, _section(look, numbers, rows, sketches, following, disputed)
+    return numbers, _section(look, numbers, rows, sketches, proposed, disputed)
 
 
-def lines_of(found: Sequence[dict[str, Any]]) -> list[str]:
+def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:
     """The findings in a few lines, for the page and the terminal."""
     lines = []
-    for part in found:
+    for part in parts:
         worst = max(part["members"], key=lambda row: row["false_positives"])
         lines.append(
             f"{part['sub_goal']}: members disagree in {part['disagreement']:.1%} of {part['unlabelled']:,} unlabelled "
@@ -148,7 +149,7 @@ def _section(
     numbers: dict[str, Any],
     rows: NDArray[np.int64],
     sketches: NDArray[np.float64],
-    following: NDArray[np.int64],
+    proposed: NDArray[np.int64],
     disputed: NDArray[np.float64],
 ) -> Block:
     columns = [
@@ -164,8 +165,8 @@ def _section(
         "policy would be drawn to first. Alone: unlabelled states that no other member predicts positive."
     )
     blocks: list[Block] = [page.table(columns, numbers["members"], caption=caption, heading="Members")]
-    titles = [f"state {rows[row]}, disagreement {disputed[row]:.2f}" for row in following[:CARDS]]
-    shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in following[:CARDS]]
+    titles = [f"state {rows[row]}, disagreement {disputed[row]:.2f}" for row in proposed[:CARDS]]
+    shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in proposed[:CARDS]]
     blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
     for member in range(len(look.ensemble)):
         blocks += _drawn_to(look, member) + _pairs(look, member, rows, sketches)
@@ -202,11 +203,15 @@ def _drawn_to(look: Look, member: int) -> list[Block]:
             state, scores = look.known.observations[row], look.known_scores[row]
             turned = None
             if scores[member] > threshold and len(rejected):
-                some = rejected[recorded.spread(len(rejected), 500)]
+                some = rejected[spread_rows(len(rejected), REJECTED)]
                 sketches = recorded.sketches_of(np.concatenate([state[None], look.unlabelled[some]]))
                 nearest = some[np.linalg.norm(sketches[1:] - sketches[0], axis=1).argmin()]
                 turned = recorded.turning_patch(state, look.unlabelled[nearest], member, look.ensemble.predict)
-            title = "a failure" if turned is None else f"a false positive; {turned.after:.2f} without the framed patch"
+            title = (
+                "a failure"
+                if turned is None
+                else f"a false positive; {turned.after:.2f} with the framed patch exchanged"
+            )
             yield title, state, scores, turned
 
     return _cards(look, f"Member {member}: failures that a policy would be drawn to", shown())

@@ -54,7 +54,9 @@ def import_data(
     """
     rules = labels or {}
     claim(out, kind=DATA, inputs=[source], force=force)
-    if source.is_file() and begins_as(source, DATA):
+    if source.is_file() and begins_as(source, DATA, "Give a file that can be read."):
+        if sub_goals or keys or resize or every > 1 or stack or domain != IMPORTED:
+            raise UserError("a data file is taken as it is", source, "Give --label NAME=TABLE.csv and --out alone.")
         return _marked(source, out, rules, seed=seed, force=force)
     if (source / MINARI).exists():
         functions = [load_own(name, "label function", LABELS, {}) for name in rules.values()]

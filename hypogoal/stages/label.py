@@ -62,31 +62,28 @@ def label(
         return marks.counts()
 
 
-def label_next(
-    audit: Path, out: Path, *, count: int, sub_goal: str | None = None, resume: bool = False
-) -> tuple[dict[str, int], Path, str]:
+def label_next(audit: Path, out: Path, *, count: int, resume: bool = False) -> tuple[dict[str, int], Path, str]:
     """Show the first ``count`` states that an audit of recorded data proposes and save a person's marks in a table.
 
-    Returns the number of marked states of each kind, the data file and the sub-goal. ``out`` is the table, a .csv file
-    for ``import``; with ``resume`` its marks are kept. Something else than such an audit, an unknown sub-goal, data
-    that are gone or no pictures, and a missing screen are a ``UserError``.
+    Returns the number of marked states of each kind, the data file and its sub-goal. ``out`` is the table, a .csv file
+    for ``import``; with ``resume`` its marks are kept. Something else than such an audit, data of several sub-goals,
+    data that are gone or no pictures, and a missing screen are a ``UserError``.
     """
     artefact = open_artefact(audit, "recorded-audit").whole()
-    goals = artefact.config["sub_goals"]
-    if (sub_goal or goals[0]) not in goals or (sub_goal is None and len(goals) > 1):
-        raise UserError("which sub-goal?", audit, f"Give --sub-goal, one of {', '.join(goals)}.")
-    goal, data = sub_goal or goals[0], artefact.input(DATA)
-    if len(open_dataset(data).sub_goals) > 1:
+    data = artefact.input(DATA)
+    dataset = open_dataset(data)
+    if len(dataset.sub_goals) > 1:
         raise UserError("a table labels data of one sub-goal, its own", data, "Import the states for each by itself.")
+    [goal] = dataset.sub_goals
     if out.suffix != ".csv":
         raise UserError("--next writes a table", out, "Give --out NAME.csv.")
     if out.exists() and not resume:
         raise UserError("the table exists already", out, "Give --resume to continue it, or another --out.")
     rows = read_marks(audit / "next" / f"{goal}.csv")
-    given = {row["digest"]: row["label"] for row in read_marks(out)} if out.exists() else {}
+    labels = {row["digest"]: row["label"] for row in read_marks(out)} if out.exists() else {}
     for row in rows:
-        row["label"] = given.get(row["digest"], "")
-    states = open_dataset(data).unlabelled()
+        row["label"] = labels.get(row["digest"], "")
+    states = dataset.unlabelled()
     places = [int(row["row"]) for row in rows[:count]]
     if any(
         place >= len(states) or digest(states[place]).hex() != row["digest"]

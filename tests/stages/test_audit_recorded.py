@@ -78,6 +78,34 @@ def test_what_is_labelled_next_becomes_data(
     assert main(["train-ensemble", str(more), "--out", str(tmp_path / "ensemble"), "-q", *few]) == 0
 
 
+def test_a_data_file_is_taken_as_it_is(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What ``import`` would do to other sources is not silently left out."""
+    out, table = tmp_path / "more.h5", audited / "audit/next" / f"{GOAL}.csv"
+    for words in (["--resize", "32"], ["--every", "2"], ["--domain", "doorkey"], ["--key", "front"], ["--stack"]):
+        words = ["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", *words, "--out", str(out)]
+        assert main(words) == 2
+        assert "a data file is taken as it is" in capsys.readouterr().err and not out.exists()
+
+
+def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Data of two sub-goals can be audited; labelling them is one line, and no command is printed that would fail."""
+    arrays = mixed.arrays()
+    for name in ("labels", "heldout_labels"):
+        arrays[name] = np.stack([arrays[name], ~arrays[name]], axis=1)
+    np.savez(tmp_path / "states.npz", **arrays)
+    run = tmp_path / "run"
+    goals = ["--sub-goal", "one", "--sub-goal", "two"]
+    assert main(["import", str(tmp_path / "states.npz"), *goals, "--out", str(run / "data.h5"), "-q"]) == 0
+    few = ["--set", "steps=2", "--set", "members=1", "--set", "diversity=none", "--set", "workers=1"]
+    assert main(["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "-q", *few]) == 0
+    capsys.readouterr()
+    assert main(["audit", str(run / "ensemble"), "--out", str(run / "audit")]) == 0
+    assert "next:" not in capsys.readouterr().out
+    assert {path.name for path in (run / "audit/next").iterdir()} == {"one.csv", "two.csv"}
+    assert main(["label", str(run / "audit"), "--next", "3", "--out", str(run / "labels.csv")]) == 2
+    assert "a table labels data of one sub-goal" in capsys.readouterr().err
+
+
 def damaged(table: Path, out: Path, **cells: str) -> Path:
     """A copy of a table whose first row has other cells."""
     rows = list(csv.DictReader(table.read_text().splitlines()))
@@ -114,8 +142,9 @@ def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsy
     """No ensemble, settings, an unknown sub-goal, another artefact; nothing is left behind."""
     ensemble, out = str(audited / "ensemble"), tmp_path / "audit"
     for words, says in [
-        (["mine:classify"], "recorded data are audited of ensembles"),
+        (["mine:classify"], "on recorded data an audit takes an ensemble"),
         ([ensemble, "--set", "steps=3"], "without settings"),
+        ([ensemble, "--member", "1"], "all members"),
         ([ensemble, "--sub-goal", "other"], "unknown sub-goal"),
         ([ensemble, "--domain", "doorkey"], "which sub-goal is the truth?"),
         ([str(audited / "audit")], "but ensemble is needed"),
