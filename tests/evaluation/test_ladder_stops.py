@@ -20,7 +20,7 @@ def executions(distances: tuple[list[int], list[int]]) -> Executions:
     inside[len(distances[0]) + 1] = True
     zeros = np.zeros(count, int)
     return Executions.cast(
-        zeros, option, zeros + 5, zeros == 0, inside, zeros > 0, zeros + 9, zeros + 77, zeros + 235, sum(distances, [])
+        zeros, option, zeros + 5, zeros == 0, inside, zeros > 0, zeros + 9, zeros + 77, zeros + 235, [*distances[0], *distances[1]]
     )
 
 
