@@ -18,9 +18,9 @@ def executions(distances: tuple[list[int], list[int]]) -> Executions:
     count = len(option)
     inside = np.zeros(count, bool)
     inside[len(distances[0]) + 1] = True
-    zeros = np.zeros(count, int)
+    zeros, distance = np.zeros(count, int), [*distances[0], *distances[1]]
     return Executions.cast(
-        zeros, option, zeros + 5, zeros == 0, inside, zeros > 0, zeros + 9, zeros + 77, zeros + 235, [*distances[0], *distances[1]]
+        zeros, option, zeros + 5, zeros == 0, inside, zeros > 0, zeros + 9, zeros + 77, zeros + 235, distance
     )
 
 
