@@ -131,6 +131,8 @@ def audit(
 
 
 def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, member: int | None) -> None:
+    from hypogoal.core.artefacts import open_artefact
+    from hypogoal.dataset import open_dataset
     from hypogoal.stages.audit_recorded import audit_recorded, lines_of
 
     if not Path(source).is_dir() or member is not None or call.settings or call.preset or call.how["resume"]:
@@ -141,7 +143,8 @@ def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, memb
     for line in () if call.how["quiet"] else lines_of(parts):
         say(line)
     table = call.out.with_name("labels.csv")  # the audit's own folder is sealed
-    cli.print_next(call.how["quiet"] or len(parts) > 1, "label", call.out, "--next", 20, "--out", table)
+    several = len(open_dataset(open_artefact(call.out).input("data")).sub_goals) > 1  # which 'label' refuses
+    cli.print_next(call.how["quiet"] or several, "label", call.out, "--next", 20, "--out", table)
     give(call.out / "index.html")
 
 

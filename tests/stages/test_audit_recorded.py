@@ -99,8 +99,9 @@ def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path, capsys: pytes
     few = ["--set", "steps=2", "--set", "members=1", "--set", "diversity=none", "--set", "workers=1"]
     assert main(["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "-q", *few]) == 0
     capsys.readouterr()
-    assert main(["audit", str(run / "ensemble"), "--out", str(run / "audit")]) == 0
-    assert "next:" not in capsys.readouterr().out
+    for words in (["--sub-goal", "one", "--out", str(run / "of-one")], ["--out", str(run / "audit")]):
+        assert main(["audit", str(run / "ensemble"), *words]) == 0
+        assert "next:" not in capsys.readouterr().out
     assert {path.name for path in (run / "audit/next").iterdir()} == {"one.csv", "two.csv"}
     assert main(["label", str(run / "audit"), "--next", "3", "--out", str(run / "labels.csv")]) == 2
     assert "a table labels data of one sub-goal" in capsys.readouterr().err
