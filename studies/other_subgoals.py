@@ -20,7 +20,7 @@ from hypogoal.options.tables import Executions
 from studies import ladders
 from studies.cells import Row, interval, parser_of, run_cells, table
 
-SUB_GOALS = ("climb-up-ladder", "pass-enemy-left")
+SUB_GOALS = ("climb-up-ladder", "pass-enemy-left", "pass-enemy-right")
 METHODS = ("dbat", "none", "cnn")
 LOOKS = (25, 100, 300)
 GROUPS, HELDOUT = 1, 100
