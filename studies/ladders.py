@@ -40,6 +40,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "dbat-unpaired": {"diversity": "dbat-unpaired"},
     "say-no": {"diversity": "say-no"},
 }
+OTHERS: dict[str, dict[str, Any]] = {"joint": {"diversity": "none", "proposals": "joint"}}
 MEMBERS = 3
 LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
 SHOWN = (10, 25, 50, 100, 300, 600, 1000)  # of these in the table
@@ -125,7 +126,7 @@ def run_cell(
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
-        dataclasses.replace(config, **METHODS[method], **changes),
+        dataclasses.replace(config, **(METHODS | OTHERS)[method], **changes),
         seed_for(seed, "ensemble", sub_goal),
         Watcher(look=look, look_at=looks),
     )
@@ -188,6 +189,16 @@ def tables(path: Path) -> Iterator[str]:
             yield from _tables(groups, numbers)
         elif seeds > 1:
             yield from _tables_of_all_rooms(groups, numbers)
+
+
+def beside_others(joint: Path, others: Path) -> Iterator[str]:
+    """The tables of joint beside three other methods at N = 1, of the seeds and looks that all have."""
+    numbers = read(others, 1) | read(joint, 1)
+    shown = [numbers[name] for name in ("dbat", "none", "cnn", "joint")]
+    seeds = sorted(set.intersection(*map(set, shown)))
+    looks = sorted(set.intersection(*(set(method[seed]) for method in shown for seed in seeds)))
+    alike = ({seed: {look: method[seed][look] for look in looks} for seed in seeds} for method in shown)
+    yield from _tables(1, dict(zip(("dbat", "none", "cnn", "joint"), alike, strict=True)))
 
 
 def _tables_of_all_rooms(groups: int, numbers: Numbers) -> Iterator[str]:
@@ -270,7 +281,11 @@ def main() -> None:
     parser.add_argument("--groups", type=parse_integers, default=[1], help="labelled ladder groups: 1 or 1-4")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
+    parser.add_argument("--joint", type=Path, metavar="CSV", help="print cells of joint beside those in this file")
     arguments = parser.parse_args()
+    if arguments.joint:
+        print("\n".join(beside_others(arguments.csv, arguments.joint)))
+        return
     if printed(arguments, tables):
         return
     looks = tuple(step for step in LOOKS if step <= arguments.until)
