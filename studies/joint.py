@@ -22,7 +22,7 @@ from torch import Tensor
 
 from hypogoal.core.files import write_table
 from hypogoal.core.progress import Progress
-from hypogoal.hypotheses import proposals
+from hypogoal.hypotheses import patterns, proposals
 from hypogoal.which_feature.run import COLUMNS, JOINT, parse_entry, read_cells, resolved, rows_of, run_cell
 from hypogoal.which_feature.states import FACTORS
 from hypogoal.which_feature.table import summary
@@ -32,19 +32,19 @@ from studies.which_feature import HIGH, LOW, covered
 SEEDS, MIXES = (200, 201, 202, 203, 204), (1.0,)
 
 
-class RandomPatterns(proposals.Patterns):
+class RandomPatterns(patterns.Patterns):
     """Filters that are noise instead of patches of the pictures."""
 
     def __init__(self, pictures: NDArray[np.uint8], stride: int, rng: np.random.Generator):
         super().__init__(pictures, stride, rng)
-        shape = (proposals.FILTERS, *self.weight.shape[1:])
-        self.weight = torch.from_numpy(rng.normal(0.0, 1.0 / proposals.SIDE, shape).astype(np.float32))
+        shape = tuple(self.weight.shape)
+        self.weight = torch.from_numpy(rng.normal(0.0, 1.0 / patterns.SIDE, shape).astype(np.float32))
         centre = float(pictures.mean()) / 255.0
-        offsets = torch.from_numpy(rng.normal(0.0, 0.3, proposals.FILTERS).astype(np.float32))
+        offsets = torch.from_numpy(rng.normal(0.0, 0.3, len(self.bias)).astype(np.float32))
         self.bias = offsets - centre * self.weight.sum((1, 2, 3))
 
 
-class WholePatterns(proposals.Patterns):
+class WholePatterns(patterns.Patterns):
     """Sums over the picture alone."""
 
     def of(self, pictures: NDArray[np.uint8]) -> Tensor:
@@ -76,7 +76,7 @@ def run(path: Path, cells_wanted: Iterable[tuple[str, float, int]], agreement: s
         for variant, mix, seed in wanted:
             settings, parts = VARIANTS[variant]
             config = replace(resolved({}), agreement=agreement or f"{1.0 - mix:g}", **settings)
-            with mock.patch.multiple(proposals, **{"Patterns": proposals.Patterns, **parts}):
+            with mock.patch.multiple(proposals, **{"Patterns": patterns.Patterns, **parts}):
                 cells.append(replace(run_cell(parse_entry(JOINT), mix, seed, config), entry=variant))
             write_table(path, COLUMNS, rows_of(cells, FACTORS))
             progress.advance()
