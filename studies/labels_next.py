@@ -2,7 +2,7 @@
 
     python -m studies.labels_next docs/results/labels-next.csv --seeds 0-9
 
-A cell is a way of picking, a sub-goal and a seed: an ensemble learns the labelled states of layout 0, states of a pool
+A cell is a way of picking, a sub-goal and a seed: an ensemble learns 200 labelled states of layout 0, states of a pool
 from ten other layouts are picked and labelled by the truth, it is trained anew, and so on up to ``BUDGETS[-1]`` labels.
 Kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 """
@@ -29,11 +29,11 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import fit
 from studies.cells import Jobs, Row, difference, parser_of, printed, read_rows, run_cells, table
 
-SUB_GOALS = ("collect-red-key", "open-red-door")
+SUB_GOALS = ("collect-red-key", "collect-blue-key")
 BUDGETS = (0, 10, 20, 40, 80, 160, 320)
-POOL, STEPS = 4_000, 150
+FIRST, POOL, STEPS = 200, 4_000, 150
 LIMIT = 0.02
-LATE = 5  # steps behind the nearest true state that a policy still looks for a positive
+LATE = 2  # steps behind the nearest true state that a policy still looks for a positive
 KEYS = ("sub_goal", "way", "seed", "step")  # a step is a number of labels
 ENDS = ("fooled", "there", "fooled_strictest", "there_strictest")  # by the mean of members, and by all of them
 COLUMNS = (*KEYS, "positives", *ENDS)
@@ -46,7 +46,7 @@ class Places(NamedTuple):
     judged: range
 
 
-PLACES = {"choice": Places(range(11, 21), range(500, 550)), "test": Places(range(1, 11), range(1000, 1050))}
+PLACES = {"choice": Places(range(11, 21), range(500, 600)), "test": Places(range(1, 11), range(1000, 1100))}
 WAYS = {  # members, objective, who picks
     "next": (3, "dbat", "next"),
     "random": (3, "dbat", "random"),
@@ -114,7 +114,8 @@ def run_cell(layouts: str, way: str, sub_goal: str, seed: int) -> list[Row]:
     data, column = states_of(layouts), DOMAIN.sub_goals.index(sub_goal)
     pool = rng_for(seed, "labels-next", "pool").choice(len(data.unlabelled.labels), POOL, replace=False)
     states, truth = data.unlabelled.observations[pool], data.unlabelled.labels[pool, column]
-    known, labels = data.labelled.observations, data.labelled.labels[:, column]
+    first = rng_for(seed, "labels-next", "first").choice(len(data.labelled.labels), FIRST, replace=False)
+    known, labels = data.labelled.observations[first], data.labelled.labels[first, column]
     config = EnsembleConfig(steps=STEPS, members=members, diversity=objective)
     labelled, rows = np.zeros(POOL, np.bool_), []
     ensemble: Ensemble | None = None
