@@ -23,16 +23,16 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.dataset import Collected
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.evaluation.recorded import disagreement, sketches_of, to_label
+from hypogoal.evaluation.recorded import density_of, disagreement, sketches_of, to_label
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import fit
 from studies.cells import Jobs, Row, difference, parser_of, printed, read_rows, run_cells, table
 
 SUB_GOALS = ("collect-red-key", "collect-blue-key")
-BUDGETS = (0, 10, 20, 40, 80, 160, 320)
+BUDGETS = (0, 10, 20, 40, 80, 160)
 FIRST, POOL, STEPS = 200, 4_000, 150
-LIMIT = 0.02
+FOOLED, THERE = 0.02, 0.9  # at most, at least, of the layouts
 LATE = 2  # steps behind the nearest true state that a policy still looks for a positive
 KEYS = ("sub_goal", "way", "seed", "step")  # a step is a number of labels
 ENDS = ("fooled", "there", "fooled_strictest", "there_strictest")  # by the mean of members, and by all of them
@@ -48,7 +48,8 @@ class Places(NamedTuple):
 
 PLACES = {"choice": Places(range(11, 21), range(500, 600)), "test": Places(range(1, 11), range(1000, 1100))}
 WAYS = {  # members, objective, who picks
-    "next": (3, "dbat", "next"),
+    "next": (3, "dbat", "next"),  # as the audit picks: members disagree, and there are many such states
+    "disagreement": (3, "dbat", "disagreement"),  # without the latter
     "random": (3, "dbat", "random"),
     "uncertain": (3, "dbat", "uncertain"),
     "single-random": (1, "none", "random"),
@@ -103,8 +104,8 @@ def pick(picked: str, ensemble: Ensemble, states: NDArray[np.uint8], count: int,
     probabilities = ensemble.predict(states)
     if picked == "uncertain":
         return np.argsort(np.abs(probabilities.mean(1) - 0.5), kind="stable")[:count]
-    thresholds = ensemble.thresholds.cpu().numpy()
-    return to_label(disagreement(probabilities, thresholds), sketches_of(states), count)
+    scores, sketches = disagreement(probabilities, ensemble.thresholds.cpu().numpy()), sketches_of(states)
+    return to_label(scores * density_of(sketches) if picked == "next" else scores, sketches, count)
 
 
 def run_cell(layouts: str, way: str, sub_goal: str, seed: int) -> list[Row]:
@@ -141,13 +142,15 @@ def _ends_of(ensemble: Ensemble, course: Course) -> tuple[float, ...]:
     return (*ends(probabilities.mean(1) > 0.5, course), *ends(probabilities.min(1) > 0.5, course))
 
 
-def labels_needed(fooled: Mapping[int, float]) -> int:
-    """The fewest labels from which on a policy is fooled (share by budget) in at most ``LIMIT`` of the layouts; twice
-    the last budget where it is more often even then.
+def labels_needed(ended: Mapping[int, tuple[float, float]]) -> int:
+    """The fewest labels from which on a policy is fooled at most ``FOOLED`` and there at least ``THERE`` of the time.
+
+    ``ended`` are both shares by budget; twice the last budget where even that does not suffice.
     """
-    needed = 2 * max(fooled)
-    for budget in sorted(fooled, reverse=True):
-        if fooled[budget] > LIMIT:
+    needed = 2 * max(ended)
+    for budget in sorted(ended, reverse=True):
+        fooled, there = ended[budget]
+        if fooled > FOOLED or there < THERE:
             break
         needed = budget
     return needed
@@ -156,34 +159,50 @@ def labels_needed(fooled: Mapping[int, float]) -> int:
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     rows = read_rows(path)
-    for sub_goal in SUB_GOALS:
-        ways = {way: _by_seed(rows, sub_goal, way) for way in WAYS}
-        seeds = sorted(set.intersection(*map(set, ways.values())))
+    for by, what in (("_strictest", "all members are positive"), ("", "their mean is positive")):
+        ways = {way: _by_cell(rows, way, by) for way in WAYS}
+        seeds = [
+            seed for seed in range(100) if all({(goal, seed) for goal in SUB_GOALS} <= set(of) for of in ways.values())
+        ]
         if not seeds:
             continue
-        needed = {way: np.log2([max(1, labels_needed(each[seed])) for seed in seeds]) for way, each in ways.items()}
-        yield f"`{sub_goal}`, {len(seeds)} seeds."
+        needed = {way: np.array([_needed(of, seed) for seed in seeds]) for way, of in ways.items()}
+        yield f"Paid where {what}: episodes that end in a false positive / there, {len(seeds)} seeds."
         yield ""
         yield from table(
             ["", *(f"{budget} labels" for budget in BUDGETS), "labels needed", "halvings against random"],
             (
                 [
                     way,
-                    *(f"{np.mean([each[seed][budget] for seed in seeds]):.2f}" for budget in BUDGETS),
+                    *(_shares(of, seeds, budget) for budget in BUDGETS),
                     f"{2 ** needed[way].mean():.0f}",
                     "-" if way == "random" else difference(needed["random"] - needed[way], 1),
                 ]
-                for way, each in ways.items()
+                for way, of in ways.items()
             ),
         )
 
 
-def _by_seed(rows: list[dict[str, str]], sub_goal: str, way: str) -> dict[int, dict[int, float]]:
-    fooled: dict[int, dict[int, float]] = {}
+Ended = dict[tuple[str, int], dict[int, tuple[float, float]]]  # by sub-goal and seed, and by budget: fooled, there
+
+
+def _by_cell(rows: list[dict[str, str]], way: str, by: str) -> Ended:
+    ended: Ended = {}
     for row in rows:
-        if (row["sub_goal"], row["way"]) == (sub_goal, way):
-            fooled.setdefault(int(row["seed"]), {})[int(row["step"])] = float(row["fooled"])
-    return {seed: shares for seed, shares in fooled.items() if len(shares) == len(BUDGETS)}
+        if row["way"] == way:
+            cell = ended.setdefault((row["sub_goal"], int(row["seed"])), {})
+            cell[int(row["step"])] = float(row[f"fooled{by}"]), float(row[f"there{by}"])
+    return ended
+
+
+def _needed(ended: Ended, seed: int) -> float:
+    """The binary logarithm of the labels needed, mean over sub-goals; less than ten count as five."""
+    return float(np.mean([np.log2(max(5, labels_needed(ended[goal, seed]))) for goal in SUB_GOALS]))
+
+
+def _shares(ended: Ended, seeds: list[int], budget: int) -> str:
+    fooled, there = np.mean([ended[goal, seed][budget] for goal in SUB_GOALS for seed in seeds], axis=0)
+    return f"{fooled:.2f} / {there:.2f}"
 
 
 def main() -> None:

@@ -68,21 +68,25 @@ def disagreement(probabilities: NDArray[np.floating], thresholds: NDArray[np.flo
     return np.mean([np.abs(centred[:, first] - centred[:, second]) for first, second in pairs], axis=0)
 
 
-def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """The rows of ``count`` states to label next, best first: disputed, like many others, unlike those before.
+def density_of(sketches: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How common each state is (N,): 1 where its ten nearest are as far as usual, up to e where they are nearer."""
+    neighbours = min(NEIGHBOURS + 1, len(sketches))
+    near = KDTree(sketches).query(sketches, neighbours)[0].reshape(len(sketches), -1).mean(1)
+    density: NDArray[np.float64] = np.exp(1 - near / (np.median(near) or 1.0))
+    return density
 
-    The score (N,) times the density (1 where the ten nearest are as far as usual) times how far the nearest row before
-    is (0 there, 1 at the usual distance of two states).
+
+def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """The rows of ``count`` states to label next, best first: with a high score, and unlike those before.
+
+    The score (N,), at least 0, times how far the nearest row before is: 0 there, 1 at the usual distance of two states.
     """
-    count, neighbours = min(count, len(scores)), min(NEIGHBOURS + 1, len(scores))
-    near = KDTree(sketches).query(sketches, neighbours)[0].reshape(len(scores), -1).mean(1)
-    values = scores * np.exp(1 - near / (np.median(near) or 1.0))
     some = sketches[spread_rows(len(sketches), SAMPLE)]
     usual = float(np.median(cdist(some, some))) or 1.0
     rows: list[int] = []
     apart = np.ones(len(scores))
-    for _ in range(count):
-        remaining = np.where(np.isin(np.arange(len(scores)), rows), -1.0, values * apart)
+    for _ in range(min(count, len(scores))):
+        remaining = np.where(np.isin(np.arange(len(scores)), rows), -1.0, scores * apart)
         rows.append(int(remaining.argmax()))
         distance = np.linalg.norm(sketches - sketches[rows[-1]], axis=1) / usual
         apart = np.minimum(apart, 1 - np.exp(-(distance**2)))

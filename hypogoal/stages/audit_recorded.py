@@ -111,7 +111,7 @@ def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
     states, scores = look.unlabelled[rows], look.scores[rows]
     sketches = recorded.sketches_of(states)
     disputed = recorded.disagreement(scores, look.thresholds)
-    proposed = recorded.to_label(disputed, sketches, NEXT)
+    proposed = recorded.to_label(disputed * recorded.density_of(sketches), sketches, NEXT)
     members = recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist())
     positive = scores > look.thresholds
     disagree = (positive.any(1) & ~positive.all(1)).mean()

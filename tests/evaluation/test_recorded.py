@@ -7,6 +7,7 @@ import pytest
 
 from hypogoal.dataset import States, packed
 from hypogoal.evaluation.recorded import (
+    density_of,
     disagreement,
     member_findings,
     opposite_pairs,
@@ -35,7 +36,7 @@ def test_states_to_label_are_disputed_common_and_unlike_each_other() -> None:
     crowds = [rng.normal(place, 0.1, (20, 2)) for place in ((0, 0), (5, 0), (0, 5))]
     sketches = np.concatenate([*crowds, [[40.0, 40.0]]])
     scores = np.repeat([0.9, 0.0, 0.8, 0.95], [20, 20, 20, 1])
-    rows = to_label(scores, sketches, 4)
+    rows = to_label(scores * density_of(sketches), sketches, 4)
     assert sorted(row // 20 for row in rows[:2].tolist()) == [0, 2]
     assert 60 not in rows.tolist(), "whatever its score, nothing else is like it"
     assert len({*rows.tolist()}) == 4 and all(scores[rows] > 0)
