@@ -268,6 +268,10 @@ def test_a_damaged_dataset_is_one_line(
         ("episode,from,to\n0,a,2\n", "a label is of frames a up to 2.* Give integers"),
         ("episode,from,to\n0,1\n", "a label is of frames 1 up to None"),
         ("take,begin\n0,1\n", "lacks a column of episode, from, to"),
+        ("", "lacks a column of episode, from, to"),
+        ("episode;from;to\n0;1;2\n", "lacks a column of episode, from, to.*with commas between"),
+        ("episode,from,to\n0,1,2" + "9" * 200_000, "the table of labels is damaged"),
+        ("\ufeffepisode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
         ("episode,from,to\n0,1,2\n", "1 episodes cannot be labelled, and held out"),
     ],
 )
