@@ -107,7 +107,7 @@ def _batches(layouts: str, unlabelled: bool) -> list[patches.Batch]:
     network = Ensemble(EnsembleConfig().network, observations.shape[1:], 1, torch.Generator()).networks[0]
     batches = []
     for start in range(0, len(observations), PATCH_CHUNK):
-        tables = patches.make_tables(observations[start : start + PATCH_CHUNK], network)
+        tables = patches.make_tables([observations[start : start + PATCH_CHUNK]], network)
         assert tables is not None
         batches.append(patches.take(tables, np.arange(len(observations[start : start + PATCH_CHUNK]))))
     return batches

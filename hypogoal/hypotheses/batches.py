@@ -15,7 +15,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Observations, require_classes, values_in
+from hypogoal.dataset import Observations, Standard, require_classes, values_in
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -39,7 +39,7 @@ class TrainingStates:
 
     Args:
         observations, labels: the members' view of the labelled states, (N, h, w, C) or (N, *shape), and labels (N,).
-        unlabelled: the same of the unlabelled states.
+        unlabelled: the same of the unlabelled states. On a CPU these arrays are kept and not copied.
         network: any of the networks that will see them (their layers decide how images are stored).
         trunk: the layers that the networks share. If it is ``frozen``, the features of all states are computed once
             and kept in memory, or for each batch if states are changed at random.
@@ -47,6 +47,7 @@ class TrainingStates:
         grey: whether a random function maps the shades of each state of a training batch.
         context: whether most states' surroundings are replaced before that: :func:`.changes.other_context`.
         jitter: the most pixels by which each state is moved at random; images have this margin on every side.
+        standard: mean and deviation (D,) of mixed observations' numbers, to standardise these in each batch.
 
     Raises:
         UserError: shapes that do not fit, or labels of one class only.
@@ -66,6 +67,7 @@ class TrainingStates:
         jitter: int = 0,
         trunk: nn.Sequential | None = None,
         frozen: bool = False,
+        standard: Standard | None = None,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
@@ -73,22 +75,24 @@ class TrainingStates:
         require_classes(labels[:, None], ["the sub-goal"], None, "Collect others.")
         self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
         self.ladders, self.device = ladders, device
-        self._labelled = observations
-        images = np.concatenate([observations, unlabelled])
         self._grey, self._jitter, self._context = grey, jitter, context
+        self._dtype, self._shape = observations.dtype, (values_in(observations.shape[1:], observations.dtype),)
+        self._standard = [torch.from_numpy(values).to(device) for values in standard or ()]
+        images = [np.require(some, requirements=["C", "W"]) for some in (observations, unlabelled)]
         tables = device.type == "cpu" and not (grey or jitter)  # changed images have changed patches
         self._tables = patches.make_tables(images, trunk or network) if tables else None
-        self._dtype, self._shape = images.dtype, (values_in(images.shape[1:], images.dtype),)
-        self._images = as_tensor(images).to(device) if self._tables is None else None
+        self._labelled = images[0]
+        self._images = [as_tensor(some).to(device) for some in images] if self._tables is None else []
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
         self._trunk, self._features = trunk, None
         self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # trained by all networks
         if trunk is not None and frozen and not (grey or jitter):
             size = at_once(EVALUATED_AT_ONCE, self._shape)
-            chunks = [np.arange(at, min(at + size, len(images))) for at in range(0, len(images), size)]
+            count = self.n_labelled + self.n_unlabelled
+            chunks = [np.arange(at, min(at + size, count)) for at in range(0, count, size)]
             with torch.no_grad():
                 self._features = torch.cat([_forward(trunk, self._inputs([chunk]), [len(chunk)]) for chunk in chunks])
-            self._tables = self._images = None
+            self._tables, self._images = None, []
 
     def forward(
         self,
@@ -129,7 +133,7 @@ class TrainingStates:
         They can be differentiated. In training mode BatchNorm uses the batch's statistics and leaves its running ones
         alone, so a gradient includes a state's effect on the others of its batch.
         """
-        inputs = as_input(as_tensor(self._labelled[states]).to(self.device), self._dtype)
+        inputs = as_input(as_tensor(self._labelled[states]).to(self.device), self._dtype, self._standard)
         if self._jitter:
             inputs = inputs[:, :, self._jitter : -self._jitter, self._jitter : -self._jitter]
         inputs = inputs.requires_grad_()
@@ -152,14 +156,16 @@ class TrainingStates:
                 _forward(network, inputs, [len(states)])
 
     def _images_of(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
-        assert self._images is not None
-        images = self._images[torch.from_numpy(states).to(self.device)]
+        numbers, (labelled, unlabelled) = torch.from_numpy(states).to(self.device), self._images
+        images, first = labelled.new_empty(len(states), *labelled.shape[1:]), numbers < self.n_labelled
+        images[first] = labelled[numbers[first]]
+        images[~first] = unlabelled[numbers[~first] - self.n_labelled]
         if self._context and changes is not None:
             images = torch.from_numpy(other_context(images.cpu().numpy(), changes)).to(self.device)
         if self._jitter:
             images = _cut(images, self._jitter, changes)
         if changes is None or not self._grey:
-            return as_input(images, self._dtype)
+            return as_input(images, self._dtype, self._standard)
         maps = torch.from_numpy(grey_maps(len(states), changes)).to(self.device)
         return maps.gather(1, images.flatten(start_dim=1).long()).view(images.shape).permute(0, 3, 1, 2)
 

@@ -232,7 +232,7 @@ class Ensemble(nn.Module):
         trunk, heads = self.parts
         device = self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables(observations, trunk or heads[0])
+            tables = patches.make_tables([observations], trunk or heads[0])
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
                 return _logits(trunk, heads, batch)

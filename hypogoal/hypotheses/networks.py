@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from math import prod
 from typing import Any, TypeAlias
@@ -27,7 +27,7 @@ from torch.nn.utils import fuse_conv_bn_eval
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
 from hypogoal.core.tensors import KEPT
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, values_in
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
 from hypogoal.hypotheses.load import ByKey
 
 CLASSES = 2
@@ -256,20 +256,23 @@ def as_tensor(observations: Observations) -> Tensor:
     return torch.from_numpy(observations)
 
 
-def as_input(observations: Tensor, dtype: np.dtype[Any] = PICTURE) -> Tensor:
+def as_input(observations: Tensor, dtype: np.dtype[Any] = PICTURE, standard: Sequence[Tensor] = ()) -> Tensor:
     """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
 
     Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too. Mixed ones
-    of type ``dtype``, as bytes, become float32 (N, D), the inputs of all keys in a row.
+    of type ``dtype``, as bytes, become float32 (N, D), the inputs of all keys in a row, their numbers standardised by
+    mean and deviation, (numbers,) each, if these are given.
     """
     if dtype.names:
-        rows = []
+        rows, place = [], 0
         for key, (kind, shape) in fields_of((), dtype).items():
             at = dtype.fields[key][1]  # type: ignore[index]
             part = observations[:, at : at + dtype[key].itemsize].clone(memory_format=torch.contiguous_format)
-            rows.append(
-                as_input((part.view(torch.float32) if kind == NUMBERS else part).reshape(-1, *shape)).flatten(1)
-            )
+            if kind == NUMBERS:
+                part, place = part.view(torch.float32), place + prod(shape)
+                if standard:
+                    part = standardised(part, *(each[place - prod(shape) : place] for each in standard))
+            rows.append(as_input(part.reshape(-1, *shape)).flatten(1))
         return torch.cat(rows, dim=1)
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered

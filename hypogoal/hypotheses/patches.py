@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import prod
 from typing import Any
 
@@ -81,19 +82,21 @@ def _side(size: object) -> int:
     return size[0] if isinstance(size, tuple) and size[0] == size[1] else -1
 
 
-def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | None:
-    """The distinct patches of images uint8 (N, H, W, C) as ``network`` sees them.
+def make_tables(observations: Sequence[NDArray[Any]], network: nn.Sequential) -> Tables | None:
+    """The distinct patches of images, arrays uint8 (N, H, W, C) one after another, as ``network`` sees them.
 
     None if too few repeat to be worthwhile, or if the network has unsupported layers.
     """
-    windows = windows_of(network)
-    if windows is None or len(observations) == 0 or observations.dtype != np.uint8:
+    windows, total = windows_of(network), sum(map(len, observations))
+    if windows is None or total == 0 or observations[0].dtype != np.uint8:
         return None
-    few = len(observations) <= 2 * SAMPLE  # of which all are looked at once
-    count = len(observations) if few else SAMPLE
-    count = max(1, min(count, SAMPLE_PIXELS // prod(observations.shape[1:3])))
-    spread = np.linspace(0, len(observations) - 1, count).astype(np.int64)
-    sample = _tables(observations[spread], windows)
+    few = total <= 2 * SAMPLE  # of which all are looked at once
+    count = total if few else SAMPLE
+    count = max(1, min(count, SAMPLE_PIXELS // prod(observations[0].shape[1:3])))
+    spread = np.linspace(0, total - 1, count).astype(np.int64)
+    firsts = np.cumsum([0, *map(len, observations)])
+    rows = [spread[(spread >= first) & (spread < end)] - first for first, end in pairwise(firsts)]
+    sample = _tables(np.concatenate([some[of] for some, of in zip(observations, rows, strict=True)]), windows)
     spatial = [layer for layer in network if isinstance(layer, (nn.Conv2d, nn.MaxPool2d))]
     work = [  # multiplications, or comparisons, of each layer at one place
         layer.weight.numel() if isinstance(layer, nn.Conv2d) else kernel**2
@@ -103,7 +106,7 @@ def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | 
     plain = sum(level.rows.shape[1] * level.lines.size * each for level, each in zip(sample.levels, work, strict=True))
     if tabled >= WORTHWHILE * plain:
         return None
-    return sample if count == len(observations) else _tables(observations, windows)
+    return sample if count == total else _tables(np.concatenate(observations), windows)
 
 
 def tables_of_codes(codes: NDArray[np.uint8], tiles: NDArray[np.uint8], windows: Sequence[tuple[int, int]]) -> Tables:

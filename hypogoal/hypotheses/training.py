@@ -24,7 +24,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.proposals import Search
 from hypogoal.hypotheses.thresholds import NEED_UNLABELLED, PAPER, thresholds
-from hypogoal.hypotheses.views import NO_ORIGINS, StateOrigins, positions_of, require_origins, view_of
+from hypogoal.hypotheses.views import NO_ORIGINS, Origins, StateOrigins, positions_of, require_origins, view_of
 
 OnStep = Callable[[int, dict[str, float]], None]
 Look = Callable[[int, Ensemble], None]
@@ -122,10 +122,15 @@ def fit(
     trunk, networks = ensemble.parts
     by_ladder = config.batch_kind == "per-ladder"
     ladders = require_origins(origins.labelled, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
+    mixed = bool(view.dtype.names)  # standardised in each batch: a view of all states would copy their pictures
+
+    def seen(some: Observations, of: Origins | None) -> Observations:
+        return some if mixed else view.see(some, positions_of(of), margin=config.jitter)
+
     states = TrainingStates(
-        view.see(observations, positions_of(origins.labelled), margin=config.jitter),
+        seen(observations, origins.labelled),
         labels,
-        view.see(unlabelled, positions_of(origins.unlabelled), margin=config.jitter),
+        seen(unlabelled, origins.unlabelled),
         networks[0],
         torch.device(device),
         ladders=ladders,
@@ -134,11 +139,12 @@ def fit(
         jitter=config.jitter,
         trunk=trunk,
         frozen=ensemble.frozen,
+        standard=view.standard if mixed else None,
     )
     search = None
     if config.proposals == "joint":
-        seen, elsewhere = view.see(observations, positions_of(origins.labelled)), positions_of(origins.unlabelled)
-        search = Search(seen, labels, view.see(unlabelled, elsewhere), config, seed_for(seed, "proposals"))
+        whole, elsewhere = view.see(observations, positions_of(origins.labelled)), positions_of(origins.unlabelled)
+        search = Search(whole, labels, view.see(unlabelled, elsewhere), config, seed_for(seed, "proposals"))
         if saved is not None:
             with checkpoints.restoring():
                 search.restore(saved["search"])

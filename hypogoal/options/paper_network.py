@@ -121,7 +121,7 @@ def looked_at(
     images: NDArray[np.uint8], times: NDArray[np.int64], network: PaperQNetwork, device: torch.device
 ) -> tuple[Any, ...]:
     """Arguments of :meth:`PaperQNetwork.embed` for images and how often each counts: patches where that is faster."""
-    tables = patches.make_tables(images, network.features) if device.type == "cpu" else None
+    tables = patches.make_tables([images], network.features) if device.type == "cpu" else None
     return (tensor(images, device), tensor(times, device)) if tables is None else (Patches(tables, times),)
 
 

@@ -18,6 +18,7 @@ from hypogoal.core.files import read_text
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Fields, Observations, mixed_type
 from hypogoal.domains.observations import shrunk_picture
+from hypogoal.own_data.marks import BYTE_ORDER
 from hypogoal.own_data.parts import Parts, require_memory
 
 SPLIT = (0.4, 0.4, 0.2)  # shares of episodes that are labelled, unlabelled and held out
@@ -145,9 +146,15 @@ def _marks(recording: Recording, rule: str) -> dict[int, NDArray[np.bool_]]:
 
 def _listed(recording: Recording, table: Path) -> dict[int, NDArray[np.bool_]]:
     """Positive frames by a table: of each row those from ``from`` up to, not including, ``to``."""
-    rows = csv.DictReader(io.StringIO(read_text(table, "the table of labels is", "Give a CSV file.")))
-    if not {*COLUMNS} <= {*(rows.fieldnames or ())}:
-        raise UserError(f"the table of labels lacks a column of {', '.join(COLUMNS)}", table, "Name them in line 1.")
+    text = read_text(table, "the table of labels is", "Give a CSV file.").removeprefix(BYTE_ORDER)
+    try:
+        reader = csv.DictReader(io.StringIO(text))
+        rows, names = list(reader), reader.fieldnames or ()
+    except csv.Error:
+        raise UserError("the table of labels is damaged", table, "Give a CSV file.") from None
+    if not {*COLUMNS} <= {*names}:
+        do = "Name them in line 1, with commas between."
+        raise UserError(f"the table of labels lacks a column of {', '.join(COLUMNS)}", table, do)
     marks: dict[int, NDArray[np.bool_]] = {}
     for number, row in enumerate(rows, 2):
         where, name = f"{table}, line {number}", str(row["episode"]).strip()

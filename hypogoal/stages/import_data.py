@@ -89,6 +89,10 @@ def _marked(source: Path, out: Path, rules: Mapping[str, str], *, seed: int, for
         raise UserError("a data file has labels already", source, "Give --label NAME=TABLE.csv for more of them.")
     [(sub_goal, table)] = rules.items()
     collected, count = with_marks(dataset, Path(table), sub_goal)
+    if not len(collected.unlabelled.labels):
+        line = f"no unlabelled state is left in {printable(out.name)}: members cannot be made to differ"
+        do = "Leave some without a label, train with --unlabelled OTHER.h5, or with --set diversity=none"
+        say(f"hypogoal: {line}. {do}.", err=True)
     config = dataset.config | {"marked": dataset.config.get("marked", 0) + count}
     write_dataset(out, collected, domain=dataset.domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()

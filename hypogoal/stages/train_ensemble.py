@@ -131,7 +131,8 @@ def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, ND
     sources = [(dataset.unlabelled(), dataset.unlabelled_origins()) for dataset in map(open_dataset, files)]
     names = set.intersection(*(set(origins) for _, origins in sources))
     joined = {name: np.concatenate([origins[name] for _, origins in sources]) for name in sorted(names)}
-    return np.concatenate([states for states, _ in sources]), joined
+    states = [states for states, _ in sources]
+    return states[0] if len(states) == 1 else np.concatenate(states), joined
 
 
 def score_rows(

@@ -21,6 +21,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env as check_sb3
+from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_data import reseal
 
 import hypogoal
@@ -359,6 +360,25 @@ def test_a_classifier_ends_an_episode(run: Path) -> None:
         env = reward.wrap(corridor(), ends=ends)
         env.reset(seed=0)
         assert [env.step(0)[2] for _ in range(2)] == [False, ends]
+
+
+@pytest.mark.parametrize("vectorised", [SyncVectorEnv, DummyVecEnv])
+def test_a_reward_is_shared_by_environments_side_by_side(ensemble: Ensemble, vectorised: Any) -> None:
+    """Each is wrapped in its own function; each has its own reward, end and ``info``."""
+    reward = hypogoal.SubgoalReward(ensemble)
+    envs = vectorised([lambda: reward.wrap(corridor())] * 2)
+    if vectorised is SyncVectorEnv:
+        envs.reset(seed=0)
+    else:
+        envs.seed(0)
+        envs.reset()
+    told = [envs.step(np.array([first, 1])) for first in (0, 1, 1)]  # of two, only the second goes straight to the goal
+    assert [step[1].tolist() for step in told] == [[0, 0], [0, 0], [0, 1]]
+    ended, info = told[-1][2], told[-1][-1]
+    assert ended.tolist() == [False, True]
+    held = info["subgoal"] if isinstance(info, dict) else [each["subgoal"] for each in info]
+    assert np.array(held).tolist() == [False, True]
+    envs.close()
 
 
 def test_thresholds_fall_where_nothing_is_rewarded(run: Path) -> None:

@@ -37,10 +37,10 @@ def picture(camera: str, place: float, episode: int) -> np.ndarray:
     return frame
 
 
-def write_video(path: Path, frames: list[np.ndarray], fps: int = FPS) -> None:
-    """An mp4 file of the best codec that this build of FFmpeg has."""
+def write_video(path: Path, frames: list[np.ndarray], fps: int = FPS, codec: str = "") -> None:
+    """An mp4 file, by default of the best codec that this build of FFmpeg has."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    codec = next(name for name in ("libx264", "libopenh264", "mpeg4") if name in av.codecs_available)
+    codec = codec or next(name for name in ("libx264", "libopenh264", "mpeg4") if name in av.codecs_available)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=fps)
         stream.height, stream.width = frames[0].shape[:2]
@@ -110,7 +110,7 @@ def write_table(path: Path, table: pa.Table) -> None:
     pq.write_table(table, path)
 
 
-def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> Path:
+def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video", codec: str = "") -> Path:
     """A LeRobotDataset; in v3.0 two files share the episodes of each camera, and one table all of them."""
     (folder / "meta").mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps(facts(version, kind)))
@@ -129,7 +129,7 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> P
             write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
             for key, camera in cameras.items() if kind == "video" else ():
                 frames = [picture(camera, place, episode) for place in places(episode)]
-                write_video(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames)
+                write_video(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames, codec=codec)
         return folder
     table = pa.concat_tables(tables)
     write_table(folder / "data/chunk-000/file-000.parquet", table)
@@ -149,7 +149,7 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> P
         for file in (0, 1):
             some = [(at, place) for at in episodes if at // 3 == file for place in places(at)]
             frames = [picture(camera, place, at) for at, place in some]
-            write_video(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames)
+            write_video(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames, codec=codec)
     return folder
 
 

@@ -88,6 +88,23 @@ def test_both_versions_hold_the_same_states(datasets: Path, tmp_path: Path) -> N
             assert np.abs(ours[0][TOP].astype(int) - theirs[0][TOP].astype(int)).mean() < 4  # videos are compressed
 
 
+@pytest.mark.parametrize("codec", ["libsvtav1", "libx264"])
+def test_videos_of_any_codec_hold_the_same_frames(datasets: Path, tmp_path: Path, codec: str) -> None:
+    """LeRobot writes AV1 by default; the pictures are those of the table, up to compression."""
+    if codec not in robot_data.av.codecs_available:
+        pytest.skip(f"this build of FFmpeg has no {codec}")
+    source = robot_data.write_lerobot(tmp_path / "source", codec=codec)
+    ours, exact = (
+        frames_of(imported(folder, tmp_path / f"{number}.h5", *LABEL))
+        for number, folder in enumerate([source, datasets / "v3.0-image"])
+    )
+    for (state, label), (whole, wanted) in zip(ours, exact, strict=True):
+        np.testing.assert_array_equal(state[STATE], whole[STATE])
+        assert label == wanted
+        for key in (TOP, WRIST):
+            assert np.abs(state[key].astype(int) - whole[key].astype(int)).mean() < 4
+
+
 def test_keys_are_chosen_and_one_picture_alone_is_a_picture(datasets: Path, tmp_path: Path) -> None:
     source, out = datasets / "v3.0-image", tmp_path / "data.h5"
     assert imported(source, out, *LABEL, "--key", TOP).observation_shape == (96, 128, 3)
@@ -251,6 +268,10 @@ def test_a_damaged_dataset_is_one_line(
         ("episode,from,to\n0,a,2\n", "a label is of frames a up to 2.* Give integers"),
         ("episode,from,to\n0,1\n", "a label is of frames 1 up to None"),
         ("take,begin\n0,1\n", "lacks a column of episode, from, to"),
+        ("", "lacks a column of episode, from, to"),
+        ("episode;from;to\n0;1;2\n", "lacks a column of episode, from, to.*with commas between"),
+        ("episode,from,to\n0,1,2" + "9" * 200_000, "the table of labels is damaged"),
+        ("\ufeffepisode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
         ("episode,from,to\n0,1,2\n", "1 episodes cannot be labelled, and held out"),
     ],
 )
