@@ -230,11 +230,16 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
     ReLU is monotone, so the order changes neither values nor gradients, but behind the pooling it has a quarter of the
     work. Only attribution needs the other order.
     """
-    layers = list(network)
+    layers = [_reordered_by_key(layer) if isinstance(layer, ByKey) else layer for layer in network]
     for index, (layer, following) in enumerate(pairwise(network)):
         if isinstance(layer, nn.ReLU) and isinstance(following, nn.MaxPool2d):
             layers[index], layers[index + 1] = following, layer
     return nn.Sequential(*layers)
+
+
+def _reordered_by_key(layer: ByKey) -> ByKey:
+    encoders = layer.encoders
+    return ByKey(layer.shapes, (reordered(each) if isinstance(each, nn.Sequential) else each for each in encoders))
 
 
 def folded(network: nn.Sequential) -> nn.Sequential:
