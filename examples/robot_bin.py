@@ -181,8 +181,8 @@ def record(folder: Path, seed: int, demos: int, others: int) -> None:
     print(f"{len(kinds)} episodes, {len(truth)} different frames")
 
 
-def answer(audit: Path, takes: Path, out: Path, count: int) -> None:
-    """Fill the first rows of an audit's table with the truth, and draw the first that fools a member."""
+def answer(audit: Path, takes: Path, out: Path, count: int, classifier: Path | None) -> None:
+    """Fill the first rows of an audit's table with the truth, and draw the first that fools the classifier."""
     ensemble = open_artefact(audit, "recorded-audit").input("ensemble")
     states = open_dataset(open_artefact(ensemble, "ensemble").input("data")).unlabelled()
     truth = json.loads((takes / "truth.json").read_text())
@@ -190,7 +190,7 @@ def answer(audit: Path, takes: Path, out: Path, count: int) -> None:
         rows = list(csv.DictReader(file))[:count]
     shown = states[[int(row["row"]) for row in rows]]
     inside = np.array([truth[name_of(state)] for state in shown])
-    members = hypogoal.load_ensemble(ensemble, GOAL)
+    members = hypogoal.load_ensemble(classifier or ensemble, GOAL)
     fooled = (members.predict(shown) > members.thresholds.cpu().numpy()) & ~inside[:, None]
     for row, label in zip(rows, inside, strict=True):
         row["label"] = str(int(label))
@@ -198,7 +198,8 @@ def answer(audit: Path, takes: Path, out: Path, count: int) -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    print(f"{len(rows)} frames, {inside.sum()} successes; false positives of members: {fooled.sum(0).tolist()}")
+    name, count_of = (classifier or ensemble).name, fooled.sum(0).tolist()
+    print(f"{len(rows)} frames, {inside.sum()} successes; false positives of each member of {name}: {count_of}")
     if fooled.any():
         state = shown[fooled.any(1).argmax()]
         picture = Image.fromarray(np.concatenate([state[key] for key in KEYS], axis=1))
@@ -234,6 +235,7 @@ def main() -> None:
     answers.add_argument("audit", type=Path)
     answers.add_argument("takes", type=Path)
     answers.add_argument("out", type=Path)
+    answers.add_argument("--classifier", type=Path, help="whose false positives are counted; else the audited one")
     answers.add_argument("--next", type=int, default=20)
     judges.add_argument("ensembles", type=Path, nargs="+")
     judges.add_argument("--plays", type=int, default=20)
@@ -243,7 +245,7 @@ def main() -> None:
     if words.command == "record":
         record(words.takes, words.seed, words.demos, words.others)
     elif words.command == "answer":
-        answer(words.audit, words.takes, words.out, words.next)
+        answer(words.audit, words.takes, words.out, words.next, words.classifier)
     else:
         judge(words.ensembles, words.seed, words.plays)
 
