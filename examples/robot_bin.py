@@ -26,7 +26,7 @@ from PIL import Image
 
 import hypogoal
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.dataset import open_dataset
+from hypogoal.dataset import digest, open_dataset
 
 GOAL, CAMERAS, HEIGHT, WIDTH, FPS = "block-in-bin", ("front", "wrist"), 48, 64, 5
 KEYS = [f"observation.images.{camera}" for camera in CAMERAS]
@@ -181,16 +181,22 @@ def record(folder: Path, seed: int, demos: int, others: int) -> None:
     print(f"{len(kinds)} episodes, {len(truth)} different frames")
 
 
-def answer(audit: Path, takes: Path, out: Path, count: int, classifier: Path | None) -> None:
-    """Fill the first rows of an audit's table with the truth, and draw the first that fools the classifier."""
+def answer(audit: Path, takes: Path, out: Path, count: int, random: int | None, table: Path | None) -> None:
+    """Fill the first rows of an audit's table with the truth, and draw the first that fools a member.
+
+    With ``random``, a seed, as many rows that are drawn at random instead: what the audit's choice is worth.
+    """
     ensemble = open_artefact(audit, "recorded-audit").input("ensemble")
     states = open_dataset(open_artefact(ensemble, "ensemble").input("data")).unlabelled()
     truth = json.loads((takes / "truth.json").read_text())
     with (audit / f"next/{GOAL}.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))[:count]
+    if random is not None:
+        drawn = np.random.default_rng(random).choice(len(states), count, replace=False).tolist()
+        rows = [{**rows[0], "row": str(row), "digest": digest(states[row]).hex()} for row in drawn]
     shown = states[[int(row["row"]) for row in rows]]
     inside = np.array([truth[name_of(state)] for state in shown])
-    members = hypogoal.load_ensemble(classifier or ensemble, GOAL)
+    members = hypogoal.load_ensemble(ensemble, GOAL)
     fooled = (members.predict(shown) > members.thresholds.cpu().numpy()) & ~inside[:, None]
     for row, label in zip(rows, inside, strict=True):
         row["label"] = str(int(label))
@@ -198,15 +204,24 @@ def answer(audit: Path, takes: Path, out: Path, count: int, classifier: Path | N
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    name, count_of = (classifier or ensemble).name, fooled.sum(0).tolist()
-    print(f"{len(rows)} frames, {inside.sum()} successes; false positives of each member of {name}: {count_of}")
+    print(f"{len(rows)} frames, {inside.sum()} successes; false positives by member: {fooled.sum(0).tolist()}")
+    note(table, *([out.stem, member, count, inside.sum(), ""] for member, count in enumerate(fooled.sum(0))))
     if fooled.any():
         state = shown[fooled.any(1).argmax()]
         picture = Image.fromarray(np.concatenate([state[key] for key in KEYS], axis=1))
         picture.resize((6 * picture.width, 6 * picture.height), Image.Resampling.NEAREST).save(out.with_suffix(".png"))
 
 
-def judge(ensembles: list[Path], seed: int, count: int) -> None:
+def note(table: Path | None, *rows: list[Any]) -> None:
+    """Append rows to a CSV: of answers the frames' false positives and successes, of a judge where plays ended."""
+    if table is not None:
+        new = not table.exists()
+        with table.open("a", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerows([["name", "member", "false_positives", "successes", "never"]] * new + [*rows])
+
+
+def judge(ensembles: list[Path], seed: int, count: int, table: Path | None) -> None:
     """Where the first positive frame of each fresh play is: at a false positive, at a success, nowhere."""
     plays = [play(np.random.default_rng([seed, number, 1]), "test") for number in range(count)]
     for path in ensembles:
@@ -222,6 +237,7 @@ def judge(ensembles: list[Path], seed: int, count: int) -> None:
         for member, column in enumerate(np.transpose(ends)):
             fooled, there, never = (int((column == end).sum()) for end in range(3))
             print(f"{path.name} {member}: fooled {fooled}, there {there}, never positive {never}")
+            note(table, [path.name, member, fooled, there, never])
 
 
 def main() -> None:
@@ -235,19 +251,21 @@ def main() -> None:
     answers.add_argument("audit", type=Path)
     answers.add_argument("takes", type=Path)
     answers.add_argument("out", type=Path)
-    answers.add_argument("--classifier", type=Path, help="whose false positives are counted; else the audited one")
+    answers.add_argument("--random", type=int, metavar="SEED", help="frames drawn at random instead")
     answers.add_argument("--next", type=int, default=20)
     judges.add_argument("ensembles", type=Path, nargs="+")
     judges.add_argument("--plays", type=int, default=20)
     for part in (recorder, judges):
         part.add_argument("--seed", type=int, default=0)
+    for part in (answers, judges):
+        part.add_argument("--csv", type=Path, help="append the numbers")
     words = parser.parse_args()
     if words.command == "record":
         record(words.takes, words.seed, words.demos, words.others)
     elif words.command == "answer":
-        answer(words.audit, words.takes, words.out, words.next, words.classifier)
+        answer(words.audit, words.takes, words.out, words.next, words.random, words.csv)
     else:
-        judge(words.ensembles, words.seed, words.plays)
+        judge(words.ensembles, words.seed, words.plays, words.csv)
 
 
 if __name__ == "__main__":

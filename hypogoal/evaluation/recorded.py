@@ -59,11 +59,11 @@ def sketches_of(observations: Observations) -> NDArray[np.float64]:
 def disagreement(probabilities: NDArray[np.floating], thresholds: NDArray[np.floating]) -> NDArray[np.float64]:
     """How much members' predictions (N, K) differ, 0 to 1: the mean over pairs, each about its own threshold (K,).
 
-    Of one member how near it is to its threshold, 1 there.
+    Of one member, which cannot disagree, its own prediction, 0.5 at its threshold: the more, the more a policy is paid.
     """
     centred = 1 / (1 + np.exp(log_odds_of(thresholds) - log_odds_of(probabilities)))
     if centred.shape[1] == 1:
-        return 1 - np.abs(2 * centred[:, 0] - 1)
+        return np.asarray(centred[:, 0])
     pairs = combinations(range(centred.shape[1]), 2)
     return np.mean([np.abs(centred[:, first] - centred[:, second]) for first, second in pairs], axis=0)
 

@@ -137,11 +137,24 @@ def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:
     for part in parts:
         worst = max(part["members"], key=lambda row: row["false_positives"])
         lines.append(
-            f"{part['sub_goal']}: members disagree in {part['disagreement']:.1%} of {part['unlabelled']:,} unlabelled "
-            f"states; of {worst['negatives']} known failures member {worst['member']} predicts "
-            f"{worst['false_positives']} positive (highest probability {worst['highest_negative']:.2f})"
+            f"{part['sub_goal']}: {_of_unlabelled(part)}; of {worst['negatives']} known failures member "
+            f"{worst['member']} predicts {worst['false_positives']} positive (highest probability "
+            f"{worst['highest_negative']:.2f})"
         )
     return lines
+
+
+def _of_unlabelled(part: dict[str, Any]) -> str:
+    """How members differ on unlabelled states, and which of them hold all of these for the same."""
+    shares, states = (
+        [row["positive_unlabelled"] for row in part["members"]],
+        f"{part['unlabelled']:,} unlabelled states",
+    )
+    if len(shares) == 1:
+        return f"the classifier predicts {shares[0]:.1%} of {states} positive"
+    alike = [str(member) for member, share in enumerate(shares) if share in (0.0, 1.0)]
+    which = f" (the same prediction for all of them: member {', '.join(alike)})" if alike else ""
+    return f"members disagree in {part['disagreement']:.1%} of {states}{which}"
 
 
 def _section(
@@ -165,15 +178,13 @@ def _section(
         "policy would be drawn to first. Alone: unlabelled states that no other member predicts positive."
     )
     blocks: list[Block] = [page.table(columns, numbers["members"], caption=caption, heading="Members")]
-    titles = [f"state {rows[row]}, disagreement {disputed[row]:.2f}" for row in proposed[:CARDS]]
+    what = "disagreement" if len(look.ensemble) > 1 else "prediction"
+    titles = [f"state {rows[row]}, {what} {disputed[row]:.2f}" for row in proposed[:CARDS]]
     shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in proposed[:CARDS]]
     blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
     for member in range(len(look.ensemble)):
         blocks += _drawn_to(look, member) + _pairs(look, member, rows, sketches)
-    paragraphs = [
-        f"{len(look.known.labels):,} labelled and held-out states, {len(look.unlabelled):,} unlabelled ones. "
-        f"Members disagree in {numbers['disagreement']:.1%} of the unlabelled states."
-    ]
+    paragraphs = [f"{len(look.known.labels):,} labelled and held-out states. Beyond them {_of_unlabelled(numbers)}."]
     return page.section(page.slug(look.sub_goal), look.sub_goal, paragraphs, blocks)
 
 

@@ -20,12 +20,14 @@ from hypogoal.evaluation.recorded import (
 
 
 def test_members_disagree_about_their_own_thresholds() -> None:
-    """0 where both say the same, 1 where they are sure of opposites; of one member how near it is to its threshold."""
+    """0 where both say the same, 1 where they are sure of opposites; of one member its own prediction."""
     both = np.array([[0.5, 0.9], [1.0, 0.0], [0.999, 0.9999]])
     found = disagreement(both, np.array([0.5, 0.9]))
     np.testing.assert_allclose(found[:2], [0.0, 1.0], atol=1e-6)
     assert found[2] < 0.01
-    np.testing.assert_allclose(disagreement(np.array([[0.9], [1.0]]), np.array([0.9])), [1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        disagreement(np.array([[0.9], [1.0], [0.0]]), np.array([0.9])), [0.5, 1.0, 0.0], atol=1e-6
+    )
     pairs = disagreement(np.array([[0.0, 0.0, 1.0]]), np.full(3, 0.5))
     np.testing.assert_allclose(pairs, [2 / 3], atol=1e-6)  # two of three pairs
 
