@@ -14,6 +14,7 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.dataset import digest, open_dataset
 from hypogoal.own_data.marks import read_marks
+from hypogoal.stages.audit_recorded import lines_of
 from tests.own_data import mixed
 
 GOAL = "door-open"
@@ -157,3 +158,15 @@ def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsy
     assert "but recorded-audit is needed" in capsys.readouterr().err
     assert main(["label", str(audited / "audit"), "--next", "3", "--out", str(tmp_path / "labels")]) == 2
     assert "--next writes a table" in capsys.readouterr().err
+
+
+def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:
+    """Of one classifier, which cannot disagree, the line says how many unlabelled states it predicts positive."""
+    rows = [
+        {"member": member, "negatives": 4, "false_positives": 0, "highest_negative": 0.1, "positive_unlabelled": share}
+        for member, share in enumerate((1.0, 0.25, 0.0))
+    ]
+    part = {"sub_goal": "door", "unlabelled": 8, "disagreement": 1.0, "members": rows}
+    assert "100.0% of 8 unlabelled states (the same prediction for all of them: member 0, 2)" in lines_of([part])[0]
+    alone = lines_of([part | {"members": rows[1:2]}])[0]
+    assert "the classifier predicts 25.0% of 8 unlabelled states positive" in alone and "disagree" not in alone
