@@ -137,19 +137,17 @@ def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:
     for part in parts:
         worst = max(part["members"], key=lambda row: row["false_positives"])
         lines.append(
-            f"{part['sub_goal']}: {_of_unlabelled(part)}; of {worst['negatives']} known failures member "
+            f"{part['sub_goal']}: {_describe_unlabelled(part)}; of {worst['negatives']} known failures member "
             f"{worst['member']} predicts {worst['false_positives']} positive (highest probability "
             f"{worst['highest_negative']:.2f})"
         )
     return lines
 
 
-def _of_unlabelled(part: dict[str, Any]) -> str:
+def _describe_unlabelled(part: dict[str, Any]) -> str:
     """How members differ on unlabelled states, and which of them hold all of these for the same."""
-    shares, states = (
-        [row["positive_unlabelled"] for row in part["members"]],
-        f"{part['unlabelled']:,} unlabelled states",
-    )
+    shares = [row["positive_unlabelled"] for row in part["members"]]
+    states = f"{part['unlabelled']:,} unlabelled states"
     if len(shares) == 1:
         return f"the classifier predicts {shares[0]:.1%} of {states} positive"
     alike = [str(member) for member, share in enumerate(shares) if share in (0.0, 1.0)]
@@ -184,7 +182,9 @@ def _section(
     blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
     for member in range(len(look.ensemble)):
         blocks += _drawn_to(look, member) + _pairs(look, member, rows, sketches)
-    paragraphs = [f"{len(look.known.labels):,} labelled and held-out states. Beyond them {_of_unlabelled(numbers)}."]
+    paragraphs = [
+        f"{len(look.known.labels):,} labelled and held-out states. Beyond them {_describe_unlabelled(numbers)}."
+    ]
     return page.section(page.slug(look.sub_goal), look.sub_goal, paragraphs, blocks)
 
 
