@@ -40,7 +40,7 @@ def test_from_recorded_play_to_the_second_audit(tmp_path: Path, monkeypatch: pyt
     assert 0 < labels.sum() < len(labels), "a demonstration has both"
     assert main(["train-ensemble", "data.h5", "--out", "ensemble", *FEW]) == 0
     assert main(["audit", "ensemble", "--out", "audit"]) == 0
-    assert "8 frames" in run(tmp_path, "answer", "audit", "takes", "labels.csv", "--next", "8")
+    assert "8 frames" in run(tmp_path, "answer", "audit", "takes", "labels.csv", "--count", "8")
     with open("labels.csv", newline="", encoding="utf-8") as file:
         answers = [row["label"] for row in csv.DictReader(file)]
     assert len(answers) == 8 and set(answers) <= {"0", "1"}
