@@ -29,6 +29,7 @@ from hypogoal.core.own_code import UsersCode, as_number, load_own
 from hypogoal.core.tensors import KEPT
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
 from hypogoal.hypotheses.load import ByKey
+from hypogoal.hypotheses.pooling import lean
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
@@ -225,15 +226,15 @@ def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:
-    """The same function with each ReLU after its MaxPool; the modules, and so the weights, are shared.
+    """The same function with each ReLU after its MaxPool, which keeps less; modules with weights are shared.
 
     ReLU is monotone, so the order changes neither values nor gradients, but behind the pooling it has a quarter of the
     work. Only attribution needs the other order.
     """
-    layers = [_reordered_by_key(layer) if isinstance(layer, ByKey) else layer for layer in network]
+    layers = [_reordered_by_key(layer) if isinstance(layer, ByKey) else lean(layer) for layer in network]
     for index, (layer, following) in enumerate(pairwise(network)):
         if isinstance(layer, nn.ReLU) and isinstance(following, nn.MaxPool2d):
-            layers[index], layers[index + 1] = following, layer
+            layers[index], layers[index + 1] = lean(following), layer
     return nn.Sequential(*layers)
 
 

@@ -17,9 +17,10 @@ from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.known_windows import KnownWindows, split_of
 from hypogoal.hypotheses.networks import as_input, at_once, folded
+from hypogoal.hypotheses.pooling import LeanMaxPool2d
 from hypogoal.hypotheses.views import FullView
 
-WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
+WITHOUT_WEIGHTS = (nn.ReLU, LeanMaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
 
 
 class StackedMembers:
