@@ -19,7 +19,7 @@ from hypogoal.evaluation.table import Pairs, Row, compared, select
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
 Curves = Mapping[str, Mapping[str, NDArray[Any]]]  # a run's label -> the arrays of its learning curves
 DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
-LADDERS = [rooms.METHOD._replace(once=None), rooms.N]
+LADDERS = [page.label("method", "method"), rooms.N]
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ PARTS: Mapping[str, Part] = {
         hypotheses.PAIRS,
     ),
     "rooms": Part(
-        "Hypotheses against labelled ladders",
+        "Hypotheses in rooms without labels",
         itemgetter("rooms"),
         LADDERS,
         rooms.UNSEEN,

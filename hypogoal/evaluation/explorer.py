@@ -96,7 +96,7 @@ def sections(material: Material) -> list[Block]:
     source = page.pick(material.metrics["ensembles"], "path", explored["ensemble"])
     shown, states = (max(goal[key] for goal in explored["sub_goals"]) for key in ("shown", "states"))
     text = (
-        f"Held-out states and what each member of {explored['ensemble']} (seed {explored['seed']}) says of them. "
+        f"Held-out states and what each member of {explored['ensemble']} (seed {explored['seed']}) predicts. "
         "Choose a state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against "
         f"it. Choose a member to see the options it became. {explored['sub_goals'][0]['reading']}"
     )

@@ -323,9 +323,14 @@ def interval(aggregated: Entry | None, digits: int, scale: float = 1.0) -> str:
 
 
 def verdict(probability: float, says: bool, truth: bool) -> dict[str, str]:
-    """A member's answer on a card: marked where it is wrong."""
-    answer = "yes" if says else "no"
-    return {"class": answer if says == truth else "wrong", "text": f"{answer} {probability:.2f}"}
+    """A member's prediction on a card: marked where it is wrong."""
+    prediction = label_of(says)
+    return {"class": prediction if says == truth else "wrong", "text": f"{prediction} {probability:.2f}"}
+
+
+def label_of(positive: bool) -> str:
+    """A label or a prediction in words."""
+    return "positive" if positive else "negative"
 
 
 def comparison_tables(

@@ -48,6 +48,7 @@ WHICH = {"best": "best", "validated": VALIDATED, "mean": "mean", "worst": "worst
 SHOWN = {"best": "best member", "validated": "validated member", "mean": "mean of members"}
 SHARE = "share of states"
 SPREAD = ("mean", "standard_deviation")  # of the figures
+PAPERS = "climb-down-ladder"  # the paper's sub-goal; its authors' repository has others
 PAPER = (
     "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
     "big step at N=2. Its test files include training rooms, as 'all rooms' does; it does not say how many of their "
@@ -155,9 +156,6 @@ def missing(work: Work) -> list[str]:
     return methods_lacking(rooms, "ensemble", "Figure 3") if rooms or work.contents.ladders else []
 
 
-METHOD = page.label("method", "method", once=True)
-
-
 def group_name(entry: Entry) -> str:
     """N as a table shows it."""
     return "–" if entry["groups"] is None else str(entry["groups"])
@@ -185,25 +183,23 @@ def sections(material: Material) -> list[Block]:
         return []
     metrics = material.metrics
     question = (
-        "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
-        "several hypotheses about what the sub-goal is. Does one of them hold in rooms that training never saw, can it "
-        "be found, and does an option that ends where it says so end at the base of a ladder?"
+        "A sub-goal, such as being at the base of a ladder, is known from a few rooms only. An ensemble of classifiers "
+        "holds several hypotheses about what the sub-goal is. Does one of them hold in rooms that training never saw, "
+        "can it be picked, and does an option that ends where it is positive end at the sub-goal?"
     )
     alone = not metrics["agents"]
     identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
     summaries = [page.section(identity, title, [question], [], metrics["missing"] if alone else [])]
     text = (
-        "N is the number of ladder groups with labels. Members are judged on held-out states of rooms that no training "
-        "state came from (unseen), and of all rooms, training rooms included, as in the paper. The best member is "
-        "picked on the very states that it is scored on, so it rises with the number of members by chance alone; the "
-        "validated member is the one with the highest balanced accuracy on held-out states in the rooms of labelled "
-        "groups, which a user could pick too."
+        "N is the number of groups of rooms with labels. Members are judged on held-out states of rooms that no "
+        "training state came from (unseen), and of all rooms, training rooms included, as in the paper. The best "
+        "member is picked on the very states that it is scored on, so it rises with the number of members, whatever "
+        "they learned; the validated member is the one with the highest balanced accuracy on held-out states in the "
+        "rooms of labelled groups, which a user could pick too."
     )
-    blocks = []
-    for figure, rows in zip(figures(material), _by_sub_goal(material), strict=True):
-        blocks += [page.shown(material, figure), _table(rows)]
+    blocks = [*(page.shown(material, figure) for figure in figures(material)), _table(metrics["rooms"])]
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
-    judged = page.section("rooms", "Hypotheses against labelled ladders", [text], blocks)
+    judged = page.section("rooms", "Hypotheses in rooms without labels", [text], blocks)
     return [*summaries, judged] if metrics["rooms"] else summaries
 
 
@@ -214,7 +210,7 @@ def _by_sub_goal(material: Material) -> list[list[Entry]]:
 def _table(rows: Sequence[Entry]) -> Block:
     return page.table(
         (
-            METHOD,
+            page.label("method", page.method_of(rows), once=True),
             N,
             *UNSEEN,
             page.number("disagree, unlabelled", "disagreement_unlabelled", page.deviation, 3),
@@ -225,17 +221,22 @@ def _table(rows: Sequence[Entry]) -> Block:
         caption="Balanced accuracy on held-out states of unseen rooms of the best, the validated, the mean and the "
         "worst member; accuracy (acc.) of the best one on those of all rooms; the share of states on which two "
         "members' predictions differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
-        f"{_never(rows)}{PAPER}",
+        f"{_never(rows)}{PAPER if any(row['sub_goal'] == PAPERS for row in rows) else ''}",
     )
 
 
 def _never(rows: Sequence[Entry]) -> str:
     """What accuracy on all rooms is worth here, and where balanced accuracy is not defined."""
-    accuracies = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
-    texts = [
-        f"{accuracy:.2f}{'' if groups is None else f' (N={groups})'}"
-        for groups, accuracy in sorted(accuracies.items(), key=str)
-    ]
+    several = len({entry["sub_goal"] for entry in rows}) > 1
+    accuracies = {
+        (entry["sub_goal"] if several else "", entry["groups"]): entry["always_no"]["all"]
+        for entry in rows
+        if entry["always_no"]["all"] is not None
+    }
+    texts = []
+    for (sub_goal, groups), accuracy in sorted(accuracies.items(), key=str):
+        of = ", ".join([sub_goal] * several + [f"N={groups}"] * (groups is not None))
+        texts.append(f"{accuracy:.2f}{of and f' ({of})'}")
     text = f"A member that is never positive has accuracy {page.listed(texts)}. " if texts else ""
     bare = sorted({entry["groups"] for entry in rows if entry["positives"]["unseen"] == 0 and entry["groups"]})
     if not bare:
@@ -254,16 +255,20 @@ def figures(material: Material) -> Iterator[Drawn]:
     for rows in by_sub_goal:
         methods = {entry["method"] for entry in rows}
         seeds = sorted({entry["seed"] for entry in material.metrics["ensembles"] if entry.get("method") in methods})
+        sub_goal = rows[0]["sub_goal"]
         caption = (
             "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
             "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
             "mean one; mean over ensemble seeds, bands (bars where a method has one N): ± one standard deviation over "
             "seeds. Dotted: never positive."
+            if rows is by_sub_goal[0]
+            else f"The same, for {sub_goal}."
         )
         nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
-        title, drawn = "Figure 3: members against labelled ladder groups", scores_over_groups(rows, panels)
-        suffix = f"-{rows[0]['sub_goal']}" if len(by_sub_goal) > 1 else ""
-        yield Drawn(f"figure3{suffix}", title, drawn, caption, f"Ensemble seeds {page.spans(seeds)}.", nothing)
+        title, drawn = "Figure 3: members against labelled groups", scores_over_groups(rows, panels)
+        suffix = f"-{sub_goal}" if len(by_sub_goal) > 1 else ""
+        heading, runs = sub_goal if suffix else "", f"Ensemble seeds {page.spans(seeds)}."
+        yield Drawn(f"figure3{suffix}", title, drawn, caption, runs, nothing, heading=heading)
 
 
 def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:
@@ -301,7 +306,7 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
         for place in axes.flat:
             place.set(ylim=(max(0.0, lowest - 0.03), 1.03), xticks=ticks, xlim=(ticks[0] - 0.4, ticks[-1] + 0.4))
         for place in axes[-1]:
-            place.set_xlabel("labelled ladder groups, N")
+            place.set_xlabel("labelled groups, N")
         for place in axes[:, 0]:
             place.set_ylabel("fraction")
         legend_below(figure, list(axes.flat), 3, handlelength=2.6)

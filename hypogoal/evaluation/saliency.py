@@ -152,19 +152,21 @@ def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block
         {
             "png": page.picture(observation),
             "alt": f"A held-out state; {sub_goal} is {'reached' if truth else 'not reached'}.",
-            "title": f"truth: {'yes' if truth else 'no'}",
-            "lines": [{"class": "no", "text": place}] if place else [],
+            "title": f"truth: {page.label_of(truth)}",
+            "lines": [{"class": "negative", "text": place}] if place else [],
         }
     ]
     for member in state["members"]:
         number = member["member"]
-        answer = page.verdict(arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth)
-        lines = [answer]
+        prediction = page.verdict(
+            arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth
+        )
+        lines = [prediction]
         if observation.shape[-1] != 3 and member["last_frame"] is not None:
-            lines.append({"class": "no", "text": f"last frame: {100 * member['last_frame']:.0f} %"})
+            lines.append({"class": "negative", "text": f"last frame: {100 * member['last_frame']:.0f} %"})
         values = flat(arrays["attributions"][index, number])
         drawn = attribution_png(values, brightness(arrays["seen"][index]) / 255)
-        alt = f"Attributions of member {number}, which says {answer['text']}."
+        alt = f"Attributions of member {number}, which predicts {prediction['text']}."
         cards.append({"png": page.encoded(drawn), "alt": alt, "title": f"member {number}", "lines": lines})
     return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
 
@@ -249,7 +251,7 @@ def attributions_of_members(state: Mapping[str, NDArray[Any]]) -> Figure:
     members = len(state["attributions"])
     columns = min(4, members + 1)
     figure, places = grid_of_pictures(-(-(members + 1) // columns), columns, KEY)
-    show_picture(places[0], state["observations"], f"truth: {'yes' if state['labels'] else 'no'}")
+    show_picture(places[0], state["observations"], f"truth: {page.label_of(bool(state['labels']))}")
     grey = brightness(state["seen"]) / 255
     for member, values in enumerate(state["attributions"]):
         show_picture(places[member + 1], attribution_image(flat(values), grey), _said(state, member))

@@ -217,7 +217,7 @@ def sections(material: Material) -> list[Block]:
             "alt": scene["title"],
             "title": scene["title"],
             "lines": [
-                {"class": "yes" if holds else "no", "text": f"{name}: {'yes' if holds else 'no'}"}
+                {"class": "positive" if holds else "negative", "text": f"{name}: {'yes' if holds else 'no'}"}
                 for name, holds in scene["features"].items()
             ],
         }

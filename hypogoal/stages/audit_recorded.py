@@ -196,7 +196,7 @@ def _cards(look: Look, heading: str, states: Any) -> list[Block]:
         if picture is None:
             return []
         lines = [
-            {"class": "yes" if score > threshold else "no", "text": f"member {member}: {score:.2f}"}
+            {"class": "positive" if score > threshold else "negative", "text": f"member {member}: {score:.2f}"}
             for member, (score, threshold) in enumerate(zip(scores.tolist(), look.thresholds.tolist(), strict=True))
         ]
         cards.append({"png": page.encoded(page.image_png(picture)), "alt": title, "title": title, "lines": lines})

@@ -43,7 +43,7 @@ def stops(rooms=(1, 4)):
 @pytest.mark.parametrize(
     ("draw", "texts"),
     [
-        (scores, ["accuracy, all rooms", "balanced, unseen", "dbat, K=6", "single CNN", "labelled ladder groups, N"]),
+        (scores, ["accuracy, all rooms", "balanced, unseen", "dbat, K=6", "single CNN", "labelled groups, N"]),
         (bars, ["N=1", "true sub-goal", "oracle termination", "distance to the nearest true base", "began inside"]),
         (stops, ["dbat, room 1", "room 4", "at a true base", "elsewhere", "began inside: counts 300"]),
     ],

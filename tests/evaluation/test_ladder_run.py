@@ -266,7 +266,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     """Spec F7: its sections, Figures 3 to 5 with seeds, intervals, and what the paper claims; no empty section."""
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
-        "Summary", "Hypotheses against labelled ladders", "Options on ladders", "Where options stop on the ladders",
+        "Summary", "Hypotheses in rooms without labels", "Options on ladders", "Where options stop on the ladders",
         "Explore the hypotheses", "Ranking, whatever the threshold", "What members look at",
         "Data, settings, provenance",
     ]  # fmt: skip

@@ -26,9 +26,15 @@ def test_figure_2_has_the_state_and_every_member(members):
     drawn = attributions_of_members(explained(members, 4))
     svg = to_svg(drawn, "a")
     assert pictures(drawn) == members + 1
-    for text in ("truth: yes", "member 0: no 0.10", "attribution in log-odds", "against", "for &apos;reached&apos;"):
+    for text in (
+        "truth: positive",
+        "member 0: negative 0.10",
+        "attribution in log-odds",
+        "against",
+        "for &apos;reached&apos;",
+    ):
         assert text in svg or text.replace("&apos;", "'") in svg
-    assert ("member 5: yes 0.90" in svg) == (members == 6)
+    assert ("member 5: positive 0.90" in svg) == (members == 6)
 
 
 @pytest.mark.parametrize(("channels", "names"), [(4, ["3 steps before", "newest frame"]), (3, ["red", "blue"])])
@@ -37,7 +43,7 @@ def test_figure_9_has_every_member_and_frame(channels, names):
     drawn = attributions_of_every_frame(explained(3, channels))
     svg = to_svg(drawn, "a")
     assert pictures(drawn) == (3 + 1) * channels
-    assert all(name in svg for name in [*names, "member 2: yes 0.90"])
+    assert all(name in svg for name in [*names, "member 2: positive 0.90"])
 
 
 def test_figures_7_and_8_say_where_a_classifier_never_ended_an_option():

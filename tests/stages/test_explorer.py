@@ -107,7 +107,7 @@ def expected(data, **wanted):
     """How many states of ``GOAL`` pass."""
     states = data[GOAL]["states"]
     if "truth" in wanted:
-        states = [one for one in states if one["truth"] == (wanted["truth"] == "yes")]
+        states = [one for one in states if one["truth"] == (wanted["truth"] == "positive")]
     if "members" in wanted:
         states = [one for one in states if (len(set(one["says"])) > 1) == (wanted["members"] == "disagree")]
     if "errors" in wanted:
@@ -121,12 +121,12 @@ def expected(data, **wanted):
 
 FILTERS = [
     {},
-    {"truth": "yes"},
+    {"truth": "positive"},
     {"members": "disagree"},
-    {"members": "agree", "truth": "no"},
+    {"members": "agree", "truth": "negative"},
     {"errors": "none"},
     {"errors": "all"},
-    {"errors": "1", "truth": "yes"},
+    {"errors": "1", "truth": "positive"},
     {"place": "layout 1001", "errors": "some"},
 ]
 
@@ -190,8 +190,8 @@ def test_the_filters_in_a_browser(page, data, tmp_path):
 @needs_browser
 def test_the_address_holds_the_filters(page, data, tmp_path):
     """Spec F7: an address that was shared shows what its sender saw."""
-    count = expected(data, errors="some", truth="no")
-    document = document_of(page, f"explorer?goal={GOAL}&errors=some&truth=no&member=1", tmp_path)
+    count = expected(data, errors="some", truth="negative")
+    document = document_of(page, f"explorer?goal={GOAL}&errors=some&truth=negative&member=1", tmp_path)
     assert f">{count} of 30 states<" in document
     assert document.count('class="tile"') == count
     assert f"Member 1 of {GOAL}" in document

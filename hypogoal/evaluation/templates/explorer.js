@@ -17,12 +17,12 @@
     return node;
   };
   const image = (png, alt) => make("img", { src: "data:image/png;base64," + png, alt });
-  const yes = (truth) => (truth ? "yes" : "no");
+  const labelOf = (positive) => (positive ? "positive" : "negative");
   const goal = () => goals[at("goal").selectedIndex];
   const errorsOf = (one) => one.says.filter((said) => said !== one.truth).length;
 
   const PASSES = {
-    truth: (one, wanted) => yes(one.truth) === wanted,
+    truth: (one, wanted) => labelOf(one.truth) === wanted,
     members: (one, wanted) => (new Set(one.says).size > 1) === (wanted === "disagree"),
     errors: (one, wanted) => {
       const wrong = errorsOf(one);
@@ -39,7 +39,7 @@
 
   const verdict = (one, index) => {
     const wrong = one.says[index] !== one.truth;
-    return make("span", { class: wrong ? "wrong" : yes(one.says[index]) }, yes(one.says[index]) + (wrong ? " ✗" : ""));
+    return make("span", { class: wrong ? "wrong" : labelOf(one.says[index]) }, labelOf(one.says[index]) + (wrong ? " ✗" : ""));
   };
   const said = (one, index) => make("span", {}, make("small", {}, make("span", { class: "heard" }, "member "), `${index} `), verdict(one, index));
 
@@ -54,7 +54,7 @@
         "aria-pressed": index === state,
       },
       image(one.png, `State ${index}, ${where}:`),
-      make("span", {}, "truth " + yes(one.truth)),
+      make("span", {}, "truth " + labelOf(one.truth)),
       make("span", { class: "says" }, ...one.says.map((_, k) => said(one, k))),
     );
     button.addEventListener("click", () => {
@@ -73,7 +73,7 @@
     if (!one) return [];
     const where = [one.place, one.kind].filter(Boolean).join(", ");
     const heading = make("h3", { tabindex: "-1" }, `State ${state}`);
-    const cards = [card(image(one.png, `State ${state}`), make("div", {}, `truth: ${yes(one.truth)}`), soft(where))];
+    const cards = [card(image(one.png, `State ${state}`), make("div", {}, `truth: ${labelOf(one.truth)}`), soft(where))];
     one.says.forEach((said, k) => {
       const drawn = one.saliency.length
         ? image(one.saliency[k], `Attributions of member ${k}`)
