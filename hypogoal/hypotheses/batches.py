@@ -94,6 +94,11 @@ class TrainingStates:
                 self._features = torch.cat([_forward(trunk, self._inputs([chunk]), [len(chunk)]) for chunk in chunks])
             self._tables, self._images = None, []
 
+    @property
+    def whole(self) -> bool:
+        """Whether networks get the states themselves, not their patches or features."""
+        return bool(self._images)
+
     def forward(
         self,
         networks: Sequence[nn.Sequential],

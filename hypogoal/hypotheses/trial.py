@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.graph import saved_tensors_hooks
 
 from hypogoal.core.seeding import torch_generator
@@ -22,7 +22,8 @@ from hypogoal.hypotheses.views import FullView, cut_windows, full_view
 
 SECONDS = 0.3  # after which no larger batch is tried
 LEARNING = 3  # numbers per trained weight: its gradient and two of Adam's
-BACKWARD = 0.5  # memory of the backward pass, relative to what a member keeps for it
+BACKWARD = 2.0  # memory of the backward pass, relative to what a member keeps for it
+CONVOLUTIONS = 200e6  # what PyTorch's convolutions take, and freed memory between tensors; patches have neither
 
 
 class StepCost(NamedTuple):
@@ -83,6 +84,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     learning = LEARNING * sum(weight.nbytes for weight in training.optimiser.param_groups[0]["params"])
     copies = 1.0 + BACKWARD / (trained if config.encoder == "separate" else 1)
     memory = weights + learning + copies * (most - more * kept_each)
+    memory += CONVOLUTIONS if batches.whole and any(isinstance(layer, nn.Conv2d) for layer in ensemble.modules()) else 0
     return StepCost(weights, memory, copies * kept_each, max(0.0, later - more * seconds_each), seconds_each)
 
 
