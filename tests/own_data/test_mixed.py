@@ -27,7 +27,7 @@ from hypogoal.hypotheses.views import full_view
 from tests.own_data.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
 
 GOAL = "door-open"
-FEW = [word for pair in ("steps=60", "members=2", "learning_rate=1e-3") for word in ("--set", pair)]
+FEW = [word for pair in ("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3") for word in ("--set", pair)]
 
 
 @pytest.fixture(scope="module")
@@ -210,9 +210,9 @@ def test_options_say_that_they_cannot(run: Path, tmp_path: Path, capsys: pytest.
         patch.syspath_prepend(str(tmp_path))
         patch.setenv("HYPOGOAL_TRUST", "doors:DOMAIN")
         few = [word for pair in ("steps=40", "heldout_seeds=4", "unlabelled_seeds=1") for word in ("--set", pair)]
-        assert main(["check", "doors:DOMAIN", "--minutes", "0.1"]) == 0
+        assert main(["check", "doors:DOMAIN", "--minutes", "0.03"]) == 0
         assert main(["collect", "doors:DOMAIN", "--out", str(tmp_path / "d.h5"), "-q", *few]) == 0
-        assert main(["train-ensemble", str(tmp_path / "d.h5"), "--out", str(tmp_path / "e"), "-q", *FEW]) == 0
+        assert main(["train-ensemble", str(tmp_path / "d.h5"), "--out", str(tmp_path / "e"), "-q", *FEW, "--set", "steps=2"]) == 0
         capsys.readouterr()
         assert main(["train-options", str(tmp_path / "e"), "--out", str(tmp_path / "o"), "-q"]) == 2
         assert "agents see pictures or numbers, not both: front, state, wrist. Reward" in capsys.readouterr().err
