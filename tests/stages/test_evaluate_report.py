@@ -95,7 +95,8 @@ def test_agents_are_grouped_and_counted_whole(run, metrics):
 
 def test_an_agent_without_a_whole_episode_is_said_to_be_one(run, tmp_path):
     """Spec F5: there is no success to speak of, neither 0 nor a dash."""
-    train_meta(run / "ensemble", TrainMetaConfig(steps=512, max_episode_steps=100, random_episodes=2), tmp_path / "meta", **QUIET)
+    unfinished = TrainMetaConfig(steps=512, max_episode_steps=100, random_episodes=2)
+    train_meta(run / "ensemble", unfinished, tmp_path / "meta", **QUIET)
     metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
     assert metrics["agents"][0]["success"]["mean"] is None
     page = report(tmp_path).read_text(encoding="utf-8")
