@@ -269,8 +269,8 @@ PARTS: Mapping[str, Part] = {
             distance.SHARED[0],
             distance.SEEDS,
         ],
-        "Distance from where options stop to the nearest true base, mean over the ladders named; share of the best "
-        "member's executions that got to one. Mean over seeds ± standard deviation. Only the same ladders compare.",
+        "Distance from where options stop to the true sub-goal, mean over the ladders named; share of the best "
+        "member's executions that got there. Mean over seeds ± standard deviation. Only the same ladders compare.",
         distance.PAIRS,
     ),
 }

@@ -59,7 +59,7 @@ from hypogoal.options.tables import Executions
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
-SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
+SHARES = {"reached_base": "at sub-goal", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
 PICKED = {"best": BEST, "validated": VALIDATED, "mean": "mean", "worst": WORST}
 NUMBERS = {which: Number("distance", "", "units of position", member) for which, member in PICKED.items()}
 NUMBERS["executions_deviation"] = Number("executions_deviation", "", "units of position", BEST)
@@ -72,7 +72,7 @@ GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
 MARK: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5}
 STOPS: dict[int, tuple[str, dict[str, Any]]] = {
-    HIT: ("at a true base", MARK | {"marker": "o", "color": SKY, "markeredgewidth": 0.6, "markeredgecolor": INK}),
+    HIT: ("at the true sub-goal", MARK | {"marker": "o", "color": SKY, "markeredgewidth": 0.6, "markeredgecolor": INK}),
     MISS: ("elsewhere", MARK | {"marker": "x", "color": ORANGE}),
     BEGAN_INSIDE: ("began inside: counts 300", MARK | {"marker": "s", "color": PURPLE, "fillstyle": "none"}),
 }
@@ -372,7 +372,7 @@ OVER_LADDERS = (
 def summary(metrics: Metrics) -> list[Printed]:
     """Figure 4 by method and N."""
     rows = metrics["distance"]["over_ladders"] if metrics["distance"]["options"] else []
-    title = "Distance from a true base where options stop, mean over ladders"
+    title = "Distance from the true sub-goal where options stop, mean over ladders"
     columns = (page.label("method", page.method_of(rows)), page.number("N", group_name), *STOPPED, SHARED[0])
     return [page.terminal(title, columns, rows)] if rows else []
 
@@ -385,10 +385,10 @@ def sections(material: Material) -> list[Block]:
     bars, *stops = (page.shown(material, figure) for figure in figures(material))
     text = (
         "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
-        f"rooms, it stops from the nearest true base of a ladder, over its last {LAST} executions; an execution that "
-        f"begins inside the option's own termination set counts {INSIDE}. Per ladder the best member, as in the paper, "
-        "with mean, worst and validated member beside it; then the mean over ladders. Oracle termination ends "
-        "options at the true base: what is left to it is how well policies were learned."
+        "rooms, it stops from the nearest place where the sub-goal holds, such as a ladder's base, over its last "
+        f"{LAST} executions; one that begins inside the option's own termination set counts {INSIDE}. Per ladder "
+        "the best member, as in the paper, with mean, worst and validated member beside it; then the mean over "
+        "ladders. Oracle termination ends options at the true sub-goal: what is left to it is how well policies were learned."
     )
     rows = _ordered(distance["over_ladders"])
     short = [f"{entry['method']}, {_group(entry)}" for entry in distance["over_ladders"] if entry["incomplete_seeds"]]
@@ -396,9 +396,9 @@ def sections(material: Material) -> list[Block]:
     caption = (
         "Distance of the best, the validated, the mean and the worst member, mean over ladders; mean over seeds ± "
         "standard deviation over seeds. ± exec.: the best member's standard deviation over its last "
-        f"{LAST} executions, mean over ladders and seeds. Shares of the best member's executions: at base, within "
-        f"{NEAR} of a true one and not begun inside; inside, begun in its own termination set; timed out; died. A "
-        f"death or a time-out at a base counts as both.{left}"
+        f"{LAST} executions, mean over ladders and seeds. Shares of the best member's executions: at sub-goal, "
+        f"within {NEAR} of the true one and not begun inside; inside, begun in its own termination set; timed out; "
+        f"died. A death or a time-out there counts as both.{left}"
     )
     pairs = page.comparison_tables(
         material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
@@ -406,8 +406,8 @@ def sections(material: Material) -> list[Block]:
     table = page.table(OVER_LADDERS, rows, tight=True, caption=caption)
     where = (
         f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "
-        "not drawn none or few did. Circles: at a true base. Crosses: anywhere else, by the member's own verdict, out "
-        "of time, or dead. Squares: executions that began inside the option's own termination set."
+        "not drawn none or few did. Circles: at the true sub-goal. Crosses: anywhere else, by the member's own "
+        "prediction, out of time, or dead. Squares: executions that began inside the option's own termination set."
     )
     return [
         page.section("distance", "Options on ladders", [text], [bars, table, *pairs]),
@@ -426,7 +426,7 @@ def figures(material: Material) -> list[Drawn]:
 
 
 def _bars(material: Material) -> Drawn:
-    distance, name = material.metrics["distance"], "Figure 4: distance to the nearest true base"
+    distance, name = material.metrics["distance"], "Figure 4: distance to the true sub-goal"
     rows = [entry for entry in _ordered(distance["over_ladders"]) if entry["best"]["mean"] is not None]
     name_of, bars = page.method_of(distance["options"]), []
     for entry in rows:
@@ -468,7 +468,7 @@ def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
         more = f", {inside} began inside" if inside else ""
         more += f", {elsewhere} in rooms not drawn" if elsewhere else ""
         notes.append(
-            f"{column['method']}: member {column['member']}, {hits} of {len(ends)} at a base{more}, "
+            f"{column['method']}: member {column['member']}, {hits} of {len(ends)} at the sub-goal{more}, "
             f"distance {page.fixed(column['distance'], 1)}"
         )
     pictures = [(room, material.arrays[f"pictures/{room}"]) for room in figure["rooms"]]
@@ -512,7 +512,7 @@ def distance_bars(
         axes.set_xlim(-0.6, len(groups) - 0.4)
         axes.grid(visible=False, axis="x")
         axes.set_ylim(0, None)
-        axes.set_ylabel("distance to the nearest true base\n(units of position)")
+        axes.set_ylabel("distance to the true sub-goal\n(units of position)")
     return figure
 
 

@@ -242,7 +242,7 @@ def _never(rows: Sequence[Entry]) -> str:
     if not bare:
         return text
     return (
-        f"{text}At N={page.listed(bare)} no unseen room has a ladder base left: balanced accuracy on them is not "
+        f"{text}At N={page.listed(bare)} no unseen room has positives left: balanced accuracy on them is not "
         "defined (–), and accuracy there is the share of negatives called negative. "
     )
 

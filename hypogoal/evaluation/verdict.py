@@ -242,7 +242,7 @@ OUTCOMES |= {(OPTIONS, outcome): OUTCOMES[HYPOTHESES, outcome] for outcome in (B
 SECONDS = {
     CHOOSING: "{first} solves {a} of the episodes, {second} {b}",
     HYPOTHESES: "with {first} the agent solves {a} of the episodes, with {second} {b}",
-    OPTIONS: "options of {first} stop at the base in {a} of the executions, those of {second} in {b}",
+    OPTIONS: "options of {first} stop at the sub-goal in {a} of the executions, those of {second} in {b}",
 }
 
 
@@ -290,7 +290,7 @@ def _of_options(metrics: Metrics) -> Iterator[str]:
     for name, entries in of_method.items():
         shares = [entry["options"][entry["validated"] or 0]["reached_base"] for entry in entries]
         options = "Options that end at true sub-goals" if name == ORACLE else f"Options of {ensemble_title(name)}"
-        yield f"{options} stop at the base in {percent(mean_of(shares))} of their executions."
+        yield f"{options} stop at the sub-goal in {percent(mean_of(shares))} of their executions."
     if of_method:
         yield "Whether hypotheses mattered is unknown: the run has no options of one classifier to compare with."
 

@@ -44,8 +44,8 @@ def stops(rooms=(1, 4)):
     ("draw", "texts"),
     [
         (scores, ["accuracy, all rooms", "balanced, unseen", "dbat, K=6", "single CNN", "labelled groups, N"]),
-        (bars, ["N=1", "true sub-goal", "oracle termination", "distance to the nearest true base", "began inside"]),
-        (stops, ["dbat, room 1", "room 4", "at a true base", "elsewhere", "began inside: counts 300"]),
+        (bars, ["N=1", "true sub-goal", "oracle termination", "distance to the true sub-goal", "began inside"]),
+        (stops, ["dbat, room 1", "room 4", "at the true sub-goal", "elsewhere", "began inside: counts 300"]),
     ],
 )
 def test_figures_say_what_they_show(draw, texts):

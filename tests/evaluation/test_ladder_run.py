@@ -225,7 +225,7 @@ def test_states_to_browse_say_room_and_kind(metrics, page):
     assert {state["place"] for state in goal["states"]} >= {"room 9 (unseen)", "room 1 (labelled data from it)"}
     names = [option["name"] for option in goal["members"][1]["options"]]
     assert names == ["ladder 1L, seed 0", "ladder 2-6, seed 0"]
-    assert ["distance from a true base", "20.0"] in goal["members"][1]["options"][0]["facts"]
+    assert ["distance from the true sub-goal", "20.0"] in goal["members"][1]["options"][0]["facts"]
     assert '<option value="near-base">' in page
 
 
@@ -273,7 +273,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     assert page.count("<figure") == 4
     assert "about 70 % for the best member at N=1" in page
     assert "Its test files include training rooms" in page
-    assert "At N=3 no unseen room has a ladder base left" in page
+    assert "At N=3 no unseen room has positives left" in page
     assert "Ensemble seeds 0 and 1" in page
     assert "A member that is never positive has accuracy 0.86 (N=1), 0.86 (N=2) and 0.86 (N=3)" in page
     assert "Ladders: 1L and 2-6; seeds: 0 and 1." in page

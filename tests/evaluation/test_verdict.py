@@ -96,7 +96,7 @@ def test_sentences() -> None:
         "episodes, with one classifier 99 % (+1 points [1, 1])."
     )
     assert said(HYPOTHESES, (1.0, 0.2), (0.2, 1.0)).startswith("Whether several hypotheses mattered is undecided over")
-    assert "stop at the base in 50 % of the executions" in said(OPTIONS, (0.5, 0.1))
+    assert "stop at the sub-goal in 50 % of the executions" in said(OPTIONS, (0.5, 0.1))
 
 
 def test_intervals_stay_within_what_a_difference_can_be() -> None:
@@ -145,7 +145,7 @@ def test_an_ensemble_alone_has_shown_nothing_yet() -> None:
 def test_options_without_a_comparison() -> None:
     options = [{"method": "dbat, K=3", "validated": 1, "options": [{"reached_base": 0.0}, {"reached_base": 0.25}]}]
     lines = verdict(metrics_of(distance={"options": options}))
-    assert lines[0] == "Options of D-BAT, 3 members stop at the base in 25 % of their executions."
+    assert lines[0] == "Options of D-BAT, 3 members stop at the sub-goal in 25 % of their executions."
     assert "unknown" in lines[1]
 
 
