@@ -388,7 +388,8 @@ def sections(material: Material) -> list[Block]:
         "rooms, it stops from the nearest place where the sub-goal holds, such as a ladder's base, over its last "
         f"{LAST} executions; one that begins inside the option's own termination set counts {INSIDE}. Per ladder "
         "the best member, as in the paper, with mean, worst and validated member beside it; then the mean over "
-        "ladders. Oracle termination ends options at the true sub-goal: what is left to it is how well policies were learned."
+        "ladders. Oracle termination ends options at the true sub-goal: what is left to it is how well "
+        "policies were learned."
     )
     rows = _ordered(distance["over_ladders"])
     short = [f"{entry['method']}, {_group(entry)}" for entry in distance["over_ladders"] if entry["incomplete_seeds"]]
