@@ -38,7 +38,8 @@ CHOICE_SEEDS, CHOICE_MIX, CHOICE_MIX_OF_TWO = (100,), 0.5, 1.0
 HIGH, LOW = 0.95, 0.6
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
 TEN = CSV.with_name("which-feature-ten.csv")  # seeds 400 to 409
-TEXTURES = CSV.with_name("which-feature-textures.csv")  # the same, other scenes
+TEXTURES = CSV.with_name("which-feature-textures.csv")  # the same, other scenes, joint with the agreement given
+AUTO = CSV.with_name("which-feature-textures-auto.csv")  # joint alone, with the agreement that its loss finds
 TWO = CSV.with_name("which-feature-two.csv")
 SEQUENTIAL = CSV.with_name("which-feature-two-sequential.csv")  # members one after the other
 TWO_TEN = CSV.with_name("which-feature-two-ten.csv")  # seeds 400 to 409
@@ -79,8 +80,8 @@ def tables(path: Path) -> Iterator[str]:
         "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose.", cells, chosen(cells)
     )
     ten = _by_mix(read_cells(TEN))
-    if TEXTURES.exists():
-        ten |= {f"textures, {mix}": of for mix, of in _by_mix(read_cells(TEXTURES)).items()}
+    auto = [replace(cell, entry="joint, agreement by its loss") for cell in read_cells(AUTO)]
+    ten |= {f"textures, {mix}": of for mix, of in _by_mix([*read_cells(TEXTURES), *auto]).items()}
     yield from _against("joint", ten)
     for title, cells_of in ten.items():
         yield f"Test at {title}: the share of seeds in which a member owns the feature, and the highest ranking of it."
@@ -114,7 +115,7 @@ def _by_mix(cells: Iterable[Scored]) -> dict[str, list[Scored]]:
 def _against(entry: str, boards: Mapping[str, Sequence[Scored]]) -> Iterator[str]:
     """Coverage (best) of each entry, and what ``entry`` covers more, seed by seed; a pair of columns for each board."""
     columns = {name: {line.entry: line for line in summary(cells, HIGH, LOW)} for name, cells in boards.items()}
-    names = next(iter(columns.values()))
+    names = dict.fromkeys(name for lines in columns.values() for name in lines)
     yield f"Test: coverage (best), and {entry} minus it; mean and Student's 95 % interval over seeds."
     yield ""
     heads = [part for name in columns for part in (name, f"{entry} minus it")]

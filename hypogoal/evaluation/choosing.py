@@ -174,10 +174,9 @@ def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
     from hypogoal.meta.episodes import agent_of
     from hypogoal.options.choosers import RandomChooser
 
-    config, domain = artefact.config, load_domain(artefact.config["domain"])
-    sub_goals = domain.sub_goals
-    alone = domain.make_engine(config["layout_seed"], 1, config["max_episode_steps"])  # many games take long to begin
-    if alone.plan() is None or not set(config["sub_goals"]) <= set(sub_goals):
+    config, sub_goals = artefact.config, load_domain(artefact.config["domain"]).sub_goals
+    alone = agent_of(artefact, seed)  # one game, since many take long to begin
+    if alone.engine.plan() is None or not set(config["sub_goals"]) <= set(sub_goals):
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
     members, shortest = config["members"], loop.engine.shortest_path()
