@@ -175,8 +175,9 @@ def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
     from hypogoal.options.choosers import RandomChooser
 
     config, sub_goals = artefact.config, load_domain(artefact.config["domain"]).sub_goals
-    alone = agent_of(artefact, seed)  # one game, since many take long to begin
-    if alone.engine.plan() is None or not set(config["sub_goals"]) <= set(sub_goals):
+    if not set(config["sub_goals"]) <= set(sub_goals):
+        return None
+    if agent_of(artefact, seed).engine.plan() is None:  # one game, since many take long to begin
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
     members, shortest = config["members"], loop.engine.shortest_path()

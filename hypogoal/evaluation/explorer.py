@@ -190,7 +190,7 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
             picks = " and ".join(word for word in ("best", "validated") if row[word] == member)
             facts = [
                 ("distance from the true sub-goal", page.fixed(option["distance"], 1)),
-                ("stopped at one", page.percent(option["reached_base"])),
+                ("stopped there", page.percent(option["reached_base"])),
                 ("began inside", page.percent(option["inside_at_start"])),
                 ("timed out", page.percent(option["timed_out"])),
                 ("mean steps", page.fixed(option["duration"], 1)),
