@@ -62,21 +62,27 @@ def plan(
 
     It is named, one of the paper's figures, a TOML file, or ``module:function``, a name that the user must have given.
     ``assignments`` are ``KEY=VALUE`` or ``STAGE.KEY=VALUE``, of a TOML file ``AXIS=VALUES``; ``preset`` is of a named
-    one, a figure has its own; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages. ``short``:
+    one; a figure has its own and ``paper``; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages. ``short``:
     leave seed and layout out of names if there is a single agent; a folder that was begun with other names keeps those.
     What is unknown is a ``UserError``.
     """
     check_name(device)
     assignments = [*assignments]
     experiment = CELLS.get((experiment, preset or ""), experiment)
-    name, own_preset = FIGURES.get(experiment, (experiment, None))
-    if own_preset not in (None, preset or own_preset):
-        raise UserError(f"{experiment} has its own preset", preset, f"For another, give {name} with --preset.")
+    figure = FIGURES.get(experiment)
+    name = figure.experiment if figure else experiment
+    if figure and preset == "paper" and figure.paper is not None:
+        assignments[:0] = figure.paper
+    elif figure and preset in (None, figure.preset):
+        preset = figure.preset
+    elif figure:
+        others = "" if figure.paper is None else f" or paper, or {name} with --preset"
+        raise UserError(f"{experiment} has a preset of its own", preset, f"Give {figure.preset}{others}.")
     source = _experiment(name)
     if seeds:
         assignments.insert(0, f"{'seeds' if 'seeds' in source.settings else 'seed'}={seeds}")  # before --set's own
     short = _has_short_names(out, otherwise=short)
-    return make_plan(source, out, assignments, preset=preset or own_preset, device=device, short=short)
+    return make_plan(source, out, assignments, preset=preset, device=device, short=short)
 
 
 def _experiment(name: str) -> Experiment:

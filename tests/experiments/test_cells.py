@@ -71,7 +71,7 @@ def test_choosing_has_cells_of_its_own_and_a_preset_of_its_worlds() -> None:
     assert (play.cap, play.steps, play.world) == (1.5, 50_000, ("wrong_key=ends",))
     stages = {cell.stage for cell in plan("choosing", OUT, assignments=["learned=false"]).cells}
     assert "train-options" not in stages and "train-meta" in stages
-    with pytest.raises(UserError, match="choosing has its own preset: demo"):
+    with pytest.raises(UserError, match="choosing has a preset of its own: demo. Give choosing."):
         plan("choosing", OUT, preset="demo")
 
 
@@ -245,8 +245,14 @@ def test_the_papers_figures_are_experiments() -> None:
     assert plan("figure3", OUT).cells == plan("montezuma-ladders", OUT, preset="figure3").cells
     assert plan("figure4", OUT).cells == plan("montezuma-ladders", OUT, preset="figure4").cells
     assert figure == plan("figure6", OUT, preset="figure6").cells
-    with pytest.raises(UserError, match=r"figure6 has its own preset: demo. For another, give doorkey with --preset"):
+    with pytest.raises(UserError, match=r"figure6 has a preset of its own: demo. Give figure6 or paper, or doorkey with --preset"):
         plan("figure6", OUT, preset="demo")
+    whole = plan("montezuma-ladders", OUT, preset="paper").cells
+    assert plan("figure4", OUT, preset="paper").cells == whole
+    classifiers = [cell for cell in plan("figure3", OUT, preset="paper").cells if cell.stage == "train-ensemble"]
+    assert classifiers == [cell for cell in whole if cell.stage == "train-ensemble"]
+    assert not any(cell.stage == "train-options" for cell in plan("figure3", OUT, preset="paper").cells)
+    assert plan("figure6", OUT, preset="paper").cells == plan("doorkey", OUT, preset="paper").cells
     ten = plan("figure6", OUT, seeds="0", assignments=["paired=false", "layout_seeds=210-219"]).cells
     agents = [cell for cell in ten if cell.stage == "train-meta" and dict(cell.axes)["agent"] == "meta"]
     assert [dict(cell.axes)["layout_seed"] for cell in agents] == [*range(210, 220)]
