@@ -249,8 +249,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if printed(arguments, tables):
         return
-    if not (arguments.work / "data.h5").exists():
-        collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", quiet=True)
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", resume=True, quiet=True)
     step = CHOOSE if arguments.choosing else STEP
     jobs: Jobs = {
         (method, str(seed)): partial(run_cell, arguments.work, method, seed, step)

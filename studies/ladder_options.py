@@ -347,8 +347,8 @@ def main() -> None:
         return
     work, methods = arguments.work, arguments.methods.split(",")
     for groups in arguments.groups:
-        if not (work / f"groups-{groups}.h5").exists():
-            collect(DOMAIN, MontezumaConfig(groups=groups, workers=1), work / f"groups-{groups}.h5", quiet=True)
+        settings = MontezumaConfig(groups=groups, workers=1)
+        collect(DOMAIN, settings, work / f"groups-{groups}.h5", resume=True, quiet=True)
     trained = {ENSEMBLES.get(method, method) for method in methods}
     ensembles = [
         partial(ensemble_of, work, groups, method, seed)

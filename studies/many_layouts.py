@@ -204,8 +204,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if printed(arguments, tables):
         return
-    if not (arguments.work / "data.h5").exists():
-        collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", quiet=True)
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", resume=True, quiet=True)
     looks = tuple(arguments.looks)
 
     def looks_of(cell: Cell) -> tuple[int, ...]:

@@ -130,7 +130,8 @@ def run_bonus(trial: int, chosen: Settings, work: Path) -> list[Row]:
     columns = {"agent": BONUS, "trial": trial, "step": LONG, "settings": f"bonus={BONUSES[trial]}"}
     ensemble = work / "ensemble"
     if not ensemble.exists():
-        collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), work / "data.h5", quiet=True)  # held-out ones nobody looks at
+        # Nobody looks at the held-out layouts.
+        collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), work / "data.h5", resume=True, quiet=True)
         config = TrainEnsembleConfig(diversity="dbat", members=3, workers=1)
         train_ensemble(work / "data.h5", config, ensemble, seed=4000, quiet=True)
     return tried(chosen, LONG, columns, BONUSES[trial], open_artefact(ensemble, "ensemble"))
