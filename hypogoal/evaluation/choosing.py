@@ -146,9 +146,8 @@ def rows(work: Work) -> Iterator[Row]:
         for method, numbers in ((name, played), (UNIFORM, played["uniform"])):
             yield from rows_of({key: numbers[key] for key in (*OF_PLAY, *OF_CHOICE)}, method=method, **place)
         for member in played["members"]:
-            values = {key: member[key] for key in ("quality", "conditional_preference")}
-            where = {"sub_goal": member["sub_goal"], "member": member["member"]}
-            yield from rows_of(values, method=name, **where, **place)
+            where = {"sub_goal": member.pop("sub_goal"), "member": member.pop("member")}
+            yield from rows_of(member, method=name, **where, **place)
 
 
 def view(work: Work) -> dict[str, Any]:

@@ -3,8 +3,6 @@
 A table is said once, as columns, and drawn here for the page and for the terminal.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,7 +21,7 @@ from hypogoal.core.files import parse_json
 from hypogoal.core.manifests import AGAIN
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
-from hypogoal.evaluation.pictures import image_png, reduced
+from hypogoal.evaluation.pictures import STATES, image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 from hypogoal.evaluation.table import Pairs, Row
 
@@ -67,6 +65,13 @@ class Material:
         """The arrays of a folder, by their names in it."""
         start = f"{folder}/"
         return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
+
+    def termination_states(self, path: str, option: int) -> tuple[NDArray[np.uint8] | None, str]:
+        """The states in which an option of an artefact ends, as an overlay, and how many; None and "" if unknown."""
+        image, counts = self.arrays.get(f"terminations/{path}/{option}"), self.arrays.get(f"{STATES}/{path}/counts")
+        if image is None or counts is None:
+            return image, ""
+        return image, f"{counts[option]:,} state{'' if counts[option] == 1 else 's'}"
 
     def of_numbers(self) -> bool:
         """Whether observations are no pictures."""
@@ -277,11 +282,6 @@ def spans(numbers: Iterable[int]) -> str:
         else:
             rows.append([seed])
     return listed([text for row in rows for text in (row if len(row) < 3 else [f"{row[0]} to {row[-1]}"])])
-
-
-def states(count: int) -> str:
-    """'1 state', '37 states'."""
-    return f"{count:,} state{'' if count == 1 else 's'}"
 
 
 def fixed(value: float | None, digits: int) -> str:

@@ -4,14 +4,13 @@ Select rows, group them by their fields, reduce a run's members to one value, an
 a table over runs, ``compared`` into pairs of runs, ``wide`` into the entries of ``metrics.json``.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -198,15 +197,10 @@ def tabulate(rows: Iterable[Row], table: Table) -> list[Entry]:
             layouts = [row.layout for row, _ in runs]
             values = [value for _, value in runs]
             aggregated = over(values, number.unit, *cell, layouts=layouts, deviation=table.deviation)
-            _put(entry, name.split("."), aggregated)
+            *folders, last = name.split(".")
+            reduce(lambda place, folder: place.setdefault(folder, {}), folders, entry)[last] = aggregated
         entries.append(entry)
     return entries
-
-
-def _put(entry: Entry, path: Sequence[str], value: Any) -> None:
-    for name in path[:-1]:
-        entry = entry.setdefault(name, {})
-    entry[path[-1]] = value
 
 
 def compared(rows: Sequence[Row], by: Pairs) -> list[Entry]:
