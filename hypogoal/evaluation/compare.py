@@ -18,7 +18,6 @@ from hypogoal.evaluation.table import Pairs, Row, compared, select
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
 Curves = Mapping[str, Mapping[str, NDArray[Any]]]  # a run's label -> the arrays of its learning curves
-DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
 LADDERS = [page.label("method", "method"), rooms.N]
 
 
@@ -218,7 +217,7 @@ def _curves(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
 def _pairs(comparison: Mapping[str, Any]) -> Block:
     first = comparison["runs"][0]["label"]
     shared, units = "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)"
-    blocks = page.comparison_tables(comparison["comparisons"], shared, units, DIGITS)
+    blocks = page.comparison_tables(comparison["comparisons"], shared, units)
     text = (
         f"{first} against each other run, over what both have with the same seed."
         if blocks

@@ -390,9 +390,8 @@ def runs_of(agent: Entry) -> str:
 def runs_section(material: Material) -> Block:
     """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
-    digits = {"length": 0, "success": 2, "near": 2}
     caption = f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}"
-    pairs = page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits)
+    pairs = page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS)
     intervals = page.table(INTERVALS, agents, caption=caption)
     return page.section("runs", "Intervals and pairs", [], [intervals, *pairs], folded=True)
 

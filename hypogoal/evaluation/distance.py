@@ -388,8 +388,7 @@ def sections(material: Material) -> list[Block]:
         f"within {NEAR} of the true one and not begun inside; inside, begun in its own termination set; timed out; "
         f"died. A death or a time-out there counts as both.{left}"
     )
-    digits = {"distance, best member": 1}
-    pairs = page.comparison_tables(material.comparisons("distance"), "ladder, N and seed", digits=digits)
+    pairs = page.comparison_tables(material.comparisons("distance"), "ladder, N and seed")
     table = page.table(OVER_LADDERS, rows, tight=True, caption=caption)
     where = (
         f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "

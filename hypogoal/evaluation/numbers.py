@@ -169,13 +169,11 @@ def pairs(
     for second in others:
         shared = [key for key in values[first] if key in values[second]]
         if shared:
-            first_values, second_values = (
-                np.array([values[name][key] for key in shared], np.float64) for name in (first, second)
-            )
+            ours, theirs = (np.array([values[name][key] for key in shared], np.float64) for name in (first, second))
             several = len({key[0] for key in shared}) > 1
             units = [key[:1] if several else key[-2:] for key in shared]
             entry = {"first": first, "second": second, "quantity": quantity, "where": where, "higher": higher}
-            rows.append({**entry, **compare_pairs(first_values, second_values, units, higher=higher)})
+            rows.append({**entry, **compare_pairs(ours, theirs, units, higher=higher)})
     return rows
 
 

@@ -40,6 +40,7 @@ CAPTION = (
     "n: how many {units} everything is over, each of which counts once, by its mean. Difference: mean of first − "
     "second, with its 95 % interval (Student's t)."
 )
+DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}  # decimals of a difference; else 3
 INTERVALS = (
     "95 % intervals: of 2 to 7 {units} the mean and Student's t; of more the interquartile mean and a bootstrap (2,000 "
     "resamples); of one there is none."
@@ -307,9 +308,7 @@ def spread(aggregated: Entry | None, digits: int, scale: float = 1.0, error: str
     return cell(fixed(scale * mean, digits), "" if wide is None else f"± {scale * wide:.{digits}f}")
 
 
-def deviation(aggregated: Entry | None, digits: int) -> dict[str, str]:
-    """Mean, and beside it the standard deviation over seeds where there are several."""
-    return spread(aggregated, digits, error="standard_deviation")
+deviation = partial(spread, error="standard_deviation")  # mean, and beside it the standard deviation over seeds
 
 
 def interval(aggregated: Entry | None, digits: int, scale: float = 1.0) -> str:
@@ -334,12 +333,11 @@ def label_of(positive: bool) -> str:
 
 
 def comparison_tables(
-    rows: Sequence[Entry], shared: str, units: str = "seeds", digits: Mapping[str, int] | None = None
+    rows: Sequence[Entry], shared: str, units: str = "seeds", digits: Mapping[str, int] = DIGITS
 ) -> list[Block]:
     """The table of one method against the others, pair by pair, where there are pairs (Spec F5).
 
-    Rows are of ``numbers.pairs``. ``shared``: what pairs share; ``units``: what is independent; ``digits``: decimals of
-    a quantity's difference, by default 3.
+    Rows are of ``numbers.pairs``. ``shared``: what pairs share; ``units``: what is independent; ``digits``: decimals.
     """
     compared = [entry for entry in rows if entry["n"]]
     if not compared:
@@ -353,7 +351,7 @@ def comparison_tables(
         return str(entry["quantity"]).replace("_", " ") + ("" if entry["higher"] else " (lower is better)")
 
     def difference(entry: Entry) -> dict[str, str]:
-        places = max((digits or {}).get(entry["quantity"], 3), 1)  # may be small where the numbers are not
+        places = max(digits.get(entry["quantity"], 3), 1)  # may be small where the numbers are not
         value = entry["difference"]
         signed = "–" if value is None else f"{round(value, places) + 0.0:+.{places}f}"  # + 0.0: no "-0"
         return cell(signed, _between(entry["difference_interval"], places))

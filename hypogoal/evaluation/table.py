@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, read_text
 from hypogoal.evaluation.numbers import by_groups, grouped, method_rank, over, pairs
+from hypogoal.options.tables import AGAIN, MAX_TABLE_BYTES
 
-AGAIN = "Evaluate the run again."
-MAX_BYTES = 2**30  # of numbers.csv
 HARMLESS = re.compile(rf"(^|[,;\"])'(?=\s*[{re.escape(FORMULA)}])")  # what ``write_table`` puts before a formula
 BEST, WORST, VALIDATED = "best_member", "worst_member", "validated_member"  # quantities: which member it is
 MEMBERS: Mapping[str, Callable[[Any], Any]] = {"best": np.max, "mean": np.mean, "worst": np.min}
@@ -104,7 +103,7 @@ def defined(rows: Iterable[Row]) -> Iterator[Row]:
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of ``numbers.csv``; a ``UserError`` where it is missing or damaged."""
-    text = read_text(path, "the table of numbers is", AGAIN, MAX_BYTES)
+    text = read_text(path, "the table of numbers is", AGAIN, MAX_TABLE_BYTES)
     try:
         lines = list(csv.DictReader(io.StringIO(text, newline="")))
         return [Row(**{name: _field(name, line[name]) for name in Row._fields}) for line in lines]
