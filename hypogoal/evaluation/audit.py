@@ -5,8 +5,6 @@ its positive predictions. So options are learned that end at these, and the trut
 up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -114,8 +112,8 @@ def findings(
         description = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
         kinds.append({"executions": len(alike), **description, "film": film if shown else None})
     ends = {"fooled": len(fooled), "there": int((positive & near).sum())}
-    begun = {"yes_at_start": sum(row.inside_at_start for row in rows)}
-    return option_numbers(table, option) | ends | begun | {"kinds": kinds}
+    ends["yes_at_start"] = sum(row.inside_at_start for row in rows)
+    return option_numbers(table, option) | ends | {"kinds": kinds}
 
 
 def _film(loop: OptionLoop, path: NDArray[np.int64], option: int) -> bytes:

@@ -105,12 +105,11 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
     chosen = np.bincount(taken, minlength=len(quality))
     preference = np.where(at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
     rhos, better, worse = [], 0, 0
-    for goal in range(len(quality) // members):
-        members_of_goal = slice(goal * members, (goal + 1) * members)
-        comparable = ~np.isnan(quality[members_of_goal]) & ~np.isnan(preference[members_of_goal])
-        if comparable.sum() > 1 and at_least(np.ptp(quality[members_of_goal][comparable]), DIFFERENCE):
-            rhos.append(rank_correlation(quality[members_of_goal][comparable], preference[members_of_goal][comparable]))
-        for option, other in combinations(options[members_of_goal].tolist(), 2):
+    for alike in options.reshape(-1, members):  # of one sub-goal
+        comparable = alike[~np.isnan(quality[alike]) & ~np.isnan(preference[alike])]
+        if len(comparable) > 1 and at_least(np.ptp(quality[comparable]), DIFFERENCE):
+            rhos.append(rank_correlation(quality[comparable], preference[comparable]))
+        for option, other in combinations(alike.tolist(), 2):
             if at_least(abs(quality[option] - quality[other]), DIFFERENCE):
                 good, bad = (option, other) if quality[option] > quality[other] else (other, option)
                 both = among[:, option] & among[:, other]
@@ -146,9 +145,8 @@ def rows(work: Work) -> Iterator[Row]:
         for method, numbers in ((name, played), (UNIFORM, played["uniform"])):
             yield from rows_of({key: numbers[key] for key in (*OF_PLAY, *OF_CHOICE)}, method=method, **place)
         for member in played["members"]:
-            values = {key: member[key] for key in ("quality", "conditional_preference")}
-            where = {"sub_goal": member["sub_goal"], "member": member["member"]}
-            yield from rows_of(values, method=name, **where, **place)
+            where = {"sub_goal": member.pop("sub_goal"), "member": member.pop("member")}
+            yield from rows_of(member, method=name, **where, **place)
 
 
 def view(work: Work) -> dict[str, Any]:
@@ -182,11 +180,9 @@ def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
     loop = agent_of(artefact, seed, ENVIRONMENTS)
     members, shortest = config["members"], loop.engine.shortest_path()
     goals = np.repeat([sub_goals.index(goal) for goal in config["sub_goals"]], members)
-    quality, numbers = np.empty(0), []
-    for chooser in (loop.chooser, RandomChooser(rng_for(seed, "uniform-choice"))):
-        episodes = play(loop, chooser)
-        if not len(quality):  # where the agent itself decides
-            quality = qualities(loop, goals, episodes.choices.states)
+    of_both = [play(loop, chooser) for chooser in (loop.chooser, RandomChooser(rng_for(seed, "uniform-choice")))]
+    quality, numbers = qualities(loop, goals, of_both[0].choices.states), []  # where the agent itself decides
+    for episodes in of_both:
         scores = episodes.scores(shortest) | {"length": episodes.length}
         played = {name: mean_of(scores[name].ravel()) for name in OF_PLAY}
         numbers.append(played | judge(episodes.choices, quality, members))

@@ -18,7 +18,6 @@ from hypogoal.evaluation.table import Pairs, Row, compared, select
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
 Curves = Mapping[str, Mapping[str, NDArray[Any]]]  # a run's label -> the arrays of its learning curves
-DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
 LADDERS = [page.label("method", "method"), rooms.N]
 
 
@@ -179,7 +178,7 @@ def _runs(comparison: Entry) -> Block:
 
 def _differences(comparison: Entry) -> Block:
     names = [run["label"] for run in comparison["runs"]]
-    values = [page.label(name, lambda line, name=name: line["values"][name]) for name in names]
+    values = [page.label(name, lambda line, name=name: line["values"][name]) for name in names]  # names may have dots
     lines = comparison["differences"]
     text = (
         "Settings, seeds, data and versions that are not the same in all runs; several values are of several artefacts "
@@ -210,21 +209,15 @@ def _curves(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
                 f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and "
                 f"seeds; {curves.BANDS} over them."
             )
-            title = f"{heading}: {name}"
+            title, drawn = f"{heading}: {name}", curves.learning_curves(lines, quantity)
             kind = "reward" if quantity == "reward" else "length"
-            yield Drawn(
-                f"{kind}-{number}", title, curves.learning_curves(lines, quantity), caption, f"{counts}.", heading=title
-            )
+            yield Drawn(f"{kind}-{number}", title, drawn, caption, f"{counts}.", heading=title)
 
 
 def _pairs(comparison: Mapping[str, Any]) -> Block:
     first = comparison["runs"][0]["label"]
-    blocks = page.comparison_tables(
-        comparison["comparisons"],
-        "seed, and layout, sub-goal or ladder",
-        "layouts (or seeds of ensembles or of one layout)",
-        DIGITS,
-    )
+    shared, units = "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)"
+    blocks = page.comparison_tables(comparison["comparisons"], shared, units)
     text = (
         f"{first} against each other run, over what both have with the same seed."
         if blocks
@@ -235,12 +228,7 @@ def _pairs(comparison: Mapping[str, Any]) -> Block:
 
 PARTS: Mapping[str, Part] = {
     "agents": Part(
-        "Agents",
-        itemgetter("agents"),
-        [curves.AGENT],
-        curves.HEADLINE,
-        f"{curves.HEADLINE_CAPTION}.",
-        curves.PAIRS,
+        "Agents", itemgetter("agents"), [curves.AGENT], curves.HEADLINE, f"{curves.HEADLINE_CAPTION}.", curves.PAIRS
     ),
     "hypotheses": Part(
         "Hypotheses",

@@ -1,7 +1,5 @@
 """Figure 6: what agents achieve on layouts that no data came from, over training and at its end (Spec E6, E7, F5)."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -118,7 +116,7 @@ def read_run(artefact: Artefact, path: str) -> Run:
 
 
 def trailing_mean(
-    steps: NDArray[np.int64], values: NDArray[np.float64], grid: NDArray[np.int64], window: int = LAST, least: int = 1
+    steps: NDArray[np.int64], values: NDArray[Any], grid: NDArray[np.int64], window: int = LAST, least: int = 1
 ) -> NDArray[np.float64]:
     """Spec F5: at each point of ``grid`` (G,) the mean of the last ``window`` values known by then, float64 (G,).
 
@@ -137,12 +135,9 @@ def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = LAST) -> d
 
     ``solved_length``: of the solved ones among them; NaN where none is.
     """
-    solved_length = episodes.length * episodes.succeeded
-    values = {
-        "reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length, "solved": solved_length
-    }  # fmt: skip
-    floats = {name: numbers.astype(np.float64) for name, numbers in values.items()}
-    means = {name: trailing_mean(episodes.step, numbers, grid, window, FIRST) for name, numbers in floats.items()}
+    values = {"reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length}
+    values["solved"] = episodes.length * episodes.succeeded
+    means = {name: trailing_mean(episodes.step, numbers, grid, window, FIRST) for name, numbers in values.items()}
     success = np.where(means["success"] > 0, means["success"], np.nan)
     return means | {"solved_length": means.pop("solved") / success}
 
@@ -224,9 +219,8 @@ PAIRS = Pairs("agents", {name: Number(name, higher=name != "length") for name in
 def rows_of_run(run: Run, name: str) -> Iterator[Row]:
     """Spec F5: what is said of one trained agent at the end of its training."""
     shortest = run.layout.get("shortest_path")
-    budget = {"steps": run.budget, "practice": run.practice}
-    numbers = run_numbers(run.episodes, shortest)
-    return rows_of({**budget, **numbers, "shortest_path": shortest}, **_place(run, name))
+    numbers = {"steps": run.budget, "practice": run.practice, **run_numbers(run.episodes, shortest)}
+    return rows_of(numbers | {"shortest_path": shortest}, **_place(run, name))
 
 
 def _place(run: Run, name: str) -> dict[str, Any]:
@@ -371,22 +365,19 @@ def sections(material: Material) -> list[Block]:
 def summary_section(material: Material) -> Block:
     """Curves, and the headline numbers."""
     metrics = material.metrics
+    caption = f"{HEADLINE_CAPTION}; steps of train-options count."
     headline = page.table(
-        (AGENT, *HEADLINE),
-        metrics["agents"],
-        main=lambda agent: bool(agent["name"] == LEARNED),
-        caption=f"{HEADLINE_CAPTION}; steps of train-options count.",
+        (AGENT, *HEADLINE), metrics["agents"], main=lambda agent: bool(agent["name"] == LEARNED), caption=caption
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
-    row = {"kind": "row", "blocks": drawn}
-    blocks = [row, headline] if drawn else []
+    blocks = [{"kind": "row", "blocks": drawn}, headline] if drawn else []
     return page.section("summary", "Summary", [], blocks, metrics["missing"])
 
 
 def runs_of(agent: Entry) -> str:
     """How many runs an agent has, and of which layouts and seeds."""
     runs = agent["runs"]
-    seeds = sorted({run["seed"] for run in runs})
+    seeds = {run["seed"] for run in runs}
     layouts = {run["layout_seed"] for run in runs if not run.get("layouts")}
     texts = [page.spans(layouts)] if layouts else []
     texts += sorted({run["layouts"] for run in runs if run.get("layouts")})
@@ -399,16 +390,10 @@ def runs_of(agent: Entry) -> str:
 def runs_section(material: Material) -> Block:
     """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
-    digits = {"length": 0, "success": 2, "near": 2}
-    blocks = [
-        page.table(
-            INTERVALS,
-            agents,
-            caption=f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
-        ),
-        *page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits),
-    ]
-    return page.section("runs", "Intervals and pairs", [], blocks, folded=True)
+    caption = f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}"
+    pairs = page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS)
+    intervals = page.table(INTERVALS, agents, caption=caption)
+    return page.section("runs", "Intervals and pairs", [], [intervals, *pairs], folded=True)
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -421,15 +406,10 @@ def _curve(material: Material, quantity: str) -> Drawn | None:
     agents, layouts, arrays = material.metrics["agents"], material.metrics["layouts"], material.arrays
     used = {COLOURS.get(agent["name"]) for agent in agents}
     others = cycle(look for look in OTHERS if look not in used)
-    lines = [
-        Line(
-            titled(agent["name"]),
-            arrays["curves/grid"],
-            values_of(agent, arrays[f"curves/{index}/{quantity}"]),
-            *(COLOURS.get(agent["name"]) or next(others)),
-        )
-        for index, agent in enumerate(agents)
-    ]
+    lines = []
+    for index, agent in enumerate(agents):
+        look, of_runs = COLOURS.get(agent["name"]) or next(others), arrays[f"curves/{index}/{quantity}"]
+        lines.append(Line(titled(agent["name"]), arrays["curves/grid"], values_of(agent, of_runs), *look))
     if is_flat(quantity, lines):
         return None
     lines = [line for line in lines if quantity == "reward" or np.isfinite(line.values).any()]
@@ -445,9 +425,10 @@ def _curve(material: Material, quantity: str) -> Drawn | None:
     title, _ = AXES[quantity]
     drawn = learning_curves(lines, quantity, {name: float(np.mean(values))} if values else {})
     reference = f" Dotted: mean over layouts of {dotted}." if values else ""
-    practised = [run["practice"] for agent in agents for run in agent["runs"] if run.get("practice")]
-    practice = " Agents begin after the practice of their options" if practised else ""
-    practice += f", on average {page.thousands(float(np.mean(practised)))} steps." if practised else ""
+    practice = ""
+    if practised := [run["practice"] for agent in agents for run in agent["runs"] if run.get("practice")]:
+        steps = page.thousands(float(np.mean(practised)))
+        practice = f" Agents begin after the practice of their options, on average {steps} steps."
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
         f"{f'{which_figure}{title.lower()}' if of_paper else title}, mean of the last 100 episodes at each step."

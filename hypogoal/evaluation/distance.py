@@ -1,11 +1,9 @@
 """Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders (Spec F3, F4)."""
 
-from __future__ import annotations
-
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import product
+from itertools import count, product
 from operator import itemgetter
 from typing import Any
 
@@ -15,7 +13,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from rich.table import Table as Printed
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.own_code import UsersCode, as_number
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation import page
@@ -67,6 +65,7 @@ NUMBERS |= {share: Number(share, "", "share of executions", BEST) for share in S
 OF_OPTIONS = ("executions", "distance", "executions_deviation", "duration", *SHARES, "threshold")
 QUANTITIES = (*OF_OPTIONS, BEST, WORST, VALIDATED)
 NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
+NO_PICTURES = "The domain has no pictures of its rooms."
 ROOMS_SHOWN = 3
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
@@ -99,7 +98,7 @@ def option_numbers(executions: Executions, *, never_offered: bool = False) -> di
     An option ``never_offered`` has none because it would always have begun inside its own termination set: it counts
     300. Units: the domain's; duration in steps; shares of executions. Timed out: neither classifier nor death ended it.
     """
-    distance, count = counted(executions), len(executions.step)
+    distance, executed = counted(executions), len(executions.step)
     shares = {
         "reached_base": at_base(executions),
         "inside_at_start": executions.inside_at_start,
@@ -107,9 +106,9 @@ def option_numbers(executions: Executions, *, never_offered: bool = False) -> di
         "died": executions.terminated,
     }
     return {
-        "executions": count,
-        "distance": float(INSIDE) if never_offered and not count else mean_of(distance),
-        "executions_deviation": float(distance.std(ddof=1)) if count > 1 else math.nan,
+        "executions": executed,
+        "distance": float(INSIDE) if never_offered and not executed else mean_of(distance),
+        "executions_deviation": float(distance.std(ddof=1)) if executed > 1 else math.nan,
         "duration": mean_of(executions.duration),
         **{name: mean_of(values) for name, values in shares.items()},
     }
@@ -119,7 +118,7 @@ def rows_of_ladder(
     executions: Executions,
     sub_goals: Sequence[str],
     members: int,
-    validated: Mapping[str, int | None],
+    validated: Mapping[str, int],
     *,
     masked: bool,
     thresholds: NDArray[np.float64] | None = None,
@@ -151,15 +150,14 @@ def options_of(rows: Iterable[Row]) -> list[dict[str, Any]]:
     """Of each options artefact and sub-goal its ``options``, and which member is ``best``, ``worst``, ``validated``."""
     names = {"method": "method", "groups": "N", "ladder": "ladder", "seed": "seed", "sub_goal": "sub_goal"}
     entries = with_members(_of_options(rows), path="artefact", **names)
-    before: dict[str, int] = {}  # options of the artefact's earlier sub-goals
+    numbers: dict[str, Iterator[int]] = defaultdict(count)  # of each artefact's options
     for entry in entries:
         entry["options"] = entry.pop("members")
         for option in entry["options"]:
-            option["option"] = before.get(entry["path"], 0) + option["member"]
-        before[entry["path"]] = before.get(entry["path"], 0) + len(entry["options"])
+            option["option"] = next(numbers[entry["path"]])
         for name, quantity in {"best": BEST, "worst": WORST, "validated": VALIDATED}.items():
-            entry[name] = None if math.isnan(entry[quantity]) else int(entry[quantity])
-            del entry[quantity]
+            member = entry.pop(quantity)
+            entry[name] = None if math.isnan(member) else int(member)
     return entries
 
 
@@ -193,13 +191,8 @@ def ladder_names(
     methods: Sequence[str], groups: Sequence[int | None], configs: Sequence[Mapping[str, Any]]
 ) -> list[str]:
     """Names of n options artefacts by their ensemble's method; where their own settings differ at one N, with those."""
-    names = list(methods)
     settings = [{key: value for key, value in config.items() if key not in NOT_A_METHOD} for config in configs]
-    for alike in grouped(range(len(names)), lambda index: groups[index]).values():
-        apart = name_apart([methods[index] for index in alike], [settings[index] for index in alike])
-        for index, name in zip(alike, apart, strict=True):
-            names[index] = name
-    return names
+    return name_apart(methods, settings, groups)
 
 
 def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = ()) -> list[int]:
@@ -213,8 +206,11 @@ def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = (
 
 def rows(work: Work) -> Iterator[Row]:
     """Spec F3: every member's option on every ladder: where its executions stopped; overlays go to the arrays."""
-    for artefact, (validated, place) in zip(work.contents.ladders, _named(work), strict=True):
+    picked = by_fields(select(work.rows, quantity=VALIDATED, scope=VALIDATION), "artefact")
+    for artefact, source, place in _named(work):
         path, config = work.contents.name(artefact), artefact.config
+        choices = picked.get((source,), []) if takes(artefact) else []
+        validated = {row.sub_goal: int(row.value) for row in choices if not math.isnan(row.value)}
         executions = Executions.read(artefact.path / "executions.csv")
         if "terminations.h5" in artefact.manifest["files"]:
             ends = read_terminations(artefact.path / "terminations.h5")
@@ -247,25 +243,18 @@ def view(work: Work) -> dict[str, Any]:
     return {"distance": {"options": options, "over_ladders": distance_table(work.rows, ladders), "shown": stops}}
 
 
-def _named(work: Work) -> list[tuple[dict[str, int | None], dict[str, Any]]]:
-    """Of each ladder's options the member that validation chooses, by sub-goal, and their ensemble's method and N."""
-    picked = by_fields(select(work.rows, quantity=VALIDATED, scope=VALIDATION), "artefact")
-    methods = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
-    validated: list[dict[str, int | None]] = []
-    places: list[tuple[str, int | None]] = []
+def _named(work: Work) -> Iterator[tuple[Artefact, str, dict[str, Any]]]:
+    """Each ladder's options, the path of their ensemble, empty where it is not the run's, and its method and N."""
+    known = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
+    paths, methods, groups = [], [], []
     for artefact in work.contents.ladders:
         source = open_artefact(artefact.input("ensemble"), "ensemble")
-        path = within(work.contents, source) or ""
-        learned = takes(artefact)
-        method = methods.get(path, ensemble_name(source.config))
-        places.append((method, groups_of(source.config)) if learned else (ORACLE, None))
-        rows = picked.get((path,), []) if learned else []
-        validated.append({row.sub_goal: None if math.isnan(row.value) else int(row.value) for row in rows})
-    configs = [artefact.config for artefact in work.contents.ladders]
-    groups = [number for _, number in places]
-    names = ladder_names([method for method, _ in places], groups, configs)
-    named = [{"method": name, "N": number} for name, number in zip(names, groups, strict=True)]
-    return list(zip(validated, named, strict=True))
+        paths.append(within(work.contents, source) or "")
+        methods.append(known.get(paths[-1], ensemble_name(source.config)) if takes(artefact) else ORACLE)
+        groups.append(groups_of(source.config) if takes(artefact) else None)
+    names = ladder_names(methods, groups, [artefact.config for artefact in work.contents.ladders])
+    for artefact, path, name, number in zip(work.contents.ladders, paths, names, groups, strict=True):
+        yield artefact, path, {"method": name, "N": number}
 
 
 def show_stops(
@@ -286,22 +275,20 @@ def show_stops(
     numbers: list[int | None] = [groups for groups in by_groups(rows) if groups is not None] or [None]
     shown = []
     for ladder, groups in product(ladders, numbers):
-        candidates = [
-            row for row in rows if row["ladder"] == ladder and row["seed"] == first and row["best"] is not None
-        ]
+        at_start = [row for row in rows if (row["ladder"], row["seed"]) == (ladder, first) and row["best"] is not None]
+        beside = [row for row in at_start if row["groups"] == groups or row["method"].startswith(ORACLE)]
         columns, where = [], []
-        for row in sorted(candidates, key=lambda row: method_rank(row["method"])):
-            if row["groups"] == groups or row["method"].startswith(ORACLE):
-                best = row["options"][row["best"]]
-                stops = executions[row["path"]].of(best["option"])
-                group = arrays.require_group(f"stops/{row['path']}/{best['option']}")
-                if not len(group):  # the oracle's stand beside every N
-                    group["positions"] = stops.positions()
-                    with UsersCode("the domain's pixel", domain, "pixel"):
-                        group["pixels"] = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
-                    group["fates"] = fates(stops)
-                columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
-                where.append(stops.room)
+        for row in sorted(beside, key=lambda row: method_rank(row["method"])):
+            best = row["options"][row["best"]]
+            stops = executions[row["path"]].of(best["option"])
+            group = arrays.require_group(f"stops/{row['path']}/{best['option']}")
+            if not len(group):  # the oracle's stand beside every N
+                group["positions"] = stops.positions()
+                with UsersCode("the domain's pixel", domain, "pixel"):
+                    group["pixels"] = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
+                group["fates"] = fates(stops)
+            columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
+            where.append(stops.room)
         if columns:
             place: dict[str, Any] = {"ladder": ladder, "groups": groups, "seed": first}
             shown.append({**place, "rooms": rooms_shown(where, _rooms_of(domain, ladder)), "columns": columns})
@@ -401,9 +388,7 @@ def sections(material: Material) -> list[Block]:
         f"within {NEAR} of the true one and not begun inside; inside, begun in its own termination set; timed out; "
         f"died. A death or a time-out there counts as both.{left}"
     )
-    pairs = page.comparison_tables(
-        material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
-    )
+    pairs = page.comparison_tables(material.comparisons("distance"), "ladder, N and seed")
     table = page.table(OVER_LADDERS, rows, tight=True, caption=caption)
     where = (
         f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "
@@ -423,7 +408,11 @@ def _ordered(rows: Sequence[Entry]) -> list[Entry]:
 
 def figures(material: Material) -> list[Drawn]:
     """Figures 4 and 5."""
-    return [_bars(material), *_stops(material)] if material.metrics["distance"]["options"] else []
+    distance, title = material.metrics["distance"], "Figure 5: where executions stopped"
+    if not distance["options"]:
+        return []
+    stops = [_scatter(material, figure, index) for index, figure in enumerate(distance["shown"])]
+    return [_bars(material), *(stops or [Drawn("figure5", title, None, missing=NO_PICTURES)])]
 
 
 def _bars(material: Material) -> Drawn:
@@ -431,31 +420,19 @@ def _bars(material: Material) -> Drawn:
     rows = [entry for entry in _ordered(distance["over_ladders"]) if entry["best"]["mean"] is not None]
     name_of, bars = page.method_of(distance["options"]), []
     for entry in rows:
-        mean, wide = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
+        mean, deviation = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
         each = [seed for seed in entry["each_seed"] if seed is not None]
-        bars.append((name_of(entry), _group(entry), mean, wide, each))
+        bars.append((name_of(entry), _group(entry), mean, deviation, each))
     names = list(dict.fromkeys(name for name, *_ in bars if not name.startswith(ORACLE)))
     drawn = distance_bars(bars, names, INSIDE) if bars else None
-    seeds = sorted({row["seed"] for row in distance["options"]})
-    ladders = distance["over_ladders"][0]["ladders"]
+    seeds = page.spans({row["seed"] for row in distance["options"]})
+    runs = f"Ladders: {page.listed(distance['over_ladders'][0]['ladders'])}; seeds: {seeds}."
     caption = (
         "Figure 4 of the paper: distance of the best member of each ladder, mean over ladders; bars: mean over seeds, "
         "whiskers: ± one standard deviation over seeds, dots: each seed. Lower is better. The paper's error bars are "
         "the deviation over the last 100 executions instead: in the table."
     )
-    runs, nothing = (
-        f"Ladders: {page.listed(ladders)}; seeds: {page.spans(seeds)}.",
-        "No seed has executions on all ladders of the run.",
-    )
-    return Drawn("figure4", name, drawn, caption, runs, nothing)
-
-
-def _stops(material: Material) -> list[Drawn]:
-    distance = material.metrics["distance"]
-    if not distance["shown"]:
-        nothing = "The domain has no pictures of its rooms."
-        return [Drawn("figure5", "Figure 5: where executions stopped", None, missing=nothing)]
-    return [_scatter(material, figure, index) for index, figure in enumerate(distance["shown"])]
+    return Drawn("figure4", name, drawn, caption, runs, "No seed has executions on all ladders of the run.")
 
 
 def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
@@ -545,9 +522,8 @@ def stops_over_rooms(
                 x, y = pixels[(rooms == room) & (ends == fate)].T
                 place.plot(x, y, alpha=0.75, **mark)
             first = room == pictures[0][0]
-            place.set_title(
-                f"{title}, room {room}" if first else f"room {room}", pad=3, fontsize=9.5 if columns == 2 else 8
-            )
+            name = f"{title}, room {room}" if first else f"room {room}"
+            place.set_title(name, pad=3, fontsize=9.5 if columns == 2 else 8)
         handles, labels = [Line2D([], [], **mark) for _, mark in STOPS.values()], [name for name, _ in STOPS.values()]
         figure.legend(handles, labels, loc="lower left", ncols=3, handletextpad=0.2, columnspacing=1.2, borderpad=0)
         return figure

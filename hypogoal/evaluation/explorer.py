@@ -4,8 +4,6 @@ Most predictions are right, so a random sample would hardly show an error. Here 
 within each the places that states are from. ``templates/explorer.js`` shows those that its filters let through.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -18,7 +16,7 @@ from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, variants
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Entry, Material, Question
-from hypogoal.evaluation.pictures import FULL, STATES, attribution_png, brightness, flat, reduced, to_bytes
+from hypogoal.evaluation.pictures import FULL, attribution_image, brightness, flat, image_png, reduced, to_bytes
 from hypogoal.evaluation.table import Row
 
 MOST_STATES = 300  # over all sub-goals: the page of the ladders has 1.4 MB
@@ -40,7 +38,8 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     most = min(MOST_OF_ONE, MOST_STATES // sub_goals)  # all sub-goals share the page
     places = [split.origins[name] for name in PLACES if name in split.origins]
     picked = pick_to_browse(predictions, split.labels, places, most, rng_for(0, "browse", sub_goal))
-    kind, kinds = split.origins.get("kind"), judgement.kinds
+    kinds, reading = (judgement.domain.kinds, judgement.domain.reading) if judgement.domain else ((), "")
+    kind = split.origins.get("kind")
     names = [kinds[kind[index]] if kind is not None and kind[index] < len(kinds) else "" for index in picked]
     group = work.arrays.create_group(f"explorer/{sub_goal}")
     judgement.write_states(group, list(zip(picked.tolist(), names, strict=True)))
@@ -53,7 +52,6 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     group["attributions"] = np.concatenate([np.zeros(shape, np.int8), *values])
     group["brightness"] = brightness(seen)
     counts = {"states": len(split.labels), "shown": len(picked), "explained": len(seen)}
-    reading = judgement.domain.reading if judgement.domain else ""
     work.looked["explorer"].append({"sub_goal": sub_goal, **counts, "reading": reading})
     return ()
 
@@ -150,7 +148,8 @@ def _states(material: Material, sub_goal: str) -> list[dict[str, Any]]:
         if index < explained:
             grey = reduced(arrays["brightness"][index] / 255)
             values = arrays["attributions"][index]
-            saliency = [page.encoded(attribution_png(reduced(of_member / FULL), grey)) for of_member in values]
+            images = [attribution_image(reduced(of_member / FULL), grey) for of_member in values]
+            saliency = [page.encoded(image_png(image)) for image in images]
         states.append(
             {
                 "png": page.picture(arrays["observations"][index]),
@@ -196,24 +195,15 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
                 ("mean steps", page.fixed(option["duration"], 1)),
             ]
             name, note = f"ladder {row['ladder']}, seed {row['seed']}", f"{picks} member here" if picks else ""
-            options.append(
-                {"name": name, "note": note, "facts": facts, **_overlay(material, row["path"], option["option"])}
-            )
+            picture = _overlay(material, row["path"], option["option"])
+            options.append({"name": name, "note": note, "facts": facts, **picture})
     return options
 
 
 def _overlay(material: Material, path: str, option: int) -> dict[str, str]:
     """The picture of the states in which an option ends, and their number."""
-    image, counts = (
-        material.arrays.get(place) for place in (f"terminations/{path}/{option}", f"{STATES}/{path}/counts")
-    )
-    if image is None:
-        return {"png": "", "states": ""}
-    return {"png": page.picture(image), "states": "" if counts is None else f"ends in {page.states(counts[option])}"}
+    image, states = material.termination_states(path, option)
+    return {"png": "" if image is None else page.picture(image), "states": f"ends in {states}" if states else ""}
 
 
-QUESTION = Question(
-    look=look,
-    view=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=sections,
-)
+QUESTION = Question(look=look, view=lambda work: {"explorer": work.kept("explorer", work.browsed)}, sections=sections)

@@ -4,8 +4,6 @@ Episodes differ in length, and the failed ones are the longest. Of all episodes 
 many are short, so every environment plays the same number of episodes, however long they take.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

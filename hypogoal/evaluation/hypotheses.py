@@ -1,7 +1,5 @@
 """How good hypotheses are on layouts that no data came from, and how much members differ (Spec F1, F2)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
@@ -136,7 +134,7 @@ def figures(material: Material) -> list[Drawn]:
     """Figure 3's quantity for one labelled context."""
     entries = material.metrics["hypotheses"]
     drawn = best_mean_worst_members(entries)
-    seeds = sorted({ensemble["seed"] for ensemble in material.metrics["ensembles"]})
+    seeds = {ensemble["seed"] for ensemble in material.metrics["ensembles"]}
     where = "layouts, pooled over them" if _has_layouts(material.metrics) else "states"
     caption = (
         f"The quantity of the paper's Figure 3, for one labelled context: balanced accuracy on held-out {where}. "
@@ -175,11 +173,4 @@ def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
     return figure
 
 
-QUESTION = Question(
-    look=look,
-    view=view,
-    pairs=PAIRS,
-    summary=summary,
-    sections=sections,
-    figures=figures,
-)
+QUESTION = Question(look=look, view=view, pairs=PAIRS, summary=summary, sections=sections, figures=figures)

@@ -76,11 +76,6 @@ class Judgement:
     domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
 
-    @property
-    def kinds(self) -> Sequence[str]:
-        """Names of the values of the origin ``kind``."""
-        return self.domain.kinds if self.domain else ()
-
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
         """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
         from hypogoal.hypotheses.deep_lift import mean_state

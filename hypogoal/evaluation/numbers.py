@@ -3,8 +3,6 @@
 Runs that were not made alike are never averaged: they have different names.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
@@ -171,13 +169,11 @@ def pairs(
     for second in others:
         shared = [key for key in values[first] if key in values[second]]
         if shared:
-            first_values, second_values = (
-                np.array([values[name][key] for key in shared], np.float64) for name in (first, second)
-            )
+            ours, theirs = (np.array([values[name][key] for key in shared], np.float64) for name in (first, second))
             several = len({key[0] for key in shared}) > 1
             units = [key[:1] if several else key[-2:] for key in shared]
             entry = {"first": first, "second": second, "quantity": quantity, "where": where, "higher": higher}
-            rows.append({**entry, **compare_pairs(first_values, second_values, units, higher=higher)})
+            rows.append({**entry, **compare_pairs(ours, theirs, units, higher=higher)})
     return rows
 
 
@@ -215,15 +211,19 @@ def compare_pairs(
     }
 
 
-def name_apart(bases: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
+def name_apart(
+    bases: Sequence[str], configs: Sequence[Mapping[str, Any]], groups: Sequence[int | None] = ()
+) -> list[str]:
     """A name for each of n things: its base name, and the settings by which it differs from most of that base name.
 
-    ``domain_config`` inside the settings is looked into.
+    ``domain_config`` inside the settings is looked into. Of several ``groups`` (N) only things of the same are named
+    apart.
     """
     flat = [{**(config.get("domain_config") or {}), **config, "domain_config": None} for config in configs]
+    kinds = list(zip(bases, groups or [None] * len(bases), strict=True))
     names = []
-    for base, config in zip(bases, flat, strict=True):
-        alike = [other for other, name in zip(flat, bases, strict=True) if name == base]
+    for base, kind, config in zip(bases, kinds, flat, strict=True):
+        alike = [other for other, others_kind in zip(flat, kinds, strict=True) if others_kind == kind]
         differing = []
         for key in sorted({key for other in alike for key in other} - NOT_A_VARIANT):
             values = [_text(other.get(key)) for other in alike]

@@ -3,8 +3,6 @@
 A table is said once, as columns, and drawn here for the page and for the terminal.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,7 +21,7 @@ from hypogoal.core.files import parse_json
 from hypogoal.core.manifests import AGAIN
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
-from hypogoal.evaluation.pictures import image_png, reduced
+from hypogoal.evaluation.pictures import STATES, image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 from hypogoal.evaluation.table import Pairs, Row
 
@@ -42,6 +40,7 @@ CAPTION = (
     "n: how many {units} everything is over, each of which counts once, by its mean. Difference: mean of first − "
     "second, with its 95 % interval (Student's t)."
 )
+DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}  # decimals of a difference; else 3
 INTERVALS = (
     "95 % intervals: of 2 to 7 {units} the mean and Student's t; of more the interquartile mean and a bootstrap (2,000 "
     "resamples); of one there is none."
@@ -67,6 +66,13 @@ class Material:
         """The arrays of a folder, by their names in it."""
         start = f"{folder}/"
         return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
+
+    def termination_states(self, path: str, option: int) -> tuple[NDArray[np.uint8] | None, str]:
+        """The states in which an option of an artefact ends, as an overlay, and how many; None and "" if unknown."""
+        image, counts = self.arrays.get(f"terminations/{path}/{option}"), self.arrays.get(f"{STATES}/{path}/counts")
+        if image is None or counts is None:
+            return image, ""
+        return image, f"{counts[option]:,} state{'' if counts[option] == 1 else 's'}"
 
     def of_numbers(self) -> bool:
         """Whether observations are no pictures."""
@@ -279,11 +285,6 @@ def spans(numbers: Iterable[int]) -> str:
     return listed([text for row in rows for text in (row if len(row) < 3 else [f"{row[0]} to {row[-1]}"])])
 
 
-def states(count: int) -> str:
-    """'1 state', '37 states'."""
-    return f"{count:,} state{'' if count == 1 else 's'}"
-
-
 def fixed(value: float | None, digits: int) -> str:
     """A number with a fixed number of decimals; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}f}"
@@ -307,9 +308,7 @@ def spread(aggregated: Entry | None, digits: int, scale: float = 1.0, error: str
     return cell(fixed(scale * mean, digits), "" if wide is None else f"± {scale * wide:.{digits}f}")
 
 
-def deviation(aggregated: Entry | None, digits: int) -> dict[str, str]:
-    """Mean, and beside it the standard deviation over seeds where there are several."""
-    return spread(aggregated, digits, error="standard_deviation")
+deviation = partial(spread, error="standard_deviation")  # mean, and beside it the standard deviation over seeds
 
 
 def interval(aggregated: Entry | None, digits: int, scale: float = 1.0) -> str:
@@ -334,12 +333,11 @@ def label_of(positive: bool) -> str:
 
 
 def comparison_tables(
-    rows: Sequence[Entry], shared: str, units: str = "seeds", digits: Mapping[str, int] | None = None
+    rows: Sequence[Entry], shared: str, units: str = "seeds", digits: Mapping[str, int] = DIGITS
 ) -> list[Block]:
     """The table of one method against the others, pair by pair, where there are pairs (Spec F5).
 
-    Rows are of ``numbers.pairs``. ``shared``: what pairs share; ``units``: what is independent; ``digits``: decimals of
-    a quantity's difference, by default 3.
+    Rows are of ``numbers.pairs``. ``shared``: what pairs share; ``units``: what is independent; ``digits``: decimals.
     """
     compared = [entry for entry in rows if entry["n"]]
     if not compared:
@@ -353,7 +351,7 @@ def comparison_tables(
         return str(entry["quantity"]).replace("_", " ") + ("" if entry["higher"] else " (lower is better)")
 
     def difference(entry: Entry) -> dict[str, str]:
-        places = max((digits or {}).get(entry["quantity"], 3), 1)  # may be small where the numbers are not
+        places = max(digits.get(entry["quantity"], 3), 1)  # may be small where the numbers are not
         value = entry["difference"]
         signed = "–" if value is None else f"{round(value, places) + 0.0:+.{places}f}"  # + 0.0: no "-0"
         return cell(signed, _between(entry["difference_interval"], places))

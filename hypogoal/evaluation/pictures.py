@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.dataset import States
+from hypogoal.dataset import States, spread_rows
 from hypogoal.evaluation.plots import PALETTE
 
 if TYPE_CHECKING:
@@ -66,11 +66,6 @@ def reduced(values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(squares.mean((1, 3)).astype(values.dtype))
 
 
-def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) -> bytes:
-    """Figures 2 and 9: signed attributions as a PNG, see :func:`attribution_image`."""
-    return image_png(attribution_image(values, grey))
-
-
 def attribution_image(values: NDArray[np.floating], grey: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Figures 2 and 9: signed attributions (H, W) as a picture, uint8 (H, W, 3).
 
@@ -95,6 +90,11 @@ def flat(values: NDArray[np.floating]) -> NDArray[np.floating]:
 def brightness(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Observations (..., C) in grey, (...): of a stack of frames the last."""
     return observations.mean(-1).astype(np.uint8) if observations.shape[-1] == 3 else observations[..., -1]
+
+
+def coloured(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Observations (..., C) as they are shown, (..., 3): of a stack of frames the last, in grey."""
+    return observations if observations.shape[-1] == 3 else observations[..., -1:].repeat(3, axis=-1)
 
 
 def to_bytes(values: NDArray[np.floating]) -> NDArray[np.int8]:
@@ -139,7 +139,7 @@ def contact_sheets(split: States, kinds: Sequence[str] = ()) -> dict[str, NDArra
             inside = np.flatnonzero((places == value) & (split.labels == label))
             inside = inside[np.argsort(kind[inside], kind="stable")]
             if len(inside):
-                inside = inside[np.linspace(0, len(inside) - 1, min(len(inside), MOST_STATES)).astype(np.int64)]
+                inside = inside[spread_rows(len(inside), MOST_STATES)]
                 name = word if place is None else f"{place.replace('_', '-')}-{value:02d}-{word}"
                 captions = [_caption(split.origins, index, kinds) for index in inside.tolist()]
                 sheets[name] = contact_sheet(split.observations[inside], captions)
@@ -147,15 +147,14 @@ def contact_sheets(split: States, kinds: Sequence[str] = ()) -> dict[str, NDArra
 
 
 def contact_sheet(observations: NDArray[np.uint8], captions: Sequence[str]) -> NDArray[np.uint8]:
-    """Observations uint8 (n, H, W, C) in rows of ``COLUMNS``, a caption under each: uint8 (height, width, 3).
+    """Observations uint8 (n, H, W, C), see :func:`coloured`, in rows of ``COLUMNS``, a caption under each.
 
-    Of three channels all are shown, as colours; else the last one, which is the newest of stacked frames, as grey.
+    Returns uint8 (height, width, 3).
     """
     from PIL import Image, ImageDraw
 
-    count, height, width, channels = observations.shape
-    shown = observations if channels == 3 else np.repeat(observations[..., -1:], 3, axis=3)
-    shown = shown.repeat(SCALE, axis=1).repeat(SCALE, axis=2)
+    count, height, width, _ = observations.shape
+    shown = coloured(observations).repeat(SCALE, axis=1).repeat(SCALE, axis=2)
     high, wide = height * SCALE + CAPTION_HEIGHT + GAP, width * SCALE + GAP
     columns = min(COLUMNS, count)
     sheet = np.full((-(-count // columns) * high + GAP, columns * wide + GAP, 3), BACKGROUND, np.uint8)
@@ -198,7 +197,7 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    state = frame.observation if frame.observation.shape[-1] == 3 else frame.observation[..., -1:].repeat(3, axis=-1)
+    state = coloured(frame.observation)
     times = max(1, SIDE // max(state.shape[:2]))
     large = np.ascontiguousarray(state.repeat(times, axis=0).repeat(times, axis=1))
     height, width = large.shape[:2]

@@ -1,7 +1,5 @@
 """What members know of held-out states, wherever their thresholds lie and without the luck of picking the best."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import method_rank
-from hypogoal.evaluation.page import Block, Entry, Material, Question
+from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.table import Number, Row, Table, rows_by_member, rows_of, select, tabulate
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
 
@@ -76,10 +74,6 @@ def view(work: Work) -> dict[str, Any]:
     return {"ranking": tabulate((row._replace(scope=HELDOUT) for row in judged), TABLE)}
 
 
-def _name(entry: Entry) -> str:
-    return entry["name"] + (f", N={entry['groups']}" if entry["groups"] else "")
-
-
 SCORES = {
     "ranking: best, cross-fitted": "cross_fitted_ranking",
     "mean": "ranking",
@@ -88,7 +82,9 @@ SCORES = {
     "lost by the threshold": "calibration_gap",
 }
 COLUMNS = (
-    page.label("ensemble", _name, once=True),
+    page.label(
+        "ensemble", lambda entry: entry["name"] + (f", N={entry['groups']}" if entry["groups"] else ""), once=True
+    ),
     page.label("sub-goal", "sub_goal"),
     *(page.number(title, score, page.spread, 3) for title, score in SCORES.items()),
     page.number("seeds", "ensembles"),
@@ -108,8 +104,8 @@ def sections(material: Material) -> list[Block]:
     caption = (
         "On held-out states of layouts or rooms without training states; mean over ensemble seeds ± standard error."
     )
-    blocks = [page.table(COLUMNS, material.metrics["ranking"], caption=caption)]
-    return [page.section("ranking", TITLE, [text], blocks, folded=True)]
+    table = page.table(COLUMNS, material.metrics["ranking"], caption=caption)
+    return [page.section("ranking", TITLE, [text], [table], folded=True)]
 
 
 QUESTION = Question(look=look, view=view, sections=sections)

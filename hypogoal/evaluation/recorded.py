@@ -2,11 +2,9 @@
 policy would be drawn to, what a prediction hangs on, and which states to label next (Spec I6).
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,7 @@ from hypogoal.dataset import (
     standardised,
 )
 from hypogoal.domains.observations import resized_picture
-from hypogoal.evaluation.pictures import brightness, reduced
+from hypogoal.evaluation.pictures import coloured, reduced
 from hypogoal.hypotheses.thresholds import log_odds_of
 
 GRID = 16  # areas along a side of a picture, whose means are compared
@@ -129,7 +127,12 @@ def turning_patch(state: Observations, other: Observations, member: int, predict
     """Which of 6 x 6 patches of ``state`` (*obs) says most of a member's positive prediction: exchanged for the same
     patch of ``other`` (*obs), it lowers the probability most. None without pictures.
     """
-    boxes = list(_boxes(state))
+    boxes = []
+    for key, (dtype, shape) in fields_of(state.shape, state.dtype).items():
+        if dtype == PICTURE:
+            rows, columns = (np.linspace(0, side, min(PATCHES, side) + 1).astype(int).tolist() for side in shape[:2])
+            patches = product(pairwise(rows), pairwise(columns))
+            boxes += [(key, (top, left, bottom, right)) for (top, bottom), (left, right) in patches]
     changed = np.repeat(state[None], len(boxes) + 1, axis=0)
     for number, (key, (top, left, bottom, right)) in enumerate(boxes):
         pictures, source = (changed[key], other[key]) if key else (changed, other)
@@ -141,33 +144,19 @@ def turning_patch(state: Observations, other: Observations, member: int, predict
     return Turned(*boxes[lowest], before, after[lowest])
 
 
-def _boxes(state: Observations) -> Iterator[tuple[str, tuple[int, int, int, int]]]:
-    for key, (dtype, shape) in fields_of(state.shape, state.dtype).items():
-        if dtype == PICTURE:
-            rows, columns = (np.linspace(0, side, min(PATCHES, side) + 1).astype(int).tolist() for side in shape[:2])
-            for top, bottom in pairwise(rows):
-                for left, right in pairwise(columns):
-                    yield key, (top, left, bottom, right)
-
-
 def picture_of(state: Observations, turned: Turned | None = None) -> NDArray[np.uint8] | None:
     """A state's pictures side by side, uint8 (H, W, 3), the patch that turned a prediction framed; None without any."""
     parts = []
     for key, (dtype, _) in fields_of(state.shape, state.dtype).items():
         if dtype == PICTURE:
-            picture = np.array(state[key] if key else state)
-            coloured = picture if picture.shape[2] == 3 else np.repeat(brightness(picture)[..., None], 3, axis=2)
+            picture = coloured(np.array(state[key] if key else state))
             if turned and key == turned.key:
                 top, left, bottom, right = turned.box
-                width = max(1, max(coloured.shape[:2]) // 64)
-                for rows, columns in (
-                    (slice(top, top + width), slice(left, right)),
-                    (slice(bottom - width, bottom), slice(left, right)),
-                    (slice(top, bottom), slice(left, left + width)),
-                    (slice(top, bottom), slice(right - width, right)),
-                ):
-                    coloured[rows, columns] = FRAME
-            parts.append(reduced(coloured))
+                width = max(1, max(picture.shape[:2]) // 64)
+                inside = picture[top:bottom, left:right]
+                for edge in (inside[:width], inside[-width:], inside[:, :width], inside[:, -width:]):
+                    edge[:] = FRAME
+            parts.append(reduced(picture))
     if not parts:
         return None
     height = max(len(part) for part in parts)

@@ -5,8 +5,6 @@ score stands on unseen rooms and on all rooms, and beside the best member are th
 rooms of the labelled groups, the only ones whose labels were to be had, would have picked.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -25,17 +23,7 @@ from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import Metrics, by_method, grouped, methods_lacking
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
-from hypogoal.evaluation.table import (
-    VALIDATED,
-    Number,
-    Pairs,
-    Row,
-    Table,
-    rows_by_member,
-    rows_of,
-    select,
-    tabulate,
-)
+from hypogoal.evaluation.table import VALIDATED, Number, Pairs, Row, Table, rows_by_member, rows_of, select, tabulate
 from hypogoal.hypotheses.scores import member_scores, ranking
 
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or
@@ -76,7 +64,8 @@ def rows_by_room(
         scores["ranking"] = ranking(probabilities[inside], labels[inside])
         yield from rows_by_member(scores, **place, scope=name)
         counts = {"states": int(inside.sum()), "positives": int(labels[inside].sum())}
-        counts |= {"rooms": len(np.unique(origins["room"][inside]))} if "room" in origins else {}
+        if "room" in origins:
+            counts["rooms"] = len(np.unique(origins["room"][inside]))
         yield from rows_of(counts, **place, scope=name)
     yield from rows_of(choose(predictions, labels, seen), **place, scope=VALIDATION)
 
@@ -203,10 +192,6 @@ def sections(material: Material) -> list[Block]:
     return [*summaries, judged] if metrics["rooms"] else summaries
 
 
-def _by_sub_goal(material: Material) -> list[list[Entry]]:
-    return list(grouped(material.metrics["rooms"], itemgetter("sub_goal")).values())
-
-
 def _table(rows: Sequence[Entry]) -> Block:
     return page.table(
         (
@@ -249,12 +234,12 @@ def _never(rows: Sequence[Entry]) -> str:
 
 def figures(material: Material) -> Iterator[Drawn]:
     """Figure 3, and what it leaves out, of each sub-goal."""
-    by_sub_goal = _by_sub_goal(material)
+    by_sub_goal = list(grouped(material.metrics["rooms"], itemgetter("sub_goal")).values())
     panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
     panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
     for rows in by_sub_goal:
         methods = {entry["method"] for entry in rows}
-        seeds = sorted({entry["seed"] for entry in material.metrics["ensembles"] if entry.get("method") in methods})
+        seeds = {entry["seed"] for entry in material.metrics["ensembles"] if entry.get("method") in methods}
         sub_goal = rows[0]["sub_goal"]
         caption = (
             "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
@@ -287,12 +272,10 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
         ticks, lowest = sorted({row["groups"] for row in rows}), 0.5
         for place, (title, scope, score, which) in zip(axes.flat, panels, strict=False):
             for name, entries in grouped(rows, itemgetter("method")).items():
-                scores = [entry["scores"][scope][score][which] for entry in entries]
-                mean, deviation = (np.array([over[key] for over in scores], float) for key in SPREAD)
-                _draw_method(
-                    place, name, np.array([entry["groups"] for entry in entries], float), mean, deviation, names
-                )
-                lowest = float(np.nanmin([lowest, *(mean - np.nan_to_num(deviation))]))
+                scores = [(entry["groups"], entry["scores"][scope][score][which]) for entry in entries]
+                points = np.array([(groups, *(over[key] for key in SPREAD)) for groups, over in scores], float).T
+                _draw_method(place, name, names, points)
+                lowest = float(np.nanmin([lowest, *(points[1] - np.nan_to_num(points[2]))]))
             blind = {}
             for row in sorted(rows, key=itemgetter("groups")):
                 never = row["always_no"][scope] if score == "accuracy" else 0.5 if row["positives"][scope] else None
@@ -313,21 +296,14 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
         return figure
 
 
-def _draw_method(
-    axes: Axes,
-    name: str,
-    groups: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    deviation: NDArray[np.float64],
-    names: Sequence[str],
-) -> None:
+def _draw_method(axes: Axes, name: str, names: Sequence[str], points: NDArray[np.float64]) -> None:
+    """One of the methods ``names``; ``points``, (3, n), are N, mean and standard deviation."""
     index, count = names.index(name), len(names)  # of colours there are 6, of lines 5: both again after 30
     colour, line, marker = (looks[index % len(looks)] for looks in (METHOD_COLOURS, STYLES, MARKERS))
-    if len(groups) == 1:  # the others with one N lie at the same place
-        groups = groups + (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
-    axes.plot(groups, mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=name)
-    shown = ~(np.isnan(mean) | np.isnan(deviation))
-    groups, mean, deviation = groups[shown], mean[shown], deviation[shown]
+    if points.shape[1] == 1:  # the others with one N lie at the same place
+        points[0] += (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
+    axes.plot(*points[:2], marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=name)
+    groups, mean, deviation = points[:, ~np.isnan(points).any(0)]
     if len(mean) == 1:  # a band would have no width
         axes.errorbar(groups, mean, deviation, color=colour, capsize=3, linewidth=1.2)
     else:

@@ -3,8 +3,6 @@
 A damaged file is refused in one line (Spec G2).
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,24 +1,21 @@
 """Figures 2 and 9: what each member goes by in a few held-out states (Spec F2)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hypogoal.core.hdf5 import fixed
-from hypogoal.dataset import PICTURE, fields_of, open_dataset
+from hypogoal.dataset import PICTURE, fields_of, open_dataset, spread_rows
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judgement, Work, parts_of
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
+from hypogoal.evaluation.pictures import attribution_image, brightness, flat, image_png
 from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
 from hypogoal.evaluation.table import Row
 
@@ -48,11 +45,10 @@ def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
     labels, probabilities, predictions = split.labels[among], judged.probabilities[among], judged.predictions[among]
     pictures = split.observations.dtype == PICTURE
-    spread = np.linspace(0, len(among) - 1, min(len(among), AVERAGED)).astype(np.int64).tolist()
     explained = pick_to_explain(probabilities, predictions, labels)
     if not pictures:
         first = explained[:1] if split.observations.dtype.names else []
-        explained = first + [(at, SPREAD) for at in spread]
+        explained = first + [(at, SPREAD) for at in spread_rows(len(among), AVERAGED).tolist()]
     picked = [(int(among[index]), kind) for index, kind in explained]
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
@@ -158,14 +154,12 @@ def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block
     ]
     for member in state["members"]:
         number = member["member"]
-        prediction = page.verdict(
-            arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth
-        )
+        prediction = page.verdict(arrays["probabilities"][index, number], arrays["verdicts"][index, number], truth)
         lines = [prediction]
         if observation.shape[-1] != 3 and member["last_frame"] is not None:
             lines.append({"class": "negative", "text": f"last frame: {100 * member['last_frame']:.0f} %"})
         values = flat(arrays["attributions"][index, number])
-        drawn = attribution_png(values, brightness(arrays["seen"][index]) / 255)
+        drawn = image_png(attribution_image(values, brightness(arrays["seen"][index]) / 255))
         alt = f"Attributions of member {number}, which predicts {prediction['text']}."
         cards.append({"png": page.encoded(drawn), "alt": alt, "title": f"member {number}", "lines": lines})
     return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
@@ -188,17 +182,15 @@ def feature_figures(material: Material) -> Iterator[Drawn]:
 
 def attributions_of_cameras(arrays: Mapping[str, NDArray[Any]], cameras: Sequence[str]) -> Figure:
     """A row per camera of mixed observations: its picture in one state, and what each member goes by in it."""
-    columns = 1 + len(arrays["probabilities"][0])
-    figure, places = grid_of_pictures(len(cameras), columns, KEY)
     state = {name: arrays[name][0] for name in ("probabilities", "verdicts", "labels")}
-    for row, camera in enumerate(cameras):
-        picture, grey = arrays[f"observations/{camera}"][0], brightness(arrays[f"seen/{camera}"][:1])[0] / 255
-        show_picture(places[row * columns], picture, camera)
+    panels = []
+    for camera in cameras:
+        grey = brightness(arrays[f"seen/{camera}"][:1])[0] / 255
+        panels.append((arrays[f"observations/{camera}"][0], camera))
         for member, values in enumerate(arrays[f"maps/{camera}"]):
-            title = "" if row else _said(state, member)
-            show_picture(places[row * columns + 1 + member], attribution_image(flat(values), grey), title)
-    _key(figure, places)
-    return figure
+            title = _said(state, member) if camera == cameras[0] else ""
+            panels.append((attribution_image(flat(values), grey), title))
+    return _grid(panels, 1 + len(arrays["probabilities"][0]))
 
 
 def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:
@@ -242,45 +234,43 @@ def figures(material: Material) -> Iterator[Drawn]:
 
 
 def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
-    says = page.verdict(state["probabilities"][member], bool(state["verdicts"][member]), bool(state["labels"]))
-    return f"member {member}: {says['text']}"
+    prediction = page.verdict(state["probabilities"][member], state["verdicts"][member], bool(state["labels"]))
+    return f"member {member}: {prediction['text']}"
 
 
 def attributions_of_members(state: Mapping[str, NDArray[Any]]) -> Figure:
     """Figure 2: what each member goes by in one state, of which ``state`` holds ``EXPLAINED``; of a stack the last."""
-    members = len(state["attributions"])
-    columns = min(4, members + 1)
-    figure, places = grid_of_pictures(-(-(members + 1) // columns), columns, KEY)
-    show_picture(places[0], state["observations"], f"truth: {page.label_of(bool(state['labels']))}")
     grey = brightness(state["seen"]) / 255
+    panels = [(state["observations"], f"truth: {page.label_of(bool(state['labels']))}")]
     for member, values in enumerate(state["attributions"]):
-        show_picture(places[member + 1], attribution_image(flat(values), grey), _said(state, member))
-    _key(figure, places)
-    return figure
+        panels.append((attribution_image(flat(values), grey), _said(state, member)))
+    return _grid(panels, min(4, len(panels)))
 
 
 def attributions_of_every_frame(state: Mapping[str, NDArray[Any]]) -> Figure:
     """Figure 9: a row per member, a column per frame, oldest first, above them the frames; of colours one of each."""
-    channels, members = state["seen"].shape[-1], len(state["attributions"])
-    figure, places = grid_of_pictures(members + 1, channels, KEY)
-    ages = [f"{age} step{'s' if age > 1 else ''} before" for age in range(channels - 1, 0, -1)]
-    for channel, name in enumerate(["red", "green", "blue"] if channels == 3 else [*ages, "newest frame"]):
-        frame = state["seen"][..., channel]
-        show_picture(places[channel], frame, name)
-        for member, values in enumerate(state["attributions"]):
-            image, answer = attribution_image(values[..., channel], frame / 255), _said(state, member)
-            show_picture(places[(member + 1) * channels + channel], image, "" if channel else answer)
-    _key(figure, places)
-    return figure
+    frames = np.moveaxis(state["seen"], -1, 0)
+    ages = [f"{age} step{'s' if age > 1 else ''} before" for age in range(len(frames) - 1, 0, -1)]
+    names = ["red", "green", "blue"] if len(frames) == 3 else [*ages, "newest frame"]
+    panels = list(zip(frames, names, strict=True))
+    for member, values in enumerate(state["attributions"]):
+        for channel, frame in enumerate(frames):
+            title = "" if channel else _said(state, member)
+            panels.append((attribution_image(values[..., channel], frame / 255), title))
+    return _grid(panels, len(frames))
 
 
-def _key(figure: Figure, places: Sequence[Axes]) -> None:
-    """What the colours mean; each picture has a scale of its own, so it has no numbers."""
+def _grid(panels: Sequence[tuple[NDArray[np.uint8], str]], columns: int) -> Figure:
+    """Pictures with titles, and what the colours mean; each has a scale of its own, so the key has no numbers."""
+    figure, places = grid_of_pictures(-(-len(panels) // columns), columns, KEY)
+    for place, (image, title) in zip(places, panels, strict=False):
+        show_picture(place, image, title)
     where: dict[str, Any] = {"location": "bottom", "fraction": 0.05, "shrink": 0.6, "aspect": 40}
     with styled():
-        bar = figure.colorbar(ScalarMappable(Normalize(-1, 1), SIGNED), ax=list(places), **where)
+        bar = figure.colorbar(ScalarMappable(Normalize(-1, 1), SIGNED), ax=places, **where)
         bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
         bar.set_label("attribution in log-odds, each picture on its own scale")
+    return figure
 
 
 QUESTION = Question(

@@ -1,7 +1,5 @@
 """Figures 7 and 8: which members the meta-policy prefers, and where their options stop (Spec F6)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -27,7 +25,7 @@ from hypogoal.evaluation.pictures import STATES, overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
 from hypogoal.evaluation.run import takes, thresholds_of, within
 from hypogoal.evaluation.table import Row, by_fields, by_run, rows_by_member, select
-from hypogoal.hypotheses.scores import member_scores, most_and_least
+from hypogoal.hypotheses.scores import member_scores, most_and_least, ratio
 from hypogoal.meta.config import layout_seeds
 from hypogoal.options.tables import Choices
 
@@ -44,8 +42,7 @@ def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[n
     always. This ratio is 1 for a chooser that does not care. ``expected``: the sum of 1 / (options offered) over the
     decisions that offered it.
     """
-    safe = np.where(expected > 0, expected, 1.0)
-    return np.where(expected > 0, chosen / safe, np.nan)
+    return ratio(chosen, expected)
 
 
 def rows_of_choices(
@@ -56,14 +53,12 @@ def rows_of_choices(
     Of each member there are offered, chosen, reached, expected, mean duration in steps, and preference.
     """
     options = len(sub_goals) * members
-    totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
-    chosen = totals["chosen"]
-    duration = np.divide(totals["duration"], chosen, out=np.full(options, np.nan), where=chosen > 0)
     columns: dict[str, NDArray[Any]] = {
-        name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")
+        name: choices.total(name, options).astype(np.int64) for name in ("offered", "chosen", "reached")
     }
-    columns |= {"expected": totals["expected"], "duration": duration, **more}
-    columns["preference"] = preference(chosen, totals["expected"])
+    columns["expected"] = choices.total("expected", options)
+    columns["duration"] = ratio(choices.total("duration", options), columns["chosen"])
+    columns |= {**more, "preference": preference(columns["chosen"], columns["expected"])}
     for index, sub_goal in enumerate(sub_goals):
         part = slice(index * members, (index + 1) * members)
         of_goal = {name: values[part] for name, values in columns.items()}
@@ -128,7 +123,7 @@ class OnLayout(NamedTuple):
 
 
 def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
-    """Every member of an ensemble's artefact on the states of layouts."""
+    """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met."""
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
     source = open_artefact(path, "ensemble")
@@ -136,7 +131,8 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
     arguments = domain.world(source.config["domain_config"])
     arguments |= {"layouts": Layouts(layouts)} if len(layouts) > 1 else {}
     engine = domain.make_engine(layouts[0], len(layouts), 500, **arguments)
-    ids = states_of_layout(engine)
+    reachable = engine.reachable()
+    ids = states_met(engine, 2_000, rng_for(0, "states-of-layout")) if reachable is None else reachable
     images, labels = engine.images(ids), dict(zip(domain.sub_goals, engine.labels(ids).T, strict=True))
     match, sets = np.full(len(source.config["sub_goals"]) * members, np.nan), {}
     counts = np.zeros(len(match), np.int64)
@@ -151,12 +147,6 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
             if says_yes.any() and images.dtype == PICTURE:
                 sets[option] = overlay(images[says_yes])
     return OnLayout(match, counts, sets)
-
-
-def states_of_layout(engine: Engine) -> NDArray[np.int64]:
-    """Of a fresh engine's layout the states that can be reached, else those that random play meets; each once."""
-    reachable = engine.reachable()
-    return states_met(engine, 2_000, rng_for(0, "states-of-layout")) if reachable is None else reachable
 
 
 def states_met(engine: Engine, steps: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -237,11 +227,8 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
     """Title, note and picture of the most or the least preferred member."""
     member = goal["members"][goal[word]]
     note = f"preference {page.fixed(member['preference'], 2)}, match {page.fixed(member['match'], 2)}"
-    image, counts = (
-        material.arrays.get(place) for place in (f"terminations/{path}/{member['option']}", f"{STATES}/{path}/counts")
-    )
-    count = "" if image is None or counts is None else f"\n{page.states(counts[member['option']])}"
-    return f"{word} preferred: member {goal[word]}", f"{note}{count}", image
+    image, states = material.termination_states(path, member["option"])
+    return f"{word} preferred: member {goal[word]}", f"{note}\n{states}".rstrip(), image
 
 
 def sections(material: Material) -> list[Block]:

@@ -4,14 +4,13 @@ Select rows, group them by their fields, reduce a run's members to one value, an
 a table over runs, ``compared`` into pairs of runs, ``wide`` into the entries of ``metrics.json``.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +20,8 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, read_text
 from hypogoal.evaluation.numbers import by_groups, grouped, method_rank, over, pairs
+from hypogoal.options.tables import AGAIN, MAX_TABLE_BYTES
 
-AGAIN = "Evaluate the run again."
-MAX_BYTES = 2**30  # of numbers.csv
 HARMLESS = re.compile(rf"(^|[,;\"])'(?=\s*[{re.escape(FORMULA)}])")  # what ``write_table`` puts before a formula
 BEST, WORST, VALIDATED = "best_member", "worst_member", "validated_member"  # quantities: which member it is
 MEMBERS: Mapping[str, Callable[[Any], Any]] = {"best": np.max, "mean": np.mean, "worst": np.min}
@@ -105,7 +103,7 @@ def defined(rows: Iterable[Row]) -> Iterator[Row]:
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of ``numbers.csv``; a ``UserError`` where it is missing or damaged."""
-    text = read_text(path, "the table of numbers is", AGAIN, MAX_BYTES)
+    text = read_text(path, "the table of numbers is", AGAIN, MAX_TABLE_BYTES)
     try:
         lines = list(csv.DictReader(io.StringIO(text, newline="")))
         return [Row(**{name: _field(name, line[name]) for name in Row._fields}) for line in lines]
@@ -198,15 +196,10 @@ def tabulate(rows: Iterable[Row], table: Table) -> list[Entry]:
             layouts = [row.layout for row, _ in runs]
             values = [value for _, value in runs]
             aggregated = over(values, number.unit, *cell, layouts=layouts, deviation=table.deviation)
-            _put(entry, name.split("."), aggregated)
+            *folders, last = name.split(".")
+            reduce(lambda place, folder: place.setdefault(folder, {}), folders, entry)[last] = aggregated
         entries.append(entry)
     return entries
-
-
-def _put(entry: Entry, path: Sequence[str], value: Any) -> None:
-    for name in path[:-1]:
-        entry = entry.setdefault(name, {})
-    entry[path[-1]] = value
 
 
 def compared(rows: Sequence[Row], by: Pairs) -> list[Entry]:

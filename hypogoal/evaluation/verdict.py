@@ -4,13 +4,12 @@ Two comparisons say so: the agent with uniform-random choice among its own optio
 with several members with one that has a single classifier (did hypotheses matter?).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +18,11 @@ from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM, UNIFORM_CHOICE
 from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name, titled
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
 from hypogoal.evaluation.page import Block, Material, Question, listed, percent, picture, section
 from hypogoal.evaluation.table import Row, select
 from hypogoal.evaluation.zero_shot import SCOPE as NEW_LAYOUTS
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.judging import Work
 
 MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
 LEAST = 3  # units; two that agree by accident would have an interval without width
@@ -80,19 +77,16 @@ def compare(
     result = compare_pairs(shares[:, 0], shares[:, 1], units)
     low, high = (float(np.clip(bound, -1, 1)) for bound in result["difference_interval"])
     first_mean, second_mean = (mean_of(by_unit(shares[:, column], units)) for column in (0, 1))
-    difference = float(result["difference"])
-    kind = unit if several or result["units"] == 1 else "seed"
-    outcome = outcome_of(difference, low, high)
-    return Finding(
-        subject, first, second, first_mean, second_mean, difference, (low, high), result["units"], kind, outcome
-    )
+    count, difference = result["units"], result["difference"]
+    kind, outcome = unit if several or count == 1 else "seed", outcome_of(difference, low, high)
+    return Finding(subject, first, second, first_mean, second_mean, difference, (low, high), count, kind, outcome)
 
 
 def paired(rows: Iterable[Row], others: Iterable[Row], *fields: str) -> list[tuple[Row, Row]]:
     """Rows of the first with those of the second that agree in ``fields``."""
-    by_place = {tuple(getattr(row, field) for field in fields): row for row in others}
-    places = ((row, by_place.get(tuple(getattr(row, field) for field in fields))) for row in rows)
-    return [(row, other) for row, other in places if other is not None]
+    place = attrgetter(*fields)
+    by_place = {place(row): row for row in others}
+    return [(row, by_place[place(row)]) for row in rows if place(row) in by_place]
 
 
 def findings(work: Work) -> Iterator[Finding]:
@@ -122,23 +116,20 @@ def findings(work: Work) -> Iterator[Finding]:
 
 def on_ladders(work: Work) -> Iterator[Finding]:
     """Of options on ladders: how often the member that validation picks stops at the base, against one classifier."""
-    options = work.metrics["distance"]["options"]
-    rows = [
-        Row(
-            "reached_base",
-            entry["options"][entry["validated"] or 0]["reached_base"],
-            entry["method"],
-            seed=entry["seed"],
-            ladder=entry["ladder"],
-            N=entry["groups"],
-        )
-        for entry in options
-    ]
-    methods = list(dict.fromkeys(row.method for row in rows if row.N is not None))
-    for method in methods:
+    rows = []
+    for entry in work.metrics["distance"]["options"]:
+        place = {"seed": entry["seed"], "ladder": entry["ladder"], "N": entry["groups"]}
+        rows.append(Row("reached_base", _stopping(entry), entry["method"], **place))
+    for method in dict.fromkeys(row.method for row in rows if row.N is not None):
         if method != "single CNN":
             pairs = paired(select(rows, method=method), select(rows, method="single CNN"), "ladder", "seed", "N")
             yield from filter(None, [compare(OPTIONS, ensemble_title(method), ONE, pairs, "ladder")])
+
+
+def _stopping(entry: Mapping[str, Any]) -> float:
+    """The share of executions that stop at the base, of the option that validation picks."""
+    share: float = entry["options"][entry["validated"] or 0]["reached_base"]
+    return share
 
 
 def called(run: Run) -> str:
@@ -150,9 +141,9 @@ def called(run: Run) -> str:
 def tasks(work: Work) -> list[str]:
     """What every agent of the run has to do, and how long it may take."""
     sentences = []
-    for name, runs in work.agents.items():
+    for runs in work.agents.values():
         config = work.artefact(runs[0].path).config
-        sentences.append(" ".join(filter(None, [task_of(config), cap_of(config, work.agents[name])])))
+        sentences.append(" ".join(filter(None, [task_of(config), cap_of(config, runs)])))
     sentences += [task_of(artefact.config) for artefact in work.contents.ladders] if not sentences else []
     longest = [text for text in sentences if not any(other != text and other.startswith(text) for other in sentences)]
     return list(dict.fromkeys(filter(None, longest)))
@@ -228,17 +219,13 @@ def sections(material: Material) -> list[Block]:
 
 QUESTION = Question(view=view, sections=sections)
 
+CAUSES = {CHOOSING: "choosing", HYPOTHESES: "several hypotheses", OPTIONS: "several hypotheses"}
 OUTCOMES = {
-    (CHOOSING, BETTER): "Choosing mattered",
-    (CHOOSING, WORSE): "Choosing made it worse",
-    (CHOOSING, ALIKE): "Choosing made no difference",
-    (CHOOSING, UNDECIDED): "Whether choosing mattered is undecided",
-    (HYPOTHESES, BETTER): "Several hypotheses mattered",
-    (HYPOTHESES, WORSE): "Several hypotheses made it worse",
-    (HYPOTHESES, ALIKE): "Several hypotheses made no difference",
-    (HYPOTHESES, UNDECIDED): "Whether several hypotheses mattered is undecided",
+    BETTER: "{} mattered",
+    WORSE: "{} made it worse",
+    ALIKE: "{} made no difference",
+    UNDECIDED: "whether {} mattered is undecided",
 }
-OUTCOMES |= {(OPTIONS, outcome): OUTCOMES[HYPOTHESES, outcome] for outcome in (BETTER, WORSE, ALIKE, UNDECIDED)}
 SECONDS = {
     CHOOSING: "{first} solves {a} of the episodes, {second} {b}",
     HYPOTHESES: "with {first} the agent solves {a} of the episodes, with {second} {b}",
@@ -255,7 +242,8 @@ def sentence(finding: Mapping[str, Any], *, alone: bool = True) -> str:
     text = SECONDS[finding["subject"]].format(first=first, second=finding["second"], **shares)
     low, high = finding["interval"]
     points = "" if low is None else f" ({100 * finding['difference']:+.0f} points [{100 * low:.0f}, {100 * high:.0f}])"
-    return f"{OUTCOMES[finding['subject'], finding['outcome']]} {place}: {text}{points}."
+    outcome = OUTCOMES[finding["outcome"]].format(CAUSES[finding["subject"]])
+    return f"{outcome[0].upper()}{outcome[1:]} {place}: {text}{points}."
 
 
 def verdict(metrics: Metrics) -> list[str]:
@@ -269,10 +257,9 @@ def verdict(metrics: Metrics) -> list[str]:
     if metrics["agents"] and all(agent["success"]["mean"] is None for agent in metrics["agents"]):
         return ["No episode of an agent has ended yet: train with more steps."]
     if not comparisons and metrics["agents"]:
-        best = [agent for agent in metrics["agents"] if agent["success"]["mean"] is not None][:1]
-        for agent in best:
-            share, name = percent(agent["success"]["mean"]), titled(agent["name"])
-            lines.append(f"{name[:1].upper()}{name[1:]}: {share} of the last training episodes solved.")
+        agent = next(agent for agent in metrics["agents"] if agent["success"]["mean"] is not None)
+        share, name = percent(agent["success"]["mean"]), titled(agent["name"])
+        lines.append(f"{name[:1].upper()}{name[1:]}: {share} of the last training episodes solved.")
         lines.append(
             "Whether hypotheses mattered is unknown: the run has neither uniform-random choice nor an agent with one "
             "classifier to compare with."
@@ -288,9 +275,9 @@ def _of_options(metrics: Metrics) -> Iterator[str]:
     """How often options on ladders stop at the base, of each method."""
     of_method = grouped(metrics["distance"]["options"], lambda entry: str(entry["method"]))
     for name, entries in of_method.items():
-        shares = [entry["options"][entry["validated"] or 0]["reached_base"] for entry in entries]
         options = "Options that end at true sub-goals" if name == ORACLE else f"Options of {ensemble_title(name)}"
-        yield f"{options} stop at the sub-goal in {percent(mean_of(shares))} of their executions."
+        share = mean_of([_stopping(entry) for entry in entries])
+        yield f"{options} stop at the sub-goal in {percent(share)} of their executions."
     if of_method:
         yield "Whether hypotheses mattered is unknown: the run has no options of one classifier to compare with."
 
@@ -298,26 +285,21 @@ def _of_options(metrics: Metrics) -> Iterator[str]:
 def _of_members(metrics: Metrics) -> Iterator[str]:
     """How far members differ on held-out states, mean over sub-goals, of each method."""
     for name, entries in grouped(metrics["hypotheses"], lambda entry: str(entry["name"])).items():
-        means = [
+        best, middle, worst = (
             mean_of([entry[which]["mean"] for entry in entries if entry[which]["mean"] is not None])
             for which in ("best", "mean", "worst")
-        ]
-        best, middle, worst = (f"{value:.2f}" for value in means)
+        )
         yield (
-            f"{ensemble_title(name)}: balanced accuracy on held-out states {best} for the best member, {middle} on "
-            f"average, {worst} for the worst."
+            f"{ensemble_title(name)}: balanced accuracy on held-out states {best:.2f} for the best member, "
+            f"{middle:.2f} on average, {worst:.2f} for the worst."
         )
 
 
 def baselines(metrics: Metrics) -> str:
     """What agents on primitive actions reach, and with how many steps; nothing without one."""
-    agents = [
-        agent for agent in metrics["agents"] if agent["kind"] == "baseline" and agent["success"]["mean"] is not None
-    ]
-    if not agents:
-        return ""
     parts = []
-    for agent in agents:
-        steps = max(run["steps"] for run in agent["runs"])
-        parts.append(f"{agent['name']} {percent(agent['success']['mean'])} (after {steps:,} steps)")
-    return f"On primitive actions, with the same cap: {listed(parts)}."
+    for agent in metrics["agents"]:
+        if agent["kind"] == "baseline" and agent["success"]["mean"] is not None:
+            steps = max(run["steps"] for run in agent["runs"])
+            parts.append(f"{agent['name']} {percent(agent['success']['mean'])} (after {steps:,} steps)")
+    return f"On primitive actions, with the same cap: {listed(parts)}." if parts else ""

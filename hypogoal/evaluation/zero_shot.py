@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,8 +76,8 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
     return {name: np.where(holds, np.nan, values) for name, values in scored.items()}
 
 
-def played(artefact: Artefact, layouts: tuple[int, ...]) -> dict[tuple[str, ...], Played]:
-    """What an agent does, ``("agent",)``, random choice among its options, and each option, (sub-goal, member)."""
+def played(artefact: Artefact, layouts: tuple[int, ...]) -> list[tuple[dict[str, Any], Played]]:
+    """What an agent does, random choice among its options, and each option alone; each with the fields of its rows."""
     from hypogoal.evaluation.frozen import play
     from hypogoal.meta.episodes import agent_of
     from hypogoal.options.choosers import RandomChooser
@@ -85,20 +86,19 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> dict[tuple[str, ...]
     loop = agent_of(artefact, artefact.seed, len(layouts), layouts)
     loop.config = replace(loop.config, restart_options=False)
     ways = shortest_ways(loop.engine)
-    scores_by_player: dict[tuple[str, ...], Played] = {}
+    players: list[tuple[dict[str, Any], Played]] = []
     if artefact.kind == "meta":
-        choosers = {"agent": loop.chooser, UNIFORM: RandomChooser(rng_for(artefact.seed, "uniform-choice"))}
-        for name, chooser in choosers.items():
+        random = RandomChooser(rng_for(artefact.seed, "uniform-choice"))
+        for fields, chooser in (({}, loop.chooser), ({"method": UNIFORM}, random)):
             episodes = play(loop, chooser, EPISODES)
             scores = episodes.scores(ways[:, -1:]) | {"length": episodes.length}
-            scores_by_player[name,] = {quantity: values.mean(1) for quantity, values in scores.items()}
+            players.append((fields, {quantity: values.mean(1) for quantity, values in scores.items()}))
     loop.config, loop.initiation = replace(loop.config, mask_reached=False), None
-    for index, sub_goal in enumerate(config["sub_goals"]):
+    for option, (sub_goal, member) in enumerate(product(config["sub_goals"], range(config["members"]))):
         if sub_goal in sub_goals:  # else the user's own labels said it: its truth here is not known
-            goal, first = sub_goals.index(sub_goal), index * config["members"]
-            members = [alone(loop, first + numbers, goal, ways[:, goal]) for numbers in range(config["members"])]
-            scores_by_player |= {(sub_goal, str(numbers)): scores for numbers, scores in enumerate(members)}
-    return scores_by_player
+            goal = sub_goals.index(sub_goal)
+            players.append(({"sub_goal": sub_goal, "member": member}, alone(loop, option, goal, ways[:, goal])))
+    return players
 
 
 def rows(work: Work) -> Iterator[Row]:
@@ -108,20 +108,18 @@ def rows(work: Work) -> Iterator[Row]:
             work.progress.advance(len(work.layouts))
             continue
         path = work.contents.name(artefact)
-        place = {"scope": SCOPE, "seed": artefact.seed, "artefact": path}
+        place = {"method": work.agent_of[path], "scope": SCOPE, "seed": artefact.seed, "artefact": path}
         parts = []
         for first in range(0, len(work.layouts), AT_ONCE):
             layouts = work.layouts[first : first + AT_ONCE]
             parts.append(played(artefact, layouts))
             work.progress.advance(len(layouts))
-        for key in parts[0]:
-            joined = {name: np.concatenate([part[key][name] for part in parts]).tolist() for name in parts[0][key]}
-            of_option = len(key) > 1
-            where = {"sub_goal": key[0], "member": int(key[1])} if of_option else {}
-            method = UNIFORM if key[0] == UNIFORM else work.agent_of[path]
-            for index, layout in enumerate(work.layouts):
-                numbers = {name: joined[name][index] for name in (OF_OPTIONS if of_option else OF_AGENTS)}
-                yield from rows_of(numbers, method=method, **where, layout=layout, **place)
+        for players in zip(*parts, strict=True):  # the same one on all layouts
+            where = place | players[0][0]
+            names = OF_OPTIONS if "member" in where else OF_AGENTS
+            columns = [np.concatenate([scores[name] for _, scores in players]).tolist() for name in names]
+            for layout, *numbers in zip(work.layouts, *columns, strict=True):
+                yield from rows_of(dict(zip(names, numbers, strict=True)), **where, layout=layout)
 
 
 def _columns(names: Sequence[str]) -> dict[str, Number]:

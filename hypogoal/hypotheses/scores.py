@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +24,13 @@ def member_scores(predictions: NDArray[np.bool_], labels: NDArray[np.bool_]) -> 
     false_positives = (predictions & ~truth).sum(0)
     false_negatives = (~predictions & truth).sum(0)
     true_negatives = (~predictions & ~truth).sum(0)
-    recall = _ratio(true_positives, true_positives + false_negatives)
+    recall = ratio(true_positives, true_positives + false_negatives)
     return {
-        "balanced_accuracy": (recall + _ratio(true_negatives, true_negatives + false_positives)) / 2,
-        "precision": _ratio(true_positives, true_positives + false_positives),
+        "balanced_accuracy": (recall + ratio(true_negatives, true_negatives + false_positives)) / 2,
+        "precision": ratio(true_positives, true_positives + false_positives),
         "recall": recall,
-        "accuracy": _ratio(true_positives + true_negatives, np.full_like(true_positives, len(labels))),
-        "f1": _ratio(2 * true_positives, 2 * true_positives + false_positives + false_negatives),
+        "accuracy": ratio(true_positives + true_negatives, np.full_like(true_positives, len(labels))),
+        "f1": ratio(2 * true_positives, 2 * true_positives + false_positives + false_negatives),
     }
 
 
@@ -94,18 +95,10 @@ def cross_fitted(first: NDArray[np.float64], second: NDArray[np.float64]) -> flo
     return sum(scores) / 2
 
 
-def _ratio(numerator: NDArray[np.int64], denominator: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The quotient; NaN where the denominator is 0."""
+def ratio(numerator: NDArray[Any], denominator: NDArray[Any]) -> NDArray[np.float64]:
+    """The quotient, element by element; NaN where the denominator is 0."""
     safe = np.where(denominator == 0, 1, denominator)
     return np.where(denominator == 0, np.nan, numerator / safe)
-
-
-def by_member(scores: Scores) -> list[dict[str, float]]:
-    """Arrays (K,) of scores as K rows of numbers."""
-    return [
-        dict(zip(scores, row, strict=True))
-        for row in zip(*(column.tolist() for column in scores.values()), strict=True)
-    ]
 
 
 def best_mean_worst(scores: NDArray[np.float64]) -> dict[str, float]:

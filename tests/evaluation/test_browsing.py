@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from hypogoal.evaluation.explorer import pick_to_browse, take_turns
-from hypogoal.evaluation.pictures import attribution_png, brightness, flat, image_png, reduced, to_bytes
+from hypogoal.evaluation.pictures import attribution_image, brightness, flat, image_png, reduced, to_bytes
 
 
 def test_groups_take_turns():
@@ -60,7 +60,7 @@ def test_pictures_are_the_same_pixels_and_small():
         read = Image.open(io.BytesIO(image_png(image)))
         assert read.mode == mode
         np.testing.assert_array_equal(np.asarray(read.convert("RGB" if image.ndim == 3 else "L")), image)
-    noise = attribution_png(rng.normal(size=(84, 84)), rng.random((84, 84)))
+    noise = image_png(attribution_image(rng.normal(size=(84, 84)), rng.random((84, 84))))
     assert Image.open(io.BytesIO(noise)).mode == "P"
 
 

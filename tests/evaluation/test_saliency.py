@@ -8,7 +8,7 @@ from torch import nn
 
 from hypogoal.dataset import States
 from hypogoal.evaluation.judging import Case, Judged, Judgement, Unlabelled, Work
-from hypogoal.evaluation.pictures import attribution_png
+from hypogoal.evaluation.pictures import attribution_image, image_png
 from hypogoal.evaluation.run import Contents
 from hypogoal.evaluation.saliency import look, pick_to_explain
 from hypogoal.hypotheses.deep_lift import (
@@ -258,11 +258,11 @@ def test_the_picture_tells_signs_apart():
     from matplotlib.image import imread
 
     values = np.array([[1.0, -1.0, 0.0, 0.0]])
-    image = imread(io.BytesIO(attribution_png(values, np.array([[0, 0, 0, 1.0]]))))[0, :, :3]
+    image = imread(io.BytesIO(image_png(attribution_image(values, np.array([[0, 0, 0, 1.0]])))))[0, :, :3]
     red, green, blue = image.T
     assert red[0] > blue[0]
     assert blue[1] > red[1]
     assert image[2].tolist() == [1, 1, 1]
     assert red[3] == green[3] == blue[3]
     assert 0.6 < red[3] < 0.9
-    assert attribution_png(np.zeros((2, 2)), np.zeros((2, 2))).startswith(b"\x89PNG")
+    assert image_png(attribution_image(np.zeros((2, 2)), np.zeros((2, 2)))).startswith(b"\x89PNG")
