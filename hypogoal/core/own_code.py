@@ -96,7 +96,7 @@ def load_own(name: str, role: str, group: str, built_in: Mapping[str, str]) -> A
     name, one that cannot be loaded, and code that the user did not allow are a ``UserError``, whose message calls it by
     its ``role`` ("domain").
     """
-    entries = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
+    entries = {} if name in built_in else {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     target = built_in.get(name) or entries.get(name)
     if target is None and ":" in name:
         require_trust(name, role)

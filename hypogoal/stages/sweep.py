@@ -62,9 +62,9 @@ def plan(
 
     It is named, one of the paper's figures, a TOML file, or ``module:function``, a name that the user must have given.
     ``assignments`` are ``KEY=VALUE`` or ``STAGE.KEY=VALUE``, of a TOML file ``AXIS=VALUES``; ``preset`` is of a named
-    one; a figure has its own and ``paper``; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages. ``short``:
-    leave seed and layout out of names if there is a single agent; a folder that was begun with other names keeps those.
-    What is unknown is a ``UserError``.
+    one, of a figure its own or ``paper``; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages.
+    ``short``: leave seed and layout out of names if there is a single agent; a folder that was begun with other names
+    keeps those. What is unknown is a ``UserError``.
     """
     check_name(device)
     assignments = [*assignments]
