@@ -50,7 +50,7 @@ test: $(STAMP) ## the tests, without those marked slow or slurm
 # Both at once are stricter than each alone, at half the cost; tests/uneven.py without OLDEST shows which one failed.
 NUMERIC := tests/hypotheses tests/options/test_termination.py tests/meta/test_resuming.py
 OLDEST := ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 ONEDNN_MAX_CPU_ISA=SSE41
-kernels: $(STAMP) ## the tests of what is computed, as on other processors
+kernels: $(STAMP) ## the tests of what is computed, as on other processors (before a release; CI's is another anyway)
 	$(OLDEST) $(BIN)/python -m pytest $(PARALLEL) -p tests.uneven $(NUMERIC)
 
 OTHERS := 3.12 3.13

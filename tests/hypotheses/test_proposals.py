@@ -39,8 +39,7 @@ def searched(search: Search) -> Search:
     return search
 
 
-@pytest.mark.parametrize(("mix", "agreement"), [(1.0, 0.0), (0.5, 0.5)])
-@pytest.mark.parametrize("names", [FACTORS, ("shape", "place")])
+@pytest.mark.parametrize(("mix", "agreement", "names"), [(0.5, 0.5, FACTORS), (1.0, 0.0, ("shape", "place"))])
 def test_the_loss_says_in_how_many_states_features_agree(
     mix: float, agreement: float, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
