@@ -47,7 +47,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
     "none": {"diversity": "none"},
     "dbat-unpaired": {"diversity": "dbat-unpaired"},
-    "say-no": {"diversity": "say-no"},
+    "weak-negatives": {"diversity": "weak-negatives"},
     "cnn": {"members": 1, "diversity": "none"},
 }
 ALONE = "alone"  # proposals one by one: the terms of their independence are left out

@@ -38,7 +38,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "none": {"diversity": "none"},
     "cnn": {"members": 1, "diversity": "none"},
     "dbat-unpaired": {"diversity": "dbat-unpaired"},
-    "say-no": {"diversity": "say-no"},
+    "weak-negatives": {"diversity": "weak-negatives"},
 }
 OTHERS: dict[str, dict[str, Any]] = {"joint": {"diversity": "none", "proposals": "joint"}}
 MEMBERS = 3

@@ -130,7 +130,7 @@ def _goal(material: Material, source: Entry, sub_goal: str) -> dict[str, Any]:
                 ("balanced accuracy, held-out", page.fixed(member["balanced_accuracy"], 3)),
                 ("precision", page.fixed(member["precision"], 3)),
                 ("recall", page.fixed(member["recall"], 3)),
-                ("positive, unlabelled states", page.percent(member["says_yes_unlabelled"])),
+                ("positive, unlabelled states", page.percent(member["positive_unlabelled"])),
             ],
             "options": _options(material, source["path"], sub_goal, member["member"]),
         }

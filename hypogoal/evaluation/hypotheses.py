@@ -45,7 +45,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[Row]:
     split, judged, place = judgement.split, judgement.judged, work.place(judgement)
     layouts = split.origins.get("layout_seed", np.zeros(0))
     calls = judged.unlabelled.mean(0) if len(judged.unlabelled) else np.full(judged.unlabelled.shape[1], math.nan)
-    more = {"says_yes_unlabelled": calls, "threshold": judged.thresholds.astype(np.float64)}
+    more = {"positive_unlabelled": calls, "threshold": judged.thresholds.astype(np.float64)}
     yield from rows_by_member(member_scores(judged.predictions, split.labels) | more, **place, scope="heldout")
     counts = {"states": len(split.labels), "positives": int(split.labels.sum()), "layouts": len(np.unique(layouts))}
     yield from rows_of(counts | {"disagreement": mean_disagreement(judged.predictions)}, **place, scope="heldout")

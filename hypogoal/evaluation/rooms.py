@@ -113,7 +113,7 @@ def rooms_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
     ``scores``: scope -> score -> best, validated, mean, worst (see ``numbers.over``); by scope ``positives``, and
-    ``always_no``, the accuracy of negative predictions alone.
+    ``all_negative``, the accuracy of negative predictions alone.
     """
     by_room = {row.artefact for row in rows if row.scope == "unseen"}
     rows = [row for row in rows if row.artefact in by_room]
@@ -127,7 +127,7 @@ def rooms_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
         positives = {scope: counts[*cell, scope, "positives"] for scope in TABLED}
         states = {scope: counts[*cell, scope, "states"] for scope in TABLED}
         entry["positives"] = positives
-        entry["always_no"] = {on: 1 - positives[on] / states[on] if states[on] else math.nan for on in TABLED}
+        entry["all_negative"] = {on: 1 - positives[on] / states[on] if states[on] else math.nan for on in TABLED}
     return table
 
 
@@ -214,9 +214,9 @@ def _never(rows: Sequence[Entry]) -> str:
     """What accuracy on all rooms is worth here, and where balanced accuracy is not defined."""
     several = len({entry["sub_goal"] for entry in rows}) > 1
     accuracies = {
-        (entry["sub_goal"] if several else "", entry["groups"]): entry["always_no"]["all"]
+        (entry["sub_goal"] if several else "", entry["groups"]): entry["all_negative"]["all"]
         for entry in rows
-        if entry["always_no"]["all"] is not None
+        if entry["all_negative"]["all"] is not None
     }
     texts = []
     for (sub_goal, groups), accuracy in sorted(accuracies.items(), key=str):
@@ -278,7 +278,7 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
                 lowest = float(np.nanmin([lowest, *(points[1] - np.nan_to_num(points[2]))]))
             blind = {}
             for row in sorted(rows, key=itemgetter("groups")):
-                never = row["always_no"][scope] if score == "accuracy" else 0.5 if row["positives"][scope] else None
+                never = row["all_negative"][scope] if score == "accuracy" else 0.5 if row["positives"][scope] else None
                 if never is not None:
                     blind[row["groups"]] = never
             if len(blind) == 1:  # of one N a line is a point, which a method's marker may hide

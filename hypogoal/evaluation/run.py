@@ -19,7 +19,7 @@ from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
-FORMAT = 3  # of ``metrics.json``: 1 until 0.15, 2 until 0.16
+FORMAT = 4  # of ``metrics.json``: 1 until 0.15, 2 until 0.16, 3 until 0.21
 
 
 @dataclass(frozen=True)

@@ -143,9 +143,9 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
         if sub_goal in labels:
             match[options] = member_scores(verdicts, labels[sub_goal])["balanced_accuracy"]
         counts[options] = verdicts.sum(axis=0)
-        for option, says_yes in zip(options, verdicts.T, strict=True):
-            if says_yes.any() and images.dtype == PICTURE:
-                sets[option] = overlay(images[says_yes])
+        for option, positives in zip(options, verdicts.T, strict=True):
+            if positives.any() and images.dtype == PICTURE:
+                sets[option] = overlay(images[positives])
     return OnLayout(match, counts, sets)
 
 

@@ -49,7 +49,7 @@ def confident(*classes: int, gap: float = 6.0) -> Tensor:
 def test_the_objectives_are_those_of_the_spec() -> None:
     """Spec C1."""
     assert set(PAIRED) < set(OBJECTIVES)
-    assert ENSEMBLES == ["ace", "dbat-unpaired", "divdis", "hsic", "input-gradients", "repulsive", "say-no"]
+    assert ENSEMBLES == ["ace", "dbat-unpaired", "divdis", "hsic", "input-gradients", "repulsive", "weak-negatives"]
 
 
 @pytest.mark.parametrize("name", DIVERSE)
@@ -230,12 +230,12 @@ def test_dbat_unpaired_weighs_as_dbat_does() -> None:
     torch.testing.assert_close((loss, gradient), expected)
 
 
-def test_say_no_by_hand() -> None:
+def test_weak_negatives_by_hand() -> None:
     """-log p(no), mean over states, K - 1 times."""
     one, other = logits_of(0.9, 0.5), logits_of(0.2, 0.7)
     expected = -(math.log(0.1) + math.log(0.5) + math.log(0.8) + math.log(0.3)) / 2
-    assert ensemble_loss("say-no", batch(one, other)) == pytest.approx(expected)
-    assert ensemble_loss("say-no", batch(one)) == pytest.approx(-(math.log(0.1) + math.log(0.5)) / 2)
+    assert ensemble_loss("weak-negatives", batch(one, other)) == pytest.approx(expected)
+    assert ensemble_loss("weak-negatives", batch(one)) == pytest.approx(-(math.log(0.1) + math.log(0.5)) / 2)
 
 
 def test_divdis_by_hand() -> None:

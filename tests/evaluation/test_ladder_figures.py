@@ -16,7 +16,7 @@ def row(method, groups, mean, deviation=None, never=None):
     best = {"best": {"mean": mean, "standard_deviation": deviation}}
     scores = {scope: {"accuracy": best, "balanced_accuracy": best} for scope in ("all", "unseen")}
     about = {"method": method, "groups": groups, "scores": scores}
-    return {**about, "always_no": {"all": never}, "positives": {"all": 3, "unseen": int(groups == 1)}}
+    return {**about, "all_negative": {"all": never}, "positives": {"all": 3, "unseen": int(groups == 1)}}
 
 
 def scores():

@@ -244,7 +244,7 @@ def test_every_number_is_explained(metrics):
         metrics["distance"]["over_ladders"][0]["best"],
     ):
         assert set(numbers) - {"member", "option", "unit", "interval_over"} <= known
-    assert {"scopes", "groups", "always_no"} <= known
+    assert {"scopes", "groups", "all_negative"} <= known
 
 
 def test_the_terminal_summary_fits(metrics):

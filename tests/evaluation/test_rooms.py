@@ -126,7 +126,7 @@ def test_the_table_over_seeds():
     assert found["standard_error"] == pytest.approx(0.1)
     assert found["interval"] == pytest.approx([0.7 - 12.706 * 0.1, 0.7 + 12.706 * 0.1], abs=1e-3)
     assert rows[0]["scores"]["all"]["accuracy"]["validated"]["mean"] == pytest.approx(0.5)
-    assert rows[0]["always_no"] == {"unseen": 0.75, "all": 0.75}
+    assert rows[0]["all_negative"] == {"unseen": 0.75, "all": 0.75}
     assert rows[0]["disagreement_unlabelled"]["mean"] == pytest.approx(0.1)
     alone = rows[3]["scores"]["unseen"]["balanced_accuracy"]["best"]
     assert np.isnan(alone["standard_deviation"])

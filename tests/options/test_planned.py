@@ -42,7 +42,7 @@ def test_ways_are_shortest(wrong_key: str) -> None:
             assert np.array_equal(learner.steps[after, option], learner.steps[going, option] - 1)
 
 
-def test_it_goes_where_its_member_says_yes() -> None:
+def test_it_goes_where_its_member_predicts_positive() -> None:
     """Not to the true sub-goal: a member that is wrong gets an option that goes to the wrong place, surely."""
     engine = DoorKeyEngine(3, 1)
     ids = engine.plan().ids
