@@ -30,7 +30,8 @@ from studies.cells import table
 
 WEIGHTS = (1.0, 0.1, 0.01, 0.001, 0.0001)
 OBJECTIVES = (  # in the order in which they are run
-    "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "weak-negatives", "input-gradients",
+    "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "weak-negatives",
+    "input-gradients",
 )  # fmt: skip
 OF_TWO = OBJECTIVES[:6]
 UNWEIGHTED = ("none", "cnn", "oracle", "joint")

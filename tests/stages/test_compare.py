@@ -138,7 +138,7 @@ def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
     old = changed("old", lambda metrics: metrics.pop("distance"))
     assert "does not fit this hypogoal, or is damaged" in refused(slow, old)
     old = changed("older", lambda metrics: metrics.pop("format"))
-    assert "another version of hypogoal evaluated this (format 1, needed: 3)" in refused(slow, old)
+    assert "another version of hypogoal evaluated this (format 1, needed: 4)" in refused(slow, old)
     with pytest.raises(UserError, match="would replace an input"):
         compare([slow, fast], fast)
 
