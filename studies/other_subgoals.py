@@ -4,11 +4,13 @@
 
 A cell is a sub-goal, a method and a seed, trained and scored as in ``studies.ladders``. ``--tables`` draws them.
 ``--options FOLDER`` learns options in room 1 there, stage by stage, and writes how their last executions ended.
+``--agents FOLDER`` writes what the agents there got, and beside it (``-options.csv``) where their options ended.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from hypogoal.cli import main as main_of
-from hypogoal.options.tables import Executions
+from hypogoal.core.files import write_table
+from hypogoal.learners.episodes import LAST
+from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 from studies import ladders
 from studies.cells import Row, interval, parser_of, run_cells, table
 
@@ -71,6 +75,41 @@ def learn_options(folder: Path, out: Path, steps: int, terminations: Sequence[st
             file.flush()
 
 
+AGENTS = ("agent", "steps", "episodes", "rewarded", "rewarded_last", "length_last", "rooms")
+CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_ended", "near")
+
+
+def gather_agents(folder: Path, out: Path) -> None:
+    """The agents from the start of the game in a folder, a row each; of each option where its executions ended.
+
+    ``rewarded``: episodes with a reward, ``_last``: of the last 100. ``ended``: executions that a positive prediction
+    ended; ``near``: of the last ones so ended, those near the true sub-goal.
+    """
+    agents: list[list[object]] = []
+    options: list[list[object]] = []
+    for place in sorted(path.parent for path in folder.glob(f"*/{Episodes.FILE}")):
+        episodes = Episodes.read(place / Episodes.FILE)
+        config = json.loads((place / "manifest.json").read_text(encoding="utf-8"))["config"]
+        rooms = json.loads((place / "layout.json").read_text(encoding="utf-8"))["rooms"]
+        rewarded, last = episodes.reward > 0, slice(-LAST, None)
+        lengths = f"{episodes.length[last].mean():.1f}"
+        got = [config["steps"], len(rewarded), rewarded.sum(), rewarded[last].sum(), lengths, " ".join(rooms)]
+        agents.append([place.name, *got])
+        if not (place / Choices.FILE).exists():
+            continue
+        choices = Choices.read(place / Choices.FILE)
+        ends = Exploits.read(place / Exploits.FILE) if (place / Exploits.FILE).exists() else None  # true sub-goals
+        for option in sorted(set(choices.option.tolist())):
+            goal, member = divmod(option, config["members"])
+            own = choices.option == option
+            sums = [int(values[own].sum()) for values in (choices.chosen, choices.reached, choices.duration)]
+            of_last = ends.reached & (ends.option == option) if ends else np.zeros(0, np.bool_)
+            near = [int(of_last.sum()), int((of_last & ends.near).sum())] if ends else ["", ""]
+            options.append([place.name, config["sub_goals"][goal], member, *sums, *near])
+    write_table(out, AGENTS, agents)
+    write_table(out.with_name(f"{out.stem}-options.csv"), CHOSEN, options)
+
+
 def stage(name: str, given: str, *, out: Path, settings: list[str]) -> None:
     """A command of hypogoal."""
     words = [word for setting in settings for word in ("--set", setting)]
@@ -111,6 +150,7 @@ def main() -> None:
     parser.add_argument("--sub-goals", default=",".join(SUB_GOALS), help="comma-separated; all by default")
     parser.add_argument("--options", type=Path, help="a folder: learn options there instead")
     parser.add_argument("--steps", type=int, default=8_000, help="of each option")
+    parser.add_argument("--agents", type=Path, help="a folder: gather its agents instead")
     parser.add_argument("--terminations", default="oracle,learned", help="comma-separated")
     arguments = parser.parse_args()
     if arguments.tables:
@@ -118,6 +158,9 @@ def main() -> None:
         return
     if arguments.options:
         learn_options(arguments.options, arguments.csv, arguments.steps, arguments.terminations.split(","))
+        return
+    if arguments.agents:
+        gather_agents(arguments.agents, arguments.csv)
         return
     jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
         (sub_goal, method, str(seed)): partial(run_cell, sub_goal, method, seed)
