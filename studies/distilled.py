@@ -156,7 +156,7 @@ def run_cell(work: Path, method: str, seed: int, step: int) -> list[Row]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    within, wrong, success = (read(path, name) for name in ("within_2", "wrong_yes", "success"))
+    within, wrong, success = (read(path, name) for name in ("within_2", "false_positives", "success"))
     spent = read(path, "cpu_seconds")
     methods = [method for method in METHODS if (method, STEP, WHERE[1]) in within]
     yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals."

@@ -161,7 +161,7 @@ def picked(numbers: Found, method: str, step: int) -> NDArray[np.float64]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
-    within, wrong = read(path, "within_2"), read(path, "wrong_yes")
+    within, wrong = read(path, "within_2"), read(path, "false_positives")
     steps = {method: sorted({step for name, step, _ in within if name == method}) for method in METHODS}
     methods = [method for method in METHODS if steps[method]]
     yield f"Zero-shot success within twice the shortest path (wanted: {GOAL}), mean member, mean over five sub-goals;"

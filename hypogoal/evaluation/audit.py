@@ -112,7 +112,7 @@ def findings(
         description = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
         kinds.append({"executions": len(alike), **description, "film": film if shown else None})
     ends = {"fooled": len(fooled), "there": int((positive & near).sum())}
-    ends["yes_at_start"] = sum(row.inside_at_start for row in rows)
+    ends["positive_at_start"] = sum(row.inside_at_start for row in rows)
     return option_numbers(table, option) | ends | {"kinds": kinds}
 
 

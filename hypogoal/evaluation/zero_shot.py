@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 EPISODES = 3  # of an agent on each layout
 AT_ONCE = 100  # layouts
 PATIENCE = 10  # timeouts after which an option alone is given up
-OF_AGENTS, OF_OPTIONS = ("success", "near", "within_2", "length"), ("success", "near", "within_2", "wrong_yes")
+OF_AGENTS, OF_OPTIONS = ("success", "near", "within_2", "length"), ("success", "near", "within_2", "false_positives")
 MEAN = "mean"  # in place of a member's number
 TITLE = "On other layouts, without learning"
 SCOPE = "zero-shot"
@@ -72,7 +72,7 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
         going &= ~moved.reached & (engine.elapsed > 0)  # nor did the episode end
         if not going.any():
             break
-    scored = scores(reached, steps, shortest) | {"wrong_yes": (positive & ~reached) * 1.0}
+    scored = scores(reached, steps, shortest) | {"false_positives": (positive & ~reached) * 1.0}
     return {name: np.where(holds, np.nan, values) for name, values in scored.items()}
 
 
@@ -173,7 +173,7 @@ OPTIONS = (
     page.label("sub-goal", "sub_goal", once=lambda entry: (entry["agent"], entry["sub_goal"])),
     page.number("member", "member"),
     *SCORES,
-    page.number("false positives, %", "wrong_yes", page.interval, 0, 100),
+    page.number("false positives, %", "false_positives", page.interval, 0, 100),
 )
 
 
@@ -218,6 +218,6 @@ QUESTION = Question(
             "share (scope zero-shot) that succeeded within twice the shortest path: of an agent's episodes on a layout "
             "that it was given, or an option's that began there, to its true sub-goal; near: within 1.5 of it",
         ),
-        "wrong_yes": ("fraction", "share of an option's executions alone that end at a false positive"),
+        "false_positives": ("fraction", "share of an option's executions alone that end at a false positive"),
     },
 )

@@ -247,7 +247,7 @@ def test_divdis_by_hand() -> None:
     assert ensemble_loss("divdis", batch(one, frozen=other[None], positives=0.25)) == pytest.approx(pair + shares[0])
 
 
-def test_divdis_moves_members_that_say_yes_to_all_states() -> None:
+def test_divdis_moves_members_that_are_positive_everywhere() -> None:
     """Where mutual information has no gradient, the ratio term has one."""
     logits = confident(1, 1, 1, 1, gap=2.0).expand(2, 4, 2).clone().requires_grad_()
     for name, least, most in (("mutual-information", 0.0, 1e-6), ("divdis", 0.1, 10.0)):

@@ -43,7 +43,7 @@ def test_many_layouts_go_through_all_stages(tmp_path: Path, monkeypatch: pytest.
     with (run / "evaluation" / "numbers.csv").open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["scope"] == "zero-shot"]
     assert {row["layout"] for row in rows} == {"5000", "5001", "5002"}
-    assert {row["quantity"] for row in rows} == {"success", "length", "wrong_yes"}
+    assert {row["quantity"] for row in rows} == {"success", "length", "false_positives"}
     agrees(run, OWN_TASK, "Choosing made no difference over 3 layouts")
     page = (run / "report" / "index.html").read_text(encoding="utf-8")
     assert "On other layouts, without learning" in page and "layout seeds 1000-1999" in page

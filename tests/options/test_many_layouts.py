@@ -107,7 +107,7 @@ def test_planned_options_to_true_sub_goals_are_perfect_without_learning() -> Non
     for option in range(5):
         told = alone(loop, option, option, ways[:, option])
         assert all(told[name].tolist() == [1.0] * 4 for name in ("success", "near", "within_2"))
-        assert told["wrong_yes"].tolist() == [0.0] * 4
+        assert told["false_positives"].tolist() == [0.0] * 4
         assert alone(loop, option, option, ways[:, option] / 2.1)["within_2"].tolist() == [0.0] * 4
     episodes = play(loop, loop.chooser, 3)
     assert episodes.succeeded.shape == (4, 3) and episodes.succeeded.all()
@@ -125,7 +125,7 @@ def test_a_wrong_member_is_told_from_an_option_that_gets_nowhere() -> None:
     ways = shortest_ways(loop.engine)
     found = [alone(loop, option, option, ways[:, option]) for option in (2, 3, 4)]
     assert [told["success"].mean() for told in found] == [1, 0, 0]
-    assert [told["wrong_yes"].mean() for told in found] == [0, 1, 0]
+    assert [told["false_positives"].mean() for told in found] == [0, 1, 0]
 
 
 def test_states_visited_are_of_their_layouts() -> None:

@@ -103,7 +103,7 @@ def test_patience_goes_on_where_it_was() -> None:
     assert (whole.thresholds < [4, 5]).all()
 
 
-def test_dwelling_takes_so_many_yes_on_end() -> None:
+def test_dwelling_takes_so_many_positives_in_a_row() -> None:
     rule = Dwell(by_table, 2, None, np.array([0.5, 2.5], dtype=np.float32), 1, 3)
     assert execution(rule, 1, (4, 5, 3, 4, 5, 4)) == [False, False, False, False, False, True]
     assert execution(rule, 1, (4, 4, 5)) == [False, False, True]  # what the last one held does not count
@@ -144,7 +144,7 @@ def test_options_are_learned_that_were_out_of_reach() -> None:
 
 
 @pytest.mark.parametrize("learner", [LightLearner, RecurrentLearner])
-def test_what_dwelling_teaches_is_the_last_yes(learner: type[LightLearner] | type[RecurrentLearner]) -> None:
+def test_what_dwelling_teaches_is_the_last_positive(learner: type[LightLearner] | type[RecurrentLearner]) -> None:
     """A replay keeps whether its execution had dwelt long enough, not what the state alone would say."""
     rule = Dwell(by_table, 2, None, np.array([1.5, 5.0], dtype=np.float32), 2, 2)
     loop = loop_of(rule, learner, 2)
