@@ -75,14 +75,14 @@ def learn_options(folder: Path, out: Path, steps: int, terminations: Sequence[st
             file.flush()
 
 
-AGENTS = ("agent", "steps", "episodes", "rewarded", "rewarded_last", "length_last", "rooms")
+AGENTS = ("agent", "steps", "episodes", "rewarded", "first_rewarded", "rewarded_last", "length_last", "rooms")
 CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_ended", "near")
 
 
 def gather_agents(folder: Path, out: Path) -> None:
     """The agents from the start of the game in a folder, a row each; of each option where its executions ended.
 
-    ``rewarded``: episodes with a reward, ``_last``: of the last 100. ``ended``: executions that a positive prediction
+    ``rewarded``: episodes with a reward, ``_last``: of the last 100; ``first_``: the step at the end of the first. ``ended``: executions that a positive prediction
     ended; ``near``: of the last ones so ended, those near the true sub-goal.
     """
     agents: list[list[object]] = []
@@ -93,8 +93,9 @@ def gather_agents(folder: Path, out: Path) -> None:
         rooms = json.loads((place / "layout.json").read_text(encoding="utf-8"))["rooms"]
         rewarded, last = episodes.reward > 0, slice(-LAST, None)
         lengths = f"{episodes.length[last].mean():.1f}"
-        got = [config["steps"], len(rewarded), rewarded.sum(), rewarded[last].sum(), lengths, " ".join(rooms)]
-        agents.append([place.name, *got])
+        first = episodes.step[rewarded.argmax()] if rewarded.any() else ""
+        counts = [config["steps"], len(rewarded), rewarded.sum(), first, rewarded[last].sum()]
+        agents.append([place.name, *counts, lengths, " ".join(rooms)])
         if not (place / Choices.FILE).exists():
             continue
         choices = Choices.read(place / Choices.FILE)
