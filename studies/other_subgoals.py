@@ -82,8 +82,9 @@ CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_en
 def gather_agents(folder: Path, out: Path) -> None:
     """The agents from the start of the game in a folder, a row each; of each option where its executions ended.
 
-    ``rewarded``: episodes with a reward, ``_last``: of the last 100; ``first_``: the step at the end of the first. ``ended``: executions that a positive prediction
-    ended; ``near``: of the last ones so ended, those near the true sub-goal.
+    ``rewarded``: episodes with a reward, ``_last``: of the last 100; ``first_``: the step at the end of the first.
+    ``ended``: executions that a positive prediction ended; ``near``: of the last ones so ended, those near the true
+    sub-goal.
     """
     agents: list[list[object]] = []
     options: list[list[object]] = []
