@@ -12,6 +12,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from hypogoal.core.config import parse_integers
 from hypogoal.core.rounding import above
 from hypogoal.core.workers import in_processes
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
+from hypogoal.domains.montezuma_ladders import GROUPS
 from hypogoal.evaluation.distance import NEAR, option_numbers
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig
@@ -158,6 +160,24 @@ def tables(path: Path) -> Iterator[str]:
             yield from _tables(
                 groups, distances, read(path, groups, "reached_base"), read(path, groups, "inside_at_start")
             )
+            yield from _leads(groups, {"": distances, ", without the rule": read(path, groups, "stop_distance")})
+
+
+def _leads(groups: int, measures: dict[str, Distances]) -> Iterator[str]:
+    """How much nearer D-BAT stops than the others on ladders without labels: mean over seeds, then over ladders."""
+    rooms = {str(room) for group in GROUPS[:groups] for room in group}
+    new = [ladder for ladder in LADDERS[:9] if not rooms & {*ladder.rstrip("LMR").split("-")}]
+    for (rule, distances), other in product(measures.items(), ("none", "cnn")):
+        for of_members in (np.min, np.mean):
+            gaps = []
+            for ladder in new:
+                pair = [distances.get((method, ladder), {}).values() for method in (other, "dbat")]
+                means = [[of_members(members) for members in seeds if not np.isnan(members).any()] for seeds in pair]
+                gaps += [np.mean(means[0]) - np.mean(means[1])] if all(means) else []
+            if len(gaps) > 1:
+                name = "best" if of_members is np.min else "mean"
+                title = f"{METHODS[other][0]} minus D-BAT, {name} member{rule}"
+                yield f"{title}: {difference(np.array(gaps), 0)}, {len(gaps)} ladders"
 
 
 def _tables(groups: int, distances: Distances, reached: Distances, inside: Distances) -> Iterator[str]:
