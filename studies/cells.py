@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.config import parse_integers
+from hypogoal.core.errors import Complete
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
+from hypogoal.domains.base import Domain
 from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, RESAMPLES, student_interval
+from hypogoal.stages.collect import collect
 
 Row = dict[str, Any]
 Cell = tuple[str, ...]
@@ -57,6 +61,12 @@ def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, A
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def collect_once(domain: Domain, config: Any, path: Path) -> None:
+    """Collect into ``path``: go on where a killed study stopped, keep what is complete."""
+    with contextlib.suppress(Complete):
+        collect(domain, config, path, resume=True, quiet=True)
 
 
 def run_cells(

@@ -35,10 +35,9 @@ from hypogoal.meta.training import assemble
 from hypogoal.options.choosers import Ids
 from hypogoal.options.distilled import DistilledLearner
 from hypogoal.options.networks import apply_to_states
-from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Jobs, Row, difference, interval, parser_of, printed, run_cells, table
+from studies.cells import Jobs, Row, collect_once, difference, interval, parser_of, printed, run_cells, table
 from studies.many_layouts import ENSEMBLE_STEPS, KEYS, WHERE, new_layouts, of_seeds, picked, read, tried_out
 
 FIRST = 6000  # new layouts begin here; those from 5000 on were seen while settings were chosen
@@ -249,7 +248,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if printed(arguments, tables):
         return
-    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", resume=True, quiet=True)
+    collect_once(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5")
     step = CHOOSE if arguments.choosing else STEP
     jobs: Jobs = {
         (method, str(seed)): partial(run_cell, arguments.work, method, seed, step)

@@ -29,10 +29,9 @@ from hypogoal.evaluation.distance import NEAR, option_numbers
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
-from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Jobs, Row, difference, interval, parser_of, read_rows, run_cells, table
+from studies.cells import Jobs, Row, collect_once, difference, interval, parser_of, read_rows, run_cells, table
 from studies.ladders import read as read_lengths
 
 Settings = dict[str, Any]
@@ -368,7 +367,7 @@ def main() -> None:
     work, methods = arguments.work, arguments.methods.split(",")
     for groups in arguments.groups:
         settings = MontezumaConfig(groups=groups, workers=1)
-        collect(DOMAIN, settings, work / f"groups-{groups}.h5", resume=True, quiet=True)
+        collect_once(DOMAIN, settings, work / f"groups-{groups}.h5")
     trained = {ENSEMBLES.get(method, method) for method in methods}
     ensembles = [
         partial(ensemble_of, work, groups, method, seed)

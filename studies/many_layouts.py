@@ -38,9 +38,8 @@ from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds
 from hypogoal.meta.training import assemble
 from hypogoal.options.loop import OptionLoop
-from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
-from studies.cells import Cell, Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Cell, Jobs, Row, collect_once, interval, parser_of, printed, read_rows, run_cells, table
 
 TRAINED, FIRST, TRIED = "1000-1999", 5000, 100  # layouts to learn in; where the new ones begin, and how many
 LEARNT = (0, 1, 2)  # layouts of the states that ensembles learn from
@@ -204,7 +203,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if printed(arguments, tables):
         return
-    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5", resume=True, quiet=True)
+    collect_once(DOMAIN, DoorKeyConfig(heldout_layouts=1), arguments.work / "data.h5")
     looks = tuple(arguments.looks)
 
     def looks_of(cell: Cell) -> tuple[int, ...]:

@@ -30,9 +30,8 @@ from hypogoal.learners.baselines.agents import train
 from hypogoal.learners.baselines.engine_env import Bonus, EngineEnv
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.meta.training import judged
-from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
-from studies.cells import Jobs, Row, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, collect_once, parser_of, printed, read_rows, run_cells, table
 
 Settings = PPOSettings | DQNSettings
 Draw = Callable[[np.random.Generator], float | int | str]
@@ -131,7 +130,7 @@ def run_bonus(trial: int, chosen: Settings, work: Path) -> list[Row]:
     ensemble = work / "ensemble"
     if not ensemble.exists():
         # Nobody looks at the held-out layouts.
-        collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), work / "data.h5", resume=True, quiet=True)
+        collect_once(DOMAIN, DoorKeyConfig(heldout_layouts=1), work / "data.h5")
         config = TrainEnsembleConfig(diversity="dbat", members=3, workers=1)
         train_ensemble(work / "data.h5", config, ensemble, seed=4000, quiet=True)
     return tried(chosen, LONG, columns, BONUSES[trial], open_artefact(ensemble, "ensemble"))

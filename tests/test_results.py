@@ -2,12 +2,15 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hypogoal.core.errors import UserError
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 from hypogoal.learners.episodes import EpisodeRecorder
 from studies import (
@@ -34,7 +37,7 @@ from studies import (
     ways,
     which_feature,
 )
-from studies.cells import difference, interval, run_cells
+from studies.cells import collect_once, difference, interval, run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
@@ -200,6 +203,17 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert ran == [("a", 2), ("b", 2), ("a", 3)]
     rows = path.read_text(encoding="utf-8").splitlines()
     assert rows == ["cell,step,score", "a,1,0.1429", "a,2,0.2857", "b,1,0.1429", "b,2,0.2857", "a,3,0.4286"]
+
+
+def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
+    """Begun again, it goes on with the states it has; with other settings it says so."""
+    path, config = tmp_path / "data.h5", DoorKeyConfig(heldout_layouts=1)
+    collect_once(DOMAIN, config, path)
+    states = path.read_bytes()
+    collect_once(DOMAIN, config, path)
+    assert path.read_bytes() == states
+    with pytest.raises(UserError, match="heldout_layouts"):
+        collect_once(DOMAIN, replace(config, heldout_layouts=2), path)
 
 
 @pytest.mark.parametrize("share", [0.8, 1.0])
