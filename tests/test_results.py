@@ -1,5 +1,6 @@
 """Published tables are drawn from the committed cells (Spec F5, H7)."""
 
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -203,6 +204,37 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert ran == [("a", 2), ("b", 2), ("a", 3)]
     rows = path.read_text(encoding="utf-8").splitlines()
     assert rows == ["cell,step,score", "a,1,0.1429", "a,2,0.2857", "b,1,0.1429", "b,2,0.2857", "a,3,0.4286"]
+
+
+def test_leads_on_ladders_are_means_over_seeds_of_what_has_no_labels() -> None:
+    """Ladders of the labelled group do not count, nor does one without a peer."""
+    far, near = np.array([9.0, 5.0]), np.array([1.0, 3.0])
+    pairs = {("none", ladder): {10: far, 11: far + 2} for ladder in ("1L", "3-9", "14-22", "0-4")}
+    pairs |= {("dbat", ladder): {10: near, 11: near} for ladder in ("1L", "3-9", "14-22")}
+    pairs["none", "14-22"] = {10: far + 2, 11: far + 4}
+    best, mean = ladder_options._leads(1, {"": pairs})
+    assert best == "no diversity minus D-BAT, best member: 6 [-7, 19], 2 ladders"  # 5 and 7
+    assert mean == "no diversity minus D-BAT, mean member: 7 [-6, 20], 2 ladders"  # 6 and 8; t(1) = 12.7
+
+
+def test_agents_of_a_game_are_gathered_a_row_each(tmp_path: Path) -> None:
+    """The first reward and the last hundred; of options, what a positive prediction ended, and how much was near."""
+    place = tmp_path / "game" / "meta"
+    place.mkdir(parents=True)
+    manifest = {"config": {"steps": 900, "members": 2, "sub_goals": ["up", "down"]}}
+    (place / "manifest.json").write_text(json.dumps(manifest))
+    (place / "layout.json").write_text(json.dumps({"rooms": {"1": 9, "2": 1}}))
+    episodes = [f"{step},{step % 7},{100.0 * (step in (5, 90))},1,0" for step in range(1, 121)]
+    (place / "episodes.csv").write_text("\n".join(["step,length,reward,terminated,succeeded", *episodes]))
+    chosen = ["9,0,4,3,2.5,1,30", "9,3,4,2,2.5,2,20", "18,3,4,1,2.5,0,10"]
+    (place / "choices.csv").write_text("\n".join(["step,option,offered,chosen,expected,reached,duration", *chosen]))
+    ends = ["8,3,1,1,1.5,-2", "9,3,1,0,1.5,-2", "9,3,0,1,1.5,-2", "9,0,1,0,1.5,-2"]
+    (place / "exploits.csv").write_text("\n".join(["step,option,reached,near,best_near,best_far", *ends]))
+    other_subgoals.gather_agents(tmp_path / "game", tmp_path / "agents.csv")
+    lengths = np.mean([step % 7 for step in range(21, 121)])
+    assert (tmp_path / "agents.csv").read_text().splitlines()[1:] == [f"meta,900,120,2,5,1,{lengths:.1f},1 2"]
+    options = (tmp_path / "agents-options.csv").read_text().splitlines()[1:]
+    assert options == ["meta,up,0,3,1,30,1,0", "meta,down,1,3,2,30,2,1"]
 
 
 def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
