@@ -22,7 +22,7 @@ from hypogoal.core.files import write_table
 from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 from studies import ladders
-from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.cells import Row, interval, parser_of, read_rows, run_cells, table
 
 SUB_GOALS = ("climb-up-ladder", "pass-enemy-left", "pass-enemy-right", "pass-lasers")
 METHODS = ("dbat", "none", "cnn")
@@ -120,7 +120,11 @@ def stage(name: str, given: str, *, out: Path, settings: list[str]) -> None:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """The table of the page, as lines of Markdown."""
+    """The table of the page, or of gathered agents, as lines of Markdown."""
+    rows = read_rows(path)
+    if "agent" in rows[0]:
+        yield from table([*rows[0]], (list(row.values()) for row in rows))
+        return
     titles = [
         "",
         "",

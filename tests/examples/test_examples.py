@@ -261,11 +261,10 @@ def test_freeway_goes_through_all_stages(tmp_path: Path) -> None:
     few = settings("steps=10", "members=2", "workers=1")
     assert main(["train-ensemble", data, "--out", str(ensemble), "-q", *few]) == 0
     assert json.loads((ensemble / "manifest.json").read_text(encoding="utf-8"))["config"]["network"] == "montezuma"
-    assert main(["train-options", str(ensemble), "--out", str(run / "options"), "-q", *PLAY]) == 0
-    assert (
-        main(["train-meta", str(ensemble), "--options", str(run / "options"), "--out", str(run / "meta"), "-q", *PLAY])
-        == 0
-    )
+    play = [*PLAY, *settings("max_episode_steps=120")]  # a reset loads the game
+    options, meta = str(run / "options"), str(run / "meta")
+    assert main(["train-options", str(ensemble), "--out", options, "-q", *play]) == 0
+    assert main(["train-meta", str(ensemble), "--options", options, "--out", meta, "-q", *play]) == 0
     assert main(["evaluate", str(run), "-q"]) == 0
     assert main(["report", str(run)]) == 0
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
