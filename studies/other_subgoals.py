@@ -80,7 +80,7 @@ CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_en
 
 
 def gather_agents(folder: Path, out: Path) -> None:
-    """The agents from the start of the game in a folder, a row each; of each option where its executions ended.
+    """The agents in a folder, a row each, with their rooms, if any; of each option where its executions ended.
 
     ``rewarded``: episodes with a reward, ``_last``: of the last 100; ``first_``: the step at the end of the first.
     ``ended``: executions that a positive prediction ended; ``near``: of the last ones so ended, those near the true
@@ -91,7 +91,7 @@ def gather_agents(folder: Path, out: Path) -> None:
     for place in sorted(path.parent for path in folder.glob(f"*/{Episodes.FILE}")):
         episodes = Episodes.read(place / Episodes.FILE)
         config = json.loads((place / "manifest.json").read_text(encoding="utf-8"))["config"]
-        rooms = json.loads((place / "layout.json").read_text(encoding="utf-8"))["rooms"]
+        rooms = json.loads((place / "layout.json").read_text(encoding="utf-8")).get("rooms", ())
         rewarded, last = episodes.reward > 0, slice(-LAST, None)
         lengths = f"{episodes.length[last].mean():.1f}"
         first = episodes.step[rewarded.argmax()] if rewarded.any() else ""
