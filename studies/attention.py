@@ -1,0 +1,174 @@
+"""Do members look at different parts of a state? Figure 2's question, in numbers.
+
+    python -m studies.attention docs/results/figure2-ladders.csv --seeds 0-4
+
+A cell is a method and a seed: one training with the labels of one ladder group, six members as in the paper, looked
+at after each of ``LOOKS`` steps. Attributions are DeepLift's on true bases in rooms that no training set has. Kept and
+gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.compute import prepare
+from hypogoal.core.seeding import seed_for
+from hypogoal.dataset import spread_rows
+from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE
+from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.deep_lift import attributed, mean_state
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.scores import ranking
+from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.views import positions_of
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.ladders import HELDOUT, states_of
+from studies.ladders import METHODS as OF_LADDERS
+
+METHODS = ("dbat", "none", "dbat-unpaired")
+MEMBERS = 6
+LOOKS = (2, 25, 100, 300)  # the first: what hardly trained members share
+STATES = 60  # true bases in unseen rooms, spread over them
+SQUARE = 7  # pixels: attributions are compared in squares, so that two edges of one thing are one part
+REACH = 12  # pixels: the surroundings of the agent are 25 x 25
+KEYS = ("method", "seed", "step", "member")
+COLUMNS = (*KEYS, "common", "near_agent", "ranking_unseen")
+
+
+def in_common(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """How much of their attention members share: attributions (n, K, H, W, C) -> float64 (K,), in 0 to 1.
+
+    A member's attention in a state are the shares of its absolute attribution in squares of ``SQUARE`` pixels. Two
+    members have the smaller of two shares in common, summed over squares: 1 if both are the same, 0 if no square has
+    attributions of both. Means over the other members and the states; sides are multiples of ``SQUARE``.
+    """
+    pixels = np.abs(values).sum(-1)
+    states, members, height, width = pixels.shape
+    squares = pixels.reshape(states, members, height // SQUARE, SQUARE, width // SQUARE, SQUARE).sum((3, 5))
+    shares = squares.reshape(states, members, -1)
+    shares = shares / shares.sum(-1, keepdims=True)
+    pairs = np.minimum(shares[:, :, None], shares[:, None]).sum(-1).mean(0)
+    common: NDArray[np.float64] = (pairs.sum(1) - np.diag(pairs)) / (members - 1)
+    return common
+
+
+def near(values: NDArray[np.floating], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share of members' absolute attribution within ``REACH`` pixels of places, (n, 2) -> float64 (K,)."""
+    pixels = np.abs(values).sum(-1)
+    rows, columns = (np.abs(np.arange(side) - places[:, [axis]]) <= REACH for axis, side in enumerate(pixels.shape[2:]))
+    inside = (rows[:, :, None] & columns[:, None])[:, None]
+    shares: NDArray[np.float64] = ((pixels * inside).sum((2, 3)) / pixels.sum((2, 3))).mean(0)
+    return shares
+
+
+def run_cell(method: str, seed: int) -> list[Row]:
+    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and look where its members look."""
+    prepare()
+    data = states_of(1, CLIMB_DOWN.name, HELDOUT)
+    unseen = np.flatnonzero(data.heldout.origins["seen"] == SEEN_NOWHERE)
+    labels = data.heldout.labels[unseen, 0]
+    bases = unseen[labels]
+    bases = bases[spread_rows(len(bases), STATES)]
+    positions = positions_of({name: values[bases] for name, values in data.heldout.origins.items()})
+    assert positions is not None
+    places = DOMAIN.agent_pixels(positions)
+    rows: list[Row] = []
+
+    def look(step: int, ensemble: Ensemble) -> None:
+        baseline = mean_state(ensemble.see(data.unlabelled.observations, None))
+        values = attributed(ensemble, ensemble.see(data.heldout.observations[bases], None), baseline).values
+        columns = {
+            "common": in_common(values),
+            "near_agent": near(values, places),
+            "ranking_unseen": ranking(ensemble.predict(data.heldout.observations[unseen]), labels),
+        }
+        for member in range(len(ensemble)):
+            place = {"method": method, "seed": seed, "step": step, "member": member}
+            rows.append(place | {name: float(numbers[member]) for name, numbers in columns.items()})
+
+    config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": LOOKS[-1]})
+    fit(
+        data.labelled.observations,
+        data.labelled.labels[:, 0],
+        data.unlabelled.observations,
+        dataclasses.replace(config, **OF_LADDERS[method]),
+        seed_for(seed, "ensemble", CLIMB_DOWN.name),
+        Watcher(look=look, look_at=LOOKS),
+    )
+    return rows
+
+
+Cells = dict[tuple[str, int], dict[int, dict[str, NDArray[np.float64]]]]  # by method and step, by seed and column: (K,)
+
+
+def read(path: Path) -> Cells:
+    """The cells of the file."""
+    cells: Cells = {}
+    for row in read_rows(path):
+        columns = cells.setdefault((row["method"], int(row["step"])), {}).setdefault(int(row["seed"]), {})
+        for name in COLUMNS[len(KEYS) :]:
+            columns[name] = np.append(columns.get(name, np.empty(0)), float(row[name]))
+    return cells
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    cells, rows = read(path), []
+    for (method, step), seeds in sorted(cells.items(), key=lambda cell: (METHODS.index(cell[0][0]), cell[0][1])):
+        of_dbat = cells["dbat", step]
+        shared = [seed for seed in seeds if seed in of_dbat]
+        common = np.array([seeds[seed]["common"].mean() for seed in shared])
+        versus = (
+            "-"
+            if method == "dbat"
+            else difference(np.array([of_dbat[seed]["common"].mean() for seed in shared]) - common)
+        )
+        least, most = (
+            interval(np.array([reduce(seeds[seed]["near_agent"]) for seed in shared])) for reduce in (np.min, np.max)
+        )
+        looks_most, mean = (
+            interval(np.array([of(seeds[seed]) for seed in shared])) for of in (_ranking_of_nearest, _mean_ranking)
+        )
+        rows.append([method, str(step), interval(common), versus, least, most, looks_most, mean])
+    titles = [
+        "",
+        "steps",
+        "in common",
+        "D-BAT minus it",
+        "near the agent, least member",
+        "most",
+        "ranking of that member",
+        "mean ranking",
+    ]
+    yield from table(titles, rows)
+
+
+def _ranking_of_nearest(columns: dict[str, NDArray[np.float64]]) -> float:
+    return float(columns["ranking_unseen"][columns["near_agent"].argmax()])
+
+
+def _mean_ranking(columns: dict[str, NDArray[np.float64]]) -> float:
+    return float(columns["ranking_unseen"].mean())
+
+
+def main() -> None:
+    """Run the cells that are not in the file yet."""
+    parser = parser_of(__doc__, "0-4")
+    arguments = parser.parse_args()
+    if printed(arguments, tables):
+        return
+    jobs: Jobs = {
+        (method, str(seed)): partial(run_cell, method, seed) for seed in arguments.seeds for method in METHODS
+    }
+    run_cells(arguments.csv, COLUMNS, KEYS[:2], jobs, lambda _: LOOKS, arguments.workers)
+
+
+if __name__ == "__main__":
+    main()
