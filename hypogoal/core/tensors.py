@@ -95,6 +95,8 @@ def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: ob
     except (RuntimeError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         raise UserError("the weights do not fit the manifest", where, AGAIN) from None
     check_fit(module.state_dict(), weights, where, AGAIN)
-    module = module if custom else make()
-    module.load_state_dict(weights)
+    if custom:
+        module.load_state_dict(weights)
+    else:
+        module.load_state_dict({name: tensor.clone() for name, tensor in weights.items()}, assign=True)
     return module

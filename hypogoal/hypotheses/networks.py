@@ -189,7 +189,9 @@ def build_network(
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
         torch.manual_seed(seed)
         layers, hidden = parts_of(observation_shape) if parts_of else joined
-        features = _features(layers, *sizes)
+        # Without numbers (device meta) PyTorch takes longer over what keeps shapes than over the rest of the network.
+        shaping = [layer for layer in layers if not isinstance(layer, nn.BatchNorm2d | nn.ReLU)]
+        features = _features(shaping if name in NETWORKS else layers, *sizes)
         if features is None:
             channels = observation_shape[-1]
             built_in = {other: parts_of(channels)[0] for other, parts_of in NETWORKS.items()}
