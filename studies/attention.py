@@ -10,7 +10,7 @@ gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -39,24 +39,48 @@ STATES = 60  # true bases in unseen rooms, spread over them
 SQUARE = 7  # pixels: attributions are compared in squares, so that two edges of one thing are one part
 REACH = 12  # pixels: the surroundings of the agent are 25 x 25
 KEYS = ("method", "seed", "step", "member")
-COLUMNS = (*KEYS, "common", "near_agent", "ranking_unseen")
+COLUMNS = (*KEYS, "common", "signed", "near_agent", "ranking_unseen")
+
+
+def in_squares(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Attributions (n, K, H, W, C) added up in squares of ``SQUARE`` pixels, and over channels: float64 (n, K, S).
+
+    Sides are multiples of ``SQUARE``.
+    """
+    states, members, height, width = values.shape[:4]
+    squares = values.reshape(states, members, height // SQUARE, SQUARE, width // SQUARE, SQUARE, -1).sum((3, 5, 6))
+    flat: NDArray[np.float64] = squares.reshape(states, members, -1)
+    return flat
 
 
 def in_common(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """How much of their attention members share: attributions (n, K, H, W, C) -> float64 (K,), in 0 to 1.
 
-    A member's attention in a state are the shares of its absolute attribution in squares of ``SQUARE`` pixels. Two
-    members have the smaller of two shares in common, summed over squares: 1 if both are the same, 0 if no square has
-    attributions of both. Means over the other members and the states; sides are multiples of ``SQUARE``.
+    A member's attention in a state are its squares' shares of all absolute attribution. Two members have the smaller of
+    two shares in common, summed over squares: 1 if both are the same, 0 if no square has attributions of both. Means
+    over the other members and the states.
     """
-    pixels = np.abs(values).sum(-1)
-    states, members, height, width = pixels.shape
-    squares = pixels.reshape(states, members, height // SQUARE, SQUARE, width // SQUARE, SQUARE).sum((3, 5))
-    shares = squares.reshape(states, members, -1)
-    shares = shares / shares.sum(-1, keepdims=True)
-    pairs = np.minimum(shares[:, :, None], shares[:, None]).sum(-1).mean(0)
-    common: NDArray[np.float64] = (pairs.sum(1) - np.diag(pairs)) / (members - 1)
-    return common
+    squares = in_squares(np.abs(values))
+    shares = squares / squares.sum(-1, keepdims=True)
+    return _with_others(np.minimum(shares[:, :, None], shares[:, None]).sum(-1))
+
+
+def alike(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """How alike members' signed attributions are: (n, K, H, W, C) -> float64 (K,), in -1 to 1.
+
+    The cosine between two members' attributions by square: 1 if the same squares speak for and against, -1 if what
+    speaks for one speaks against the other. Means as of :func:`in_common`.
+    """
+    squares = in_squares(values)
+    directions = squares / np.linalg.norm(squares, axis=-1, keepdims=True)
+    return _with_others(directions @ directions.swapaxes(1, 2))
+
+
+def _with_others(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean of each member with the others, over states: (n, K, K) -> (K,)."""
+    of_pairs = pairs.mean(0)
+    means: NDArray[np.float64] = (of_pairs.sum(1) - np.diag(of_pairs)) / (len(of_pairs) - 1)
+    return means
 
 
 def near(values: NDArray[np.floating], places: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,6 +110,7 @@ def run_cell(method: str, seed: int) -> list[Row]:
         values = attributed(ensemble, ensemble.see(data.heldout.observations[bases], None), baseline).values
         columns = {
             "common": in_common(values),
+            "signed": alike(values),
             "near_agent": near(values, places),
             "ranking_unseen": ranking(ensemble.predict(data.heldout.observations[unseen]), labels),
         }
@@ -105,7 +130,8 @@ def run_cell(method: str, seed: int) -> list[Row]:
     return rows
 
 
-Cells = dict[tuple[str, int], dict[int, dict[str, NDArray[np.float64]]]]  # by method and step, by seed and column: (K,)
+Columns = dict[str, NDArray[np.float64]]  # of the K members
+Cells = dict[tuple[str, int], dict[int, Columns]]  # by method and step, by seed
 
 
 def read(path: Path) -> Cells:
@@ -124,38 +150,36 @@ def tables(path: Path) -> Iterator[str]:
     for (method, step), seeds in sorted(cells.items(), key=lambda cell: (METHODS.index(cell[0][0]), cell[0][1])):
         of_dbat = cells["dbat", step]
         shared = [seed for seed in seeds if seed in of_dbat]
-        common = np.array([seeds[seed]["common"].mean() for seed in shared])
-        versus = (
-            "-"
-            if method == "dbat"
-            else difference(np.array([of_dbat[seed]["common"].mean() for seed in shared]) - common)
-        )
-        least, most = (
-            interval(np.array([reduce(seeds[seed]["near_agent"]) for seed in shared])) for reduce in (np.min, np.max)
-        )
-        looks_most, mean = (
-            interval(np.array([of(seeds[seed]) for seed in shared])) for of in (_ranking_of_nearest, _mean_ranking)
-        )
-        rows.append([method, str(step), interval(common), versus, least, most, looks_most, mean])
-    titles = [
-        "",
-        "steps",
-        "in common",
-        "D-BAT minus it",
-        "near the agent, least member",
-        "most",
-        "ranking of that member",
-        "mean ranking",
-    ]
-    yield from table(titles, rows)
+
+        numbers = [method, str(step)]
+        for name in ("common", "signed"):
+            own, dbats = (_over(cell, shared, partial(_mean, name=name)) for cell in (seeds, of_dbat))
+            numbers += [interval(own), "-" if method == "dbat" else difference(dbats - own)]
+        for of_members in (_least_near, _most_near, _ranking_of_nearest, partial(_mean, name="ranking_unseen")):
+            numbers.append(interval(_over(seeds, shared, of_members)))
+        rows.append(numbers)
+    titles = ["", "steps", "in common", "D-BAT minus it", "signed", "D-BAT minus it"]
+    yield from table([*titles, "near the agent, least member", "most", "ranking of that member", "mean ranking"], rows)
 
 
-def _ranking_of_nearest(columns: dict[str, NDArray[np.float64]]) -> float:
+def _over(cell: dict[int, Columns], seeds: list[int], of_members: Callable[[Columns], float]) -> NDArray[np.float64]:
+    return np.array([of_members(cell[seed]) for seed in seeds])
+
+
+def _mean(columns: Columns, name: str) -> float:
+    return float(columns[name].mean())
+
+
+def _least_near(columns: Columns) -> float:
+    return float(columns["near_agent"].min())
+
+
+def _most_near(columns: Columns) -> float:
+    return float(columns["near_agent"].max())
+
+
+def _ranking_of_nearest(columns: Columns) -> float:
     return float(columns["ranking_unseen"][columns["near_agent"].argmax()])
-
-
-def _mean_ranking(columns: dict[str, NDArray[np.float64]]) -> float:
-    return float(columns["ranking_unseen"].mean())
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.attention import COLUMNS, REACH, SQUARE, in_common, near, tables
+from studies.attention import COLUMNS, REACH, SQUARE, alike, in_common, near, tables
 from studies.cells import write_rows
 
 SIDE = 12 * SQUARE
@@ -37,6 +37,15 @@ def test_the_mean_is_over_the_other_members_and_over_states() -> None:
     assert in_common(halves).tolist() == pytest.approx([0.25, 0.25]), "the second gives this square a quarter"
 
 
+def test_signed_attributions_are_alike_opposed_or_unrelated() -> None:
+    """Whatever their size; within a square, for and against cancel."""
+    assert alike(attributions((0, 0, 1), (SQUARE - 1, 3, 5))).tolist() == [1, 1]
+    assert alike(attributions((0, 0, 1), (0, 1, -5))).tolist() == [-1, -1]
+    assert alike(attributions((0, 0, 1), (50, 50, 1))).tolist() == [0, 0]
+    both = attributions((0, 0, 4), (0, 0, 1)) + attributions((0, 1, -1), (50, 50, 1))
+    assert alike(both).tolist() == pytest.approx([0.5**0.5] * 2)
+
+
 def test_near_the_agent_is_a_share_of_all_attribution() -> None:
     """At the agent, just inside and just outside of its surroundings; spread evenly, it is their area."""
     places = np.array([[40.0, 30.0]])
@@ -48,15 +57,21 @@ def test_near_the_agent_is_a_share_of_all_attribution() -> None:
 def test_the_table_pairs_seeds(tmp_path: Path) -> None:
     """D-BAT's members have less in common by .1 on one seed and .3 on the other; the nearest one's ranking beside."""
     rows = [
-        dict(zip(COLUMNS, (method, seed, 25, member, common, 0.2 + 0.1 * member, 0.5 + 0.4 * member), strict=True))
+        dict(
+            zip(
+                COLUMNS,
+                (method, seed, 25, member, common, -common, 0.2 + 0.1 * member, 0.5 + 0.4 * member),
+                strict=True,
+            )
+        )
         for method, commons in (("dbat", (0.5, 0.3)), ("none", (0.6, 0.6)))
         for seed, common in enumerate(commons)
-        for member in (0, 1)
+        for member, near_agent in enumerate((0.2, 0.3))
     ]
     write_rows(tmp_path / "cells.csv", COLUMNS, rows)
     lines = list(tables(tmp_path / "cells.csv"))
-    assert "-0.200 [-1.471, 1.071]" in lines[3]
-    assert lines[2].split(" | ")[4:] == [
+    assert "| -0.200 [-1.471, 1.071] | -0.600 (-0.600 to -0.600) | 0.200 [-1.071, 1.471] |" in lines[3]
+    assert lines[2].split(" | ")[6:] == [
         "0.200 (0.200 to 0.200)",
         "0.300 (0.300 to 0.300)",
         "0.900 (0.900 to 0.900)",
