@@ -76,7 +76,8 @@ def learn_options(folder: Path, out: Path, steps: int, terminations: Sequence[st
 
 
 AGENTS = ("agent", "steps", "episodes", "rewarded", "first_rewarded", "rewarded_last", "length_last", "rooms")
-CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_ended", "near")
+CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_ended", "near", "last_died", "on_floor")
+FLOOR, ON = 148, 20  # y where room 1's skull rolls, and how far from it a death counts as on its floor
 
 
 def gather_agents(folder: Path, out: Path) -> None:
@@ -84,7 +85,7 @@ def gather_agents(folder: Path, out: Path) -> None:
 
     ``rewarded``: episodes with a reward, ``_last``: of the last 100; ``first_``: the step at the end of the first.
     ``ended``: executions that a positive prediction ended; ``near``: of the last ones so ended, those near the true
-    sub-goal.
+    sub-goal. ``last_died``: of the last executions those that ended in a death; ``on_floor``: of these on the skull's.
     """
     agents: list[list[object]] = []
     options: list[list[object]] = []
@@ -101,13 +102,18 @@ def gather_agents(folder: Path, out: Path) -> None:
             continue
         choices = Choices.read(place / Choices.FILE)
         ends = Exploits.read(place / Exploits.FILE) if (place / Exploits.FILE).exists() else None  # true sub-goals
+        stops = Executions.read(place / Executions.FILE) if (place / Executions.FILE).exists() else None
         for option in sorted(set(choices.option.tolist())):
             goal, member = divmod(option, config["members"])
             own = choices.option == option
             sums = [int(values[own].sum()) for values in (choices.chosen, choices.reached, choices.duration)]
             of_last = ends.reached & (ends.option == option) if ends else np.zeros(0, np.bool_)
             near = [int(of_last.sum()), int((of_last & ends.near).sum())] if ends else ["", ""]
-            options.append([place.name, config["sub_goals"][goal], member, *sums, *near])
+            deaths: list[object] = ["", ""]
+            if stops:
+                last_of = stops.of(option)
+                deaths = [last_of.terminated.sum(), (last_of.terminated & (np.abs(last_of.y - FLOOR) <= ON)).sum()]
+            options.append([place.name, config["sub_goals"][goal], member, *sums, *near, *deaths])
     write_table(out, AGENTS, agents)
     write_table(out.with_name(f"{out.stem}-options.csv"), CHOSEN, options)
 
