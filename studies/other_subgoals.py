@@ -4,7 +4,8 @@
 
 A cell is a sub-goal, a method and a seed, trained and scored as in ``studies.ladders``. ``--tables`` draws them.
 ``--options FOLDER`` learns options in room 1 there, stage by stage, and writes how their last executions ended.
-``--agents FOLDER`` writes what the agents there got, and beside it (``-options.csv``) where their options ended.
+``--agents FOLDER`` writes what the agents there got, and beside it (``-options.csv``) where their options ended;
+``--play FOLDER`` where the agents themselves end, who play a hundred episodes without learning.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from hypogoal.cli import main as main_of
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.files import write_table
 from hypogoal.learners.episodes import LAST
+from hypogoal.meta.episodes import agent_of
 from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 from studies import ladders
 from studies.cells import Row, interval, parser_of, read_rows, run_cells, table
@@ -76,8 +79,7 @@ def learn_options(folder: Path, out: Path, steps: int, terminations: Sequence[st
 
 
 AGENTS = ("agent", "steps", "episodes", "rewarded", "first_rewarded", "rewarded_last", "length_last", "rooms")
-CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_ended", "near", "last_died", "on_floor")
-FLOOR, ON = 148, 20  # y where room 1's skull rolls, and how far from it a death counts as on its floor
+CHOSEN = ("agent", "sub_goal", "member", "chosen", "ended", "duration", "last_ended", "near")
 
 
 def gather_agents(folder: Path, out: Path) -> None:
@@ -85,7 +87,7 @@ def gather_agents(folder: Path, out: Path) -> None:
 
     ``rewarded``: episodes with a reward, ``_last``: of the last 100; ``first_``: the step at the end of the first.
     ``ended``: executions that a positive prediction ended; ``near``: of the last ones so ended, those near the true
-    sub-goal. ``last_died``: of the last executions those that ended in a death; ``on_floor``: of these on the skull's.
+    sub-goal.
     """
     agents: list[list[object]] = []
     options: list[list[object]] = []
@@ -102,20 +104,34 @@ def gather_agents(folder: Path, out: Path) -> None:
             continue
         choices = Choices.read(place / Choices.FILE)
         ends = Exploits.read(place / Exploits.FILE) if (place / Exploits.FILE).exists() else None  # true sub-goals
-        stops = Executions.read(place / Executions.FILE) if (place / Executions.FILE).exists() else None
         for option in sorted(set(choices.option.tolist())):
             goal, member = divmod(option, config["members"])
             own = choices.option == option
             sums = [int(values[own].sum()) for values in (choices.chosen, choices.reached, choices.duration)]
             of_last = ends.reached & (ends.option == option) if ends else np.zeros(0, np.bool_)
             near = [int(of_last.sum()), int((of_last & ends.near).sum())] if ends else ["", ""]
-            deaths: list[object] = ["", ""]
-            if stops:
-                last_of = stops.of(option)
-                deaths = [last_of.terminated.sum(), (last_of.terminated & (np.abs(last_of.y - FLOOR) <= ON)).sum()]
-            options.append([place.name, config["sub_goals"][goal], member, *sums, *near, *deaths])
+            options.append([place.name, config["sub_goals"][goal], member, *sums, *near])
     write_table(out, AGENTS, agents)
     write_table(out.with_name(f"{out.stem}-options.csv"), CHOSEN, options)
+
+
+ENDED = ("agent", "episode", "length", "reward", "died", "room", "x", "y", "sub_goal")
+
+
+def play_agents(folder: Path, out: Path, episodes: int = LAST) -> None:
+    """The agents in a folder, without learning: a row an episode, where it ended and which sub-goal's option ran."""
+    rows: list[list[object]] = []
+    for place in sorted(path.parent for path in folder.glob("*/meta.safetensors")):
+        artefact = open_artefact(place, "meta")
+        goals, members = artefact.config["sub_goals"], artefact.config["members"]
+        loop = agent_of(artefact, artefact.seed)
+        while len(loop.recorder.episodes) < episodes:
+            before = len(loop.recorder.episodes)
+            moved = loop.advance(learning=False)
+            for _, length, reward, died, _ in loop.recorder.episodes[before:]:
+                where, goal = loop.engine.positions(moved.next_ids)[0], goals[moved.options[0] // members]
+                rows.append([place.name, before, length, f"{reward:g}", died, *where, goal])
+    write_table(out, ENDED, rows)
 
 
 def stage(name: str, given: str, *, out: Path, settings: list[str]) -> None:
@@ -163,6 +179,7 @@ def main() -> None:
     parser.add_argument("--options", type=Path, help="a folder: learn options there instead")
     parser.add_argument("--steps", type=int, default=8_000, help="of each option")
     parser.add_argument("--agents", type=Path, help="a folder: gather its agents instead")
+    parser.add_argument("--play", type=Path, help="a folder: play its agents instead")
     parser.add_argument("--terminations", default="oracle,learned", help="comma-separated")
     arguments = parser.parse_args()
     if arguments.tables:
@@ -173,6 +190,9 @@ def main() -> None:
         return
     if arguments.agents:
         gather_agents(arguments.agents, arguments.csv)
+        return
+    if arguments.play:
+        play_agents(arguments.play, arguments.csv)
         return
     jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
         (sub_goal, method, str(seed)): partial(run_cell, sub_goal, method, seed)

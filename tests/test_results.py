@@ -230,14 +230,11 @@ def test_agents_of_a_game_are_gathered_a_row_each(tmp_path: Path) -> None:
     (place / "choices.csv").write_text("\n".join(["step,option,offered,chosen,expected,reached,duration", *chosen]))
     ends = ["8,3,1,1,1.5,-2", "9,3,1,0,1.5,-2", "9,3,0,1,1.5,-2", "9,0,1,0,1.5,-2"]
     (place / "exploits.csv").write_text("\n".join(["step,option,reached,near,best_near,best_far", *ends]))
-    columns = "step,option,duration,reached,inside_at_start,terminated,room,x,y,distance"
-    stops = ["8,3,1,0,0,1,1,50,148,9", "9,3,1,0,0,1,1,50,169,9", "9,3,1,0,0,0,1,50,148,9"]  # dies twice, once above it
-    (place / "executions.csv").write_text("\n".join([columns, *stops]))
     other_subgoals.gather_agents(tmp_path / "game", tmp_path / "agents.csv")
     lengths = np.mean([step % 7 for step in range(21, 121)])
     assert (tmp_path / "agents.csv").read_text().splitlines()[1:] == [f"meta,900,120,2,5,1,{lengths:.1f},1 2"]
     options = (tmp_path / "agents-options.csv").read_text().splitlines()[1:]
-    assert options == ["meta,up,0,3,1,30,1,0,0,0", "meta,down,1,3,2,30,2,1,2,1"]
+    assert options == ["meta,up,0,3,1,30,1,0", "meta,down,1,3,2,30,2,1"]
 
 
 def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
