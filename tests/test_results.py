@@ -15,12 +15,14 @@ from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 from hypogoal.learners.episodes import EpisodeRecorder
 from studies import (
+    attention,
     bandits,
     choosing,
     distilled,
     distilled_agents,
     figure6,
     finished,
+    game_agents,
     hypotheses,
     initiation,
     labels,
@@ -45,6 +47,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
     "distilled": distilled.tables,
     "distilled-agents": distilled_agents.tables,
+    "figure2-ladders": attention.tables,
     "figure3-ladders": ladders.tables,
     "figure4-ladders": ladder_options.tables,
     "figure5-ladders": ladder_stops.tables,
@@ -58,6 +61,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "late-subgoals": late_subgoals.tables,
     "many-layouts": many_layouts.tables,
     "other-subgoals": other_subgoals.tables,
+    "montezuma-agents": game_agents.tables,
     "options-that-hold": ladder_options.tables_that_hold,
     "precision": precision.tables,
     "preference-doorkey": choosing.tables,
@@ -230,7 +234,7 @@ def test_agents_of_a_game_are_gathered_a_row_each(tmp_path: Path) -> None:
     (place / "choices.csv").write_text("\n".join(["step,option,offered,chosen,expected,reached,duration", *chosen]))
     ends = ["8,3,1,1,1.5,-2", "9,3,1,0,1.5,-2", "9,3,0,1,1.5,-2", "9,0,1,0,1.5,-2"]
     (place / "exploits.csv").write_text("\n".join(["step,option,reached,near,best_near,best_far", *ends]))
-    other_subgoals.gather_agents(tmp_path / "game", tmp_path / "agents.csv")
+    game_agents.gather(tmp_path / "game", tmp_path / "agents.csv")
     lengths = np.mean([step % 7 for step in range(21, 121)])
     assert (tmp_path / "agents.csv").read_text().splitlines()[1:] == [f"meta,900,120,2,5,1,{lengths:.1f},1 2"]
     options = (tmp_path / "agents-options.csv").read_text().splitlines()[1:]

@@ -24,7 +24,7 @@ from hypogoal.options.tables import Executions
 from hypogoal.stages.train_baseline import train_baseline
 from hypogoal.stages.train_options import train_options
 from studies.cells import read_rows
-from studies.other_subgoals import play_agents
+from studies.game_agents import play
 
 BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "environments": 4, "warm_up": 60}
 
@@ -194,7 +194,7 @@ def test_where_agents_of_a_game_end_is_kept(tmp_path: Path) -> None:
     few = ("start=game", "termination=oracle", "steps=240", "environments=2", "warm_up=60", "max_episode_steps=30")
     settings = [word for setting in few for word in ("--set", setting)]
     assert main(["train-meta", str(ensemble), "--out", str(tmp_path / "game" / "agent"), "-q", *settings]) == 0
-    play_agents(tmp_path / "game", tmp_path / "ends.csv", episodes=3)
+    play(tmp_path / "game", tmp_path / "ends.csv", episodes=3)
     rows = read_rows(tmp_path / "ends.csv")
     assert [row["agent"] for row in rows] == ["agent"] * 3 and [row["episode"] for row in rows] == ["0", "1", "2"]
     for row in rows:
