@@ -17,8 +17,10 @@ import numpy as np
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.files import write_table
+from hypogoal.core.seeding import rng_for
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
+from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.tables import Choices, Episodes, Exploits
 from studies.cells import parser_of, printed, read_rows, table
 
@@ -62,19 +64,24 @@ def gather(folder: Path, out: Path) -> None:
 ENDED = ("agent", "episode", "length", "reward", "died", "room", "x", "y", "sub_goal")
 
 
-def play(folder: Path, out: Path, episodes: int = LAST) -> None:
-    """The agents in a folder, without learning: a row an episode, where it ended and which sub-goal's option ran."""
+def play(folder: Path, out: Path, episodes: int = LAST, *, uniform: bool = False) -> None:
+    """The agents in a folder, without learning: a row an episode, where it ended and which sub-goal's option ran.
+
+    ``uniform``: uniform-random choice among their options instead.
+    """
     rows: list[list[object]] = []
     for place in sorted(path.parent for path in folder.glob("*/meta.safetensors")):
         artefact = open_artefact(place, "meta")
         goals, members = artefact.config["sub_goals"], artefact.config["members"]
-        loop = agent_of(artefact, artefact.seed)
+        loop, name = agent_of(artefact, artefact.seed), place.name
+        if uniform:
+            loop.chooser, name = RandomChooser(rng_for(artefact.seed, "uniform-choice")), f"{name}, uniform"
         while len(loop.recorder.episodes) < episodes:
             before = len(loop.recorder.episodes)
             moved = loop.advance(learning=False)
             for _, length, reward, died, _ in loop.recorder.episodes[before:]:
                 where, goal = loop.engine.positions(moved.next_ids)[0], goals[moved.options[0] // members]
-                rows.append([place.name, before, length, f"{reward:g}", died, *where, goal])
+                rows.append([name, before, length, f"{reward:g}", died, *where, goal])
     write_table(out, ENDED, rows)
 
 
@@ -89,13 +96,14 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--gather", type=Path, help="a folder with artefacts of agents")
     parser.add_argument("--play", type=Path, help="the same: play those over options")
+    parser.add_argument("--uniform", action="store_true", help="with --play: uniform-random choice among their options")
     arguments = parser.parse_args()
     if printed(arguments, tables):
         return
     if arguments.gather:
         gather(arguments.gather, arguments.csv)
     if arguments.play:
-        play(arguments.play, arguments.csv)
+        play(arguments.play, arguments.csv, uniform=arguments.uniform)
 
 
 if __name__ == "__main__":
