@@ -201,3 +201,5 @@ def test_where_agents_of_a_game_end_is_kept(tmp_path: Path) -> None:
         assert (int(row["length"]) == 30) >= (row["died"] == "0") and int(row["length"]) <= 30
         assert (row["room"], row["sub_goal"], row["reward"]) == ("1", "climb-down-ladder", "0")
         assert 0 <= int(row["x"]) < 256 and 140 <= int(row["y"]) <= 256
+    play(tmp_path / "game", tmp_path / "uniform.csv", episodes=2, uniform=True)
+    assert [row["agent"] for row in read_rows(tmp_path / "uniform.csv")] == ["agent, uniform"] * 2
