@@ -4,8 +4,7 @@
 
 The plain loop is the formulation of the authors' public code, written anew: each member by itself, float32 NCHW,
 labelled and unlabelled states in two passes, the disagreement of each ordered pair, Adam for each member. Both train
-the paper's networks on the same real states, 64 labelled and 64 unlabelled a step; Montezuma's also with
-``precision=bf16`` where the processor has it.
+the paper's networks on the same real states, 64 labelled and 64 unlabelled a step.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,7 @@ import torch  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
 from hypogoal.core.checkpoints import Checkpoints  # noqa: E402
-from hypogoal.core.compute import has_bf16, prepare  # noqa: E402
+from hypogoal.core.compute import prepare  # noqa: E402
 from hypogoal.core.config import resolve  # noqa: E402
 from hypogoal.dataset import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
@@ -39,7 +37,7 @@ from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
 from hypogoal.hypotheses.training import fit  # noqa: E402
 
-WANTED = {"doorkey": {"hypogoal": 4.0}, "montezuma": {"hypogoal": 2.5, "precision=bf16": 3.8}}
+WANTED = {"doorkey": {"hypogoal": 4.0}, "montezuma": {"hypogoal": 2.5}}
 SUB_GOAL = {"doorkey": "open-red-door", "montezuma": "climb-down-ladder"}
 COLLECT = {
     "doorkey": ("heldout_layouts=1",),
@@ -131,8 +129,6 @@ def compared(split: States, unlabelled: np.ndarray, domain: str, members: int, s
         "plain loop": lambda: plain(split, unlabelled, config, steps),
         "hypogoal": lambda: ours(split, unlabelled, config),
     }
-    if domain == "montezuma" and has_bf16():
-        candidates["precision=bf16"] = lambda: ours(split, unlabelled, replace(config, precision="bf16"))
     return timing.rows_of(timing.alternated(candidates, repeats), "plain loop", WANTED[domain])
 
 

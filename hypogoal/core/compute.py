@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
 
 
 DEVICES = ("auto", "cpu", "cuda")
-BF16 = "avx512_bf16"  # the instructions without which bfloat16 is slower than float32, as Linux names them
 
 
 def prepare(device: str = "auto") -> str:
@@ -41,18 +39,6 @@ def check_name(device: str) -> None:
     """Refuse (``UserError``) an unknown device; whether this machine has it is not checked."""
     if device not in DEVICES:
         raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
-
-
-def has_bf16() -> bool:
-    """Whether this processor multiplies in bfloat16."""
-    info = Path("/proc/cpuinfo")
-    return info.exists() and BF16 in info.read_text(encoding="utf-8").split()
-
-
-def require_bf16(device: str) -> None:
-    """Refuse (``UserError``) ``precision=bf16`` anywhere but on a CPU that multiplies in it."""
-    if device != "cpu" or not has_bf16():
-        raise UserError(f"bf16 needs a CPU with {BF16}", f"precision=bf16, device {device}", "Leave precision out.")
 
 
 def tensor(values: NDArray[Any], device: torch.device) -> Tensor:

@@ -247,7 +247,7 @@ def _forward(
         return patches.forward(network, values, counted)
     for layer in network:
         if norms := _norms(layer):
-            groups = zip(values.float().split(list(sizes)), counted or [True] * len(sizes), strict=True)
+            groups = zip(values.split(list(sizes)), counted or [True] * len(sizes), strict=True)
             normed = [layer(group) if counts else _uncounted(layer, norms, group) for group, counts in groups]
         values = torch.cat(normed) if norms else layer(values)
     return values

@@ -79,13 +79,6 @@ class EnsembleConfig:
         low=2,
         high=65536,
     )
-    precision: str = setting(
-        "float32",
-        "numbers in a training step's products: float32, or bf16, faster with large networks on a CPU that has "
-        "avx512_bf16; weights, BatchNorm, losses and predictions are float32 in any case",
-        source=f"{BEYOND}: docs/results/precision.md",
-        choices=("float32", "bf16"),
-    )
     class_weight_negative: float = setting(0.5, "weight of negatives in the cross entropy", source="Table 3", low=1e-6)
     class_weight_positive: float = setting(0.5, "weight of positives in the cross entropy", source="Table 3", low=1e-6)
     class_balance: str = fixed("batch")  # a setting up to 0.15; with "none" go-to-goal falls to .63 (DEV-13)

@@ -272,19 +272,17 @@ def _batch_norm(
     groups = zip(
         rows.split([share.shape[1] for share in shares]), shares, places, counted or [True] * len(shares), strict=True
     )
-    with torch.autocast("cpu", enabled=False):
-        of_groups = [normed(layer, part, share.matmul, count, counts) for part, share, count, counts in groups]
+    of_groups = [normed(layer, part, share.matmul, count, counts) for part, share, count, counts in groups]
     return of_groups[0] if len(of_groups) == 1 else torch.cat(of_groups)
 
 
 def normed(
     layer: nn.BatchNorm2d, rows: Tensor, average: Callable[[Tensor], Tensor], places: int, counted: bool = True
 ) -> Tensor:
-    """BatchNorm in training mode of rows (U, C), never in less than float32; ``average`` is over so many places.
+    """BatchNorm in training mode of rows (U, C); ``average`` is over so many places.
 
     The layer's running statistics include them where they are ``counted``.
     """
-    rows = rows.float() if rows.dtype == torch.bfloat16 else rows
     mean = average(rows)
     centred = rows - mean
     variance = average(centred.square())

@@ -14,12 +14,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.checkpoints import Checkpoints, Resumable, State
-from hypogoal.core.compute import require_bf16
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.dataset import Observations
 from hypogoal.diversity import Context, load_objective
-from hypogoal.hypotheses.batches import Outputs, TrainingStates
+from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.proposals import Search
@@ -93,8 +92,6 @@ def fit(
     if config.schedule == "sequential" and config.encoder == "shared":
         fault = "members one after the other cannot share an encoder that learns"
         raise UserError(fault, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")
-    if config.precision == "bf16":
-        require_bf16(str(device))
     checkpoints = checkpoints or Checkpoints(None)
     saved, watcher = checkpoints.load(), watcher or Watcher()
     view = view_of(observations, unlabelled, config, seed_for(seed, "localiser"), origins, fitted=saved is None)
@@ -213,7 +210,6 @@ class Round(Resumable):
         # Two generators, since methods differ in their use of the second.
         self.changes = [rng_for(seed, "changes", group) for group in ("labelled", "unlabelled")]
         torch.manual_seed(seed_for(seed, "layers"))
-        self._precision = torch.autocast("cpu", torch.bfloat16, enabled=config.precision == "bf16")
         self.done = 0
         self.losses: list[Tensor] = []  # of the steps since the last check: each member's, then those of diversity
 
@@ -254,12 +250,11 @@ class Round(Resumable):
         diversity_losses = torch.zeros(0, device=states.device)
         if self.objective is not None or self.taught is not None:
             counted = (True, config.unlabelled_bn)
-            outputs = self._forward(labelled, unlabelled, counted=counted, changes=self.changes)
+            outputs = states.forward(self.networks, labelled, unlabelled, counted=counted, changes=self.changes)
         else:
-            outputs = self._forward(labelled, changes=self.changes[:1])
+            outputs = states.forward(self.networks, labelled, changes=self.changes[:1])
             if config.unlabelled_bn and len(unlabelled):
-                with self._precision:
-                    states.count_in(self.networks, unlabelled, self.changes[1])
+                states.count_in(self.networks, unlabelled, self.changes[1])
         losses = torch.stack(
             [functional.cross_entropy(logits, targets, self.class_weights) for logits, *_ in outputs[0]]
         )
@@ -283,12 +278,6 @@ class Round(Resumable):
             errors = functional.cross_entropy(answers, (scores > 0).long(), reduction="none")
             losses = losses + (errors * scores.abs().clamp(max=1.0)).mean(1)
         return losses, diversity_losses
-
-    def _forward(self, *groups: NDArray[np.int64], **more: Any) -> Outputs:
-        """The networks' outputs in this training's precision, as float32."""
-        with self._precision:
-            outputs = self.states.forward(self.networks, *groups, **more)
-        return Outputs(*([[rows.float() for rows in group] for group in each] for each in outputs))
 
     def _require_finite_losses(self) -> None:
         device = self.losses[-1].device  # losses from a checkpoint are on the CPU

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of
-from hypogoal.core.compute import prepare, require_bf16
+from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_end
@@ -57,8 +57,6 @@ def train_ensemble(
     unusable data, or an ``out`` that exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
     """
     device = prepare(device)
-    if config.precision == "bf16":
-        require_bf16(device)
     load_objective(config.diversity)
     agreements(config)
     dataset = open_dataset(data)

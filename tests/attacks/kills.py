@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
-from hypogoal.core.compute import has_bf16
 from hypogoal.core.drafts import draft_folder
 
 PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
@@ -64,11 +63,6 @@ _ALL = (
     Stage(
         "sequential",
         ("train-ensemble", "{data}", *_set("steps=6", "workers=2", "members=2", "schedule=sequential", GOALS)),
-        ("data",),
-    ),
-    Stage(
-        "bf16",
-        ("train-ensemble", "{data}", *_set("steps=12", "workers=1", "members=2", "precision=bf16", GOALS)),
         ("data",),
     ),
     Stage(
@@ -121,7 +115,7 @@ _ALL = (
     Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),
     Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=1600", *QUICK[1:]))),
 )
-STAGES = {stage.name: stage for stage in _ALL if stage.name != "bf16" or has_bf16()}
+STAGES = {stage.name: stage for stage in _ALL}
 
 
 @dataclass

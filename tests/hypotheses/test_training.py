@@ -12,12 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import cross_entropy
 
-from hypogoal.core import compute
 from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import seed_for, torch_generator
 from hypogoal.diversity import OBJECTIVES, Objective, dbat
-from hypogoal.hypotheses import batches, patches, training
+from hypogoal.hypotheses import batches, training
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -543,39 +542,3 @@ def test_data_that_cannot_be_learned_from_are_one_clear_line() -> None:
         fit(observations, labels[:5], unlabelled, TOY, seed=0)
     with pytest.raises(UserError, match="unknown diversity objective: spread"):
         fit(observations, labels, unlabelled, dataclasses.replace(TOY, diversity="spread"), seed=0)
-
-
-WITH_BF16 = pytest.mark.skipif(not compute.has_bf16(), reason="needs a CPU with avx512_bf16")
-
-
-@WITH_BF16
-@pytest.mark.parametrize("tables", [True, False])
-@pytest.mark.parametrize("diversity", ["dbat", "none"])
-def test_bf16_learns_what_float32_learns(tables: bool, diversity: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond the paper: the first steps' losses to a hundredth, predictions to .03; all that is kept is float32."""
-    if not tables:
-        monkeypatch.setattr(patches, "WORTHWHILE", 0.0)
-    observations, labels, unlabelled = toy()
-    losses: dict[str, list[float]] = {}
-    predictions = {}
-    for precision in ("float32", "bf16"):
-        config = dataclasses.replace(TOY, steps=10, precision=precision, diversity=diversity, learning_rate=1e-4)
-        seen = losses.setdefault(precision, [])
-        watcher = Watcher(lambda _, numbers, seen=seen: seen.append(numbers["loss"]))  # type: ignore[misc]
-        ensemble = fit(observations, labels, unlabelled, config, 1, watcher)
-        predictions[precision] = ensemble.predict(unlabelled)
-        assert {value.dtype for value in ensemble.state().values()} == {torch.float32, torch.int64}
-    assert losses["bf16"] != losses["float32"]
-    np.testing.assert_allclose(losses["bf16"], losses["float32"], rtol=0.02)
-    np.testing.assert_allclose(predictions["bf16"], predictions["float32"], atol=0.03)
-
-
-def test_bf16_is_refused_where_the_processor_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a line, on a GPU too."""
-    observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, precision="bf16")
-    with pytest.raises(UserError, match="bf16 needs a CPU with avx512_bf16"):
-        fit(observations, labels, unlabelled, config, 1, device="cuda")
-    monkeypatch.setattr(compute, "BF16", "avx1024_bf16")
-    with pytest.raises(UserError, match="bf16 needs a CPU with avx1024_bf16"):
-        fit(observations, labels, unlabelled, config, 1)
