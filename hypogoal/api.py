@@ -1,7 +1,8 @@
 """The Python interface: run stages, load what was trained, predict, play options as actions of an environment.
 
 The functions of the stages do what their commands do. ``arguments`` takes a command's options, ``preset``, ``seed``,
-``device``, ``force``, ``resume`` and ``quiet``, and any setting by name. What would end a command is a ``UserError``.
+``device``, ``force``, ``resume``, ``quiet`` and, in training, ``tensorboard``, and any setting by name. What would end
+a command is a ``UserError``.
 """
 
 import contextlib
@@ -31,7 +32,7 @@ from hypogoal.options.termination import rule_of
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "load_ensemble", "load_options"]
 Place = str | os.PathLike[str]
-OPTIONS = ("preset", "seed", "device", "force", "resume", "quiet")  # arguments that are no settings
+OPTIONS = ("preset", "seed", "device", "force", "resume", "quiet", "tensorboard")  # arguments that are no settings
 
 
 class Made:

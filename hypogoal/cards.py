@@ -64,12 +64,25 @@ class Training:
 
 @contextlib.contextmanager
 def training(
-    stage: str, out: Path, needs: Needs, *, steps: int, quiet: bool, resume: bool, **artefact: Any
+    stage: str,
+    out: Path,
+    needs: Needs,
+    *,
+    steps: int,
+    quiet: bool,
+    resume: bool,
+    tensorboard: Path | None = None,
+    **artefact: Any,
 ) -> Iterator[Training]:
     """Refuse what does not fit on this machine, then open the artefact; train and fill it in the block.
 
-    ``artefact``: see :func:`hypogoal.core.artefacts.create_artefact`.
+    ``tensorboard``: see :class:`hypogoal.core.progress.MetricsLog`; ``artefact``: see
+    :func:`hypogoal.core.artefacts.create_artefact`.
     """
     preflight(stage, out, needs, resume=resume, quiet=quiet)
-    with create_artefact(out, resume=resume, **artefact) as folder, Progress(stage, steps, quiet=quiet) as progress:
-        yield Training(folder, MetricsLog(folder / LOG), progress, checkpoints_of(folder))
+    with (
+        create_artefact(out, resume=resume, **artefact) as folder,
+        contextlib.closing(MetricsLog(folder / LOG, tensorboard)) as log,
+        Progress(stage, steps, quiet=quiet) as progress,
+    ):
+        yield Training(folder, log, progress, checkpoints_of(folder))

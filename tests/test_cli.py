@@ -161,15 +161,18 @@ def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytes
 
 
 def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:
-    """Same seed, same machine, same bytes: every stage."""
+    """Same seed, same machine, same bytes: every stage, whether TensorBoard gets the logs or not."""
     assert main(["collect", "doorkey", "--out", str(tmp_path / "data.h5"), *SMALL, "-q"]) == 0
-    arguments = ["--set", "steps=4", "--set", "workers=2", "-q"]
+    arguments = ["--set", "steps=4", "--set", "workers=2", "-q", "--tensorboard", str(tmp_path / "boards")]
     assert main(["train-ensemble", str(made / "data.h5"), "--out", str(tmp_path / "ensemble"), *arguments]) == 0
     meta = f"train-meta {made}/ensemble --options {made}/options --out {tmp_path}/meta --set steps=800 -q"
+    meta += f" --tensorboard {tmp_path}/boards/meta"
     assert main([*meta.split(), "--set", "decisions=32", *QUICK]) == 0
     files = ("meta.safetensors", "options.safetensors", "episodes.csv", "choices.csv", "metrics.jsonl")
     for name in ("ensemble/open-red-door.safetensors", "ensemble/metrics.jsonl", *(f"meta/{file}" for file in files)):
         assert (made / name).read_bytes() == (tmp_path / name).read_bytes(), name
+    for name in ("open-red-door", "meta"):
+        assert any((tmp_path / "boards" / name).iterdir()), name
 
 
 @pytest.fixture(scope="module")

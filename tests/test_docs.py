@@ -105,7 +105,7 @@ def test_the_tutorial_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         short = [part for pair in SHORT.get(words[1], ()) for part in ("--set", pair)]
         assert main([*words[1:], *short]) == 0, words
         ran.add(words[1])
-    assert {*SHORT, "evaluate", "report", "watch", "show", "run"} <= ran
+    assert {*SHORT, "evaluate", "report", "show", "run"} <= ran
     assert (tmp_path / "runs/tutorial/report/index.html").is_file()
     for block in blocks(ROOT / "README.md", "python"):
         exec(compile(block.replace("runs/demo", "runs/tutorial"), "README.md", "exec"), {})

@@ -281,12 +281,11 @@ def test_what_may_not_be_read_is_no_matter_of_the_output(
 def test_nothing_depends_on_the_clock() -> None:
     """Spec G1: no decision reads the time of day or when a file was changed; durations are of the monotonic clock.
 
-    Shown to a person it may be: ``live_view`` says how long ago a log was written, a sweep's ``status`` for how long a
-    cell has run (``records`` has when it began). ``slurm`` and ``status`` ask whether a checkpoint or an output is
-    another one than before.
+    Shown to a person it may be: a sweep's ``status`` says for how long a cell has run (``records`` has when it began).
+    ``slurm`` and ``status`` ask whether a checkpoint or an output is another one than before.
     """
     every = sorted(Path(hypogoal.__file__).parent.rglob("*.py"))
-    known = ("live_view.py", "status.py", "records.py", "slurm.py")
+    known = ("status.py", "records.py", "slurm.py")
     sources = [path for path in every if path.name not in known]
     told = re.compile(r"\btime\.time\(|\bdatetime\b|st_[mca]time|get[mca]time")
     assert len(sources) > 50

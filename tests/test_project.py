@@ -352,7 +352,7 @@ def test_one_way_to_print_and_one_to_open() -> None:
     own = {
         "cards.py", "core/compute.py", "core/config.py", "core/drafts.py", "core/files.py", "core/locks.py",
         "core/preflight.py", "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/records.py",
-        "hypotheses/load.py", "live_view.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
+        "hypotheses/load.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
         "own_data/videos.py", "stages/export_ensemble.py", "stages/train_ensemble.py",
     }  # fmt: skip
     found = set()

@@ -192,7 +192,7 @@ def test_a_log_of_an_artefact_holds_anything(tmp_path: Path, capsys: pytest.Capt
         (folder / "metrics.jsonl").write_text(f'{text}\n{{"step": 3, "sub_goal": "one", "loss": 0.5}}\n')
     words = ("train-ensemble", "x.h5", "--out", str(out))
     write_plan(run, Plan("mine", [Cell("ensemble", words, out)], 1))
-    for command in (["watch", run, "--once"], ["show", run], ["sweep", "--out", run, "--gather"]):
+    for command in (["show", run], ["sweep", "--out", run, "--gather"]):
         code = main([str(word) for word in command])
         lines = capsys.readouterr().err.splitlines()
         assert code == 0 or (code == 2 and len(lines) == 1 and "an artefact is damaged" in lines[0]), lines

@@ -117,6 +117,8 @@ Force = Annotated[bool, Option("--force", help="Replace what is at --out.")]
 Resume = Annotated[bool, Option("--resume", help="Continue an unfinished output; keep a complete one.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Show no progress.")]
 Device = Annotated[str, Option("--device", help="Where to train: auto (the CPU), cpu or cuda.")]
+BOARD = "Also write the log for TensorBoard into this folder (pip install 'hypogoal[tensorboard]')."
+Tensorboard = Annotated[Path | None, Option("--tensorboard", metavar="DIR", help=BOARD)]
 AsJson = Annotated[bool, Option("--json", help="Machine-readable output.")]
 
 

@@ -1,4 +1,4 @@
-"""The commands that only look: ``show``, ``verify``, ``watch``, ``config``."""
+"""The commands that only look: ``show``, ``verify``, ``status``, ``config``."""
 
 import itertools
 import json
@@ -73,19 +73,6 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: cli.AsJson =
     states = states_of(path) if not making or is_made(path) else []
     details = [{"path": str(each.path), "reasons": each.reasons, "command": each.command} for each in states]
     cli.echo(details, as_json, [*making, *(lines(states) if states else [])])
-
-
-@cli.command(cli.LOOK, "watch runs/mine")
-def watch(
-    run: Annotated[Path, Argument(help="A run, finished or not.")],
-    once: Annotated[bool, Option("--once", help="Print it once instead of following it.")] = False,
-    tensorboard: Annotated[Path | None, Option(help="Write logs for TensorBoard (an extra) to this folder.")] = None,
-) -> None:
-    """Follow a run: steps, success or loss so far. Ctrl-C ends it."""
-    from hypogoal.live_view import Boards
-    from hypogoal.live_view import watch as look
-
-    look(run, once=once, boards=Boards(tensorboard) if tensorboard else None)
 
 
 @cli.command(cli.LOOK, "config train-ensemble --domain montezuma")

@@ -32,12 +32,14 @@ def train_ensemble(
     call: cli.StageCall,
     data: Annotated[Path, Argument(help="The HDF5 file that 'collect' wrote.")],
     unlabelled: Annotated[list[Path] | None, Option(help=f"Take unlabelled states from elsewhere: {VISITED}")] = None,
+    tensorboard: cli.Tensorboard = None,
 ) -> None:
     """Train diverse classifiers (members) of each sub-goal."""
     from hypogoal.domains.base import installed_domain
     from hypogoal.inspection import result_of
 
-    accuracies = [trained["heldout"] for trained in call.make(data, unlabelled=tuple(unlabelled or ()))]
+    trained = call.make(data, unlabelled=tuple(unlabelled or ()), tensorboard=tensorboard)
+    accuracies = [each["heldout"] for each in trained]
     installed = installed_domain(domain_of(data, "train-ensemble"))
     defaults = installed.defaults if installed else {}
     run, practised = call.out.parent, "train-options" in defaults or "train-meta" not in defaults
@@ -58,11 +60,12 @@ def train_options(
     call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
     options: Annotated[Path | None, Option(help="Continue these options, perhaps elsewhere.")] = None,
+    tensorboard: cli.Tensorboard = None,
 ) -> None:
     """Learn an option (a policy) for every member."""
     from hypogoal.stages.train_meta import FIXED
 
-    numbers = call.make(ensemble, options=options)
+    numbers = call.make(ensemble, options=options, tensorboard=tensorboard)
     domain = domain_of(ensemble, "train-options")
     config = call.config(domain)
     inherited = inherited_of("train-meta", call.out)
@@ -79,9 +82,11 @@ def train_meta(
     call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
     options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
+    tensorboard: cli.Tensorboard = None,
 ) -> None:
     """Learn from the reward which options to choose."""
-    call.end(call.make(ensemble, options=options), "evaluate", call.out.parent)
+    numbers = call.make(ensemble, options=options, tensorboard=tensorboard)
+    call.end(numbers, "evaluate", call.out.parent)
 
 
 @cli.stage(cli.MAKE, "train-baseline", "train-baseline doorkey --agent ppo --out runs/mine/ppo")
@@ -92,9 +97,11 @@ def train_baseline(
     ensemble: Annotated[
         Path | None, Option(help="Pay --set bonus=X for a member's first positive prediction in an episode.")
     ] = None,
+    tensorboard: cli.Tensorboard = None,
 ) -> None:
     """Train PPO or DQN on primitive actions, to compare."""
-    call.end(call.make(domain, data=data, ensemble=ensemble), "evaluate", call.out.parent)
+    numbers = call.make(domain, data=data, ensemble=ensemble, tensorboard=tensorboard)
+    call.end(numbers, "evaluate", call.out.parent)
 
 
 @cli.stage(cli.OWN, "audit", "audit ensemble --domain doorkey --sub-goal go-to-goal --out audit")

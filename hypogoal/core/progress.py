@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
+from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import printable, say, screen
 
 FIRST_SECONDS, PLAIN_INTERVAL_SECONDS = 2.0, 10.0  # until the first line, and between lines
@@ -143,16 +144,30 @@ def duration(seconds: float) -> str:
 
 
 class MetricsLog:
-    """``metrics.jsonl``: one JSON object per line; the file is not kept open."""
+    """``metrics.jsonl``: one JSON object per line; the file is not kept open.
 
-    def __init__(self, path: Path):
+    With a folder ``tensorboard``, which may exist, TensorBoard gets the numbers too; without the extra a ``UserError``.
+    """
+
+    def __init__(self, path: Path, tensorboard: Path | None = None):
         self._path = path
+        self._board = _board(tensorboard) if tensorboard else None
         path.touch()
 
-    def write(self, **numbers: Any) -> None:
-        """Append one line."""
+    def write(self, **values: Any) -> None:
+        """Append one line, with a ``step`` among its values."""
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(numbers) + "\n")
+            file.write(json.dumps(values) + "\n")
+        if self._board is None:
+            return
+        for name, value in values.items():
+            if name != "step" and isinstance(value, int | float):
+                self._board.add_scalar(name, value, values["step"])
+
+    def close(self) -> None:
+        """Write what TensorBoard has not got yet."""
+        if self._board is not None:
+            self._board.close()
 
     def snapshot(self) -> int:
         """Flush the file to disk and return its length in bytes."""
@@ -165,3 +180,13 @@ class MetricsLog:
         if not 0 <= snapshot <= self._path.stat().st_size:
             raise ValueError(f"the log has fewer bytes than {snapshot}")
         os.truncate(self._path, snapshot)
+
+
+def _board(folder: Path) -> Any:
+    """A writer of TensorBoard's files, torch's; a ``UserError`` if TensorBoard is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        do = "Install it: pip install 'hypogoal[tensorboard]'."
+        raise UserError("TensorBoard is not installed", folder, do) from None
+    return SummaryWriter(folder)

@@ -30,11 +30,13 @@ def train_baseline(
     resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
+    tensorboard: Path | None = None,
 ) -> dict[str, Any]:
     """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
 
     With ``data``, states of the domain, it plays in the world they are of; without, in that of the ``ensemble``, whose
     members' positive predictions earn the bonus; else in that of the domain's defaults.
+    ``tensorboard``, a folder, gets the numbers of the log.
     Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states or
     an ensemble of another domain, a bonus without an ensemble or the other way round, or an ``out`` that exists is a
     ``UserError``, NaN or Inf in a weight a ``NumericalError``.
@@ -84,7 +86,8 @@ def train_baseline(
     settings = as_dict(config) | {"domain": domain, "domain_config": world}
     settings |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
     artefact: dict[str, Any] = {"kind": "baseline", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    with training("train-baseline", out, needs, steps=config.steps, quiet=quiet, resume=resume, **artefact) as work:
+    how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
+    with training("train-baseline", out, needs, **how, **artefact) as work:
         bonus = None
         if taught:
             terminations = judged(engine, taught.path, taught.config, device)

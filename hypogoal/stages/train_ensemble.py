@@ -1,5 +1,6 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -49,12 +50,14 @@ def train_ensemble(
     resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
+    tensorboard: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Train the ensembles of every sub-goal of a data file and write the artefact ``out``.
 
     Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
-    of those of ``data``. Returns per sub-goal the last losses and :func:`heldout_accuracy`. An unknown sub-goal,
-    unusable data, or an ``out`` that exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
+    of those of ``data``. ``tensorboard``, a folder, gets the losses, each sub-goal's in a folder of its own. Returns
+    per sub-goal the last losses and :func:`heldout_accuracy`. An unknown sub-goal, unusable data, or an ``out`` that
+    exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
     """
     device = prepare(device)
     load_objective(config.diversity)
@@ -81,7 +84,10 @@ def train_ensemble(
     artefact: dict[str, Any] = {"kind": "ensemble", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     with training("train-ensemble", out, needs, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
         folder, parts = work.folder, work.folder.parent / FOLDER
-        jobs = [partial(_train_one, data, others, sub_goal, config, seed, folder, device) for sub_goal in sub_goals]
+        jobs = []
+        for sub_goal in sub_goals:
+            board = Path(tensorboard, sub_goal) if tensorboard else None
+            jobs.append(partial(_train_one, data, others, sub_goal, config, seed, folder, device, board))
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
         parts.mkdir(exist_ok=True)
         logs = [parts / f"{sub_goal}{SUFFIXES[LOG]}" for sub_goal in sub_goals]
@@ -188,7 +194,14 @@ class _Report(Watcher):
 
 
 def _train_one(
-    data: Path, others: Sequence[Path], sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path, device: str
+    data: Path,
+    others: Sequence[Path],
+    sub_goal: str,
+    config: TrainEnsembleConfig,
+    seed: int,
+    folder: Path,
+    device: str,
+    tensorboard: Path | None,
 ) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
@@ -197,7 +210,8 @@ def _train_one(
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
     parts = folder.parent / FOLDER
-    log, scores = (MetricsLog(parts / f"{sub_goal}{SUFFIXES[name]}") for name in (LOG, SCORES))
+    log = MetricsLog(parts / f"{sub_goal}{SUFFIXES[LOG]}", tensorboard)
+    scores = MetricsLog(parts / f"{sub_goal}{SUFFIXES[SCORES]}")
     if not checkpoints.saved:
         log.restore(0)
         scores.restore(0)
@@ -210,17 +224,18 @@ def _train_one(
 
     report = _Report(sub_goal, log, scores, look, {*range(0, steps, config.score_every or steps), steps})
     domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
-    ensemble = fit(
-        split.observations,
-        split.labels,
-        unlabelled,
-        config,
-        seed_for(seed, "ensemble", sub_goal),
-        report,
-        origins=StateOrigins(split.origins, origins, domain.agent_pixels if domain and domain.sees_agent else None),
-        device=device,
-        checkpoints=checkpoints,
-    )
+    with contextlib.closing(log):
+        ensemble = fit(
+            split.observations,
+            split.labels,
+            unlabelled,
+            config,
+            seed_for(seed, "ensemble", sub_goal),
+            report,
+            origins=StateOrigins(split.origins, origins, domain.agent_pixels if domain and domain.sees_agent else None),
+            device=device,
+            checkpoints=checkpoints,
+        )
     write_ensemble(folder, sub_goal, ensemble)
     return {"sub_goal": sub_goal, **report.numbers, HELDOUT: heldout_accuracy(ensemble, dataset, sub_goal)}
 

@@ -44,9 +44,11 @@ def train_meta(
     resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
+    tensorboard: Path | None = None,
 ) -> dict[str, Any]:
     """Train the meta-policy over an ensemble's options, or over these ``options``, and write the artefact ``out``.
 
+    ``tensorboard``, a folder, gets the numbers of the log.
     Returns steps, episodes, and success and length over the last 100 episodes.
     """
     device = prepare(device)
@@ -64,7 +66,8 @@ def train_meta(
     settings = description(domain, source.config, config, **steps_spent(practice))
     needs = play_needs(domain, source.config, config)
     artefact: dict[str, Any] = {"kind": "meta", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    with training("train-meta", out, needs, steps=config.steps, quiet=quiet, resume=resume, **artefact) as work:
+    how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
+    with training("train-meta", out, needs, **how, **artefact) as work:
         loop = assemble(domain, source.path, source.config, config, seed, device)
         recorder = loop.recorder
         if practice:

@@ -38,9 +38,11 @@ def train_options(
     resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
+    tensorboard: Path | None = None,
 ) -> dict[str, Any]:
     """Train the options of an ensemble artefact, or train ``options`` further, and write the artefact ``out``.
 
+    ``tensorboard``, a folder, gets the numbers of the log.
     Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
     begins an episode, instead of these two the shares of ``recorder.recent``. With ``until`` also ``ended``: by what.
     """
@@ -60,7 +62,8 @@ def train_options(
     settings = description(domain, source.config, config, steps=steps)
     needs = play_needs(domain, source.config, config)
     artefact: dict[str, Any] = {"kind": "options", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    with training("train-options", out, needs, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
+    how: dict[str, Any] = {"steps": steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
+    with training("train-options", out, needs, **how, **artefact) as work:
         loop = assemble(domain, source.path, source.config, config, seed, device)
         if practice:
             continue_with(loop, practice)

@@ -682,7 +682,6 @@ FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
     "signals": signals,
     "clock": clock,
     "surroundings": surroundings,
-    "boards": files(hostile.boards),
     "minari": files(hostile.minari),
     "images": files(hostile.images),
     "arrays": files(hostile.arrays),
@@ -693,7 +692,7 @@ FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
 }
 
 
-RUN_FREE = ("boards", "minari", "images", "arrays", "toml")  # families that need no run
+RUN_FREE = ("minari", "images", "arrays", "toml")  # families that need no run
 
 
 def attack(box: Box, name: str, cases: range, seed: int) -> dict[str, Any]:

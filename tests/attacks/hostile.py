@@ -488,73 +488,6 @@ def around(folder: Path, rng: Rng) -> dict[str, str]:
     return {"HOME": str(folder), **{name: places[name] for name in rng.sample([*places], rng.randrange(4))}}
 
 
-# TensorBoard.
-
-
-def log(place: Path, *lines: object, boards: str = "", up: bool = False) -> None:
-    """A log in a folder; ``up``: with a link to the folder above, ``boards``: where a link of this name leads."""
-    place.mkdir(parents=True, exist_ok=True)
-    (place / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    if up:
-        (place / "up").symlink_to("..")
-    if boards:
-        (place.parent / "boards").symlink_to(boards)
-
-
-def logs(folder: Path, count: int) -> None:
-    """So many of them."""
-    for number in range(count):
-        log(folder / str(number), {"step": 1, "loss": 1})
-
-
-def draft(folder: Path, name: str) -> None:
-    """An unfinished artefact with a name of its own choice."""
-    log(folder / f".{name}.partial" / "files", {"step": 1, "loss": 1})
-
-
-BOARDS: Makers = {
-    "a draft called ..": lambda f: draft(f, ".."),
-    "a draft called .": lambda f: draft(f, "."),
-    "a draft called ... in a folder": lambda f: draft(f / "a", ".."),
-    "keys that are no text": lambda f: log(f, {"step": 1, "\ud800": 2.0}),
-    "keys of control signs": lambda f: log(f, {"step": 1, "\x1b[2J": 2.0}),
-    "a key of a megabyte": lambda f: log(f, {"step": 1, "x" * 2**20: 2.0}),
-    "keys with slashes": lambda f: log(f, {"step": 1, "../../x": 2.0, "/etc/x": 1, "": 3}),
-    "numbers beyond floats": lambda f: log(f, {"step": 1, "loss": 10**400}, {"step": 2, "loss": 1e308}),
-    "steps beyond integers": lambda f: log(f, {"step": 2**63, "loss": 1}, {"step": 2**53 - 1, "loss": 1}),
-    "steps that go back": lambda f: log(f, *({"step": -number, "loss": 1} for number in range(100))),
-    "steps that are true": lambda f: log(f, {"step": True, "loss": True}),
-    "10,000 sub-goals": lambda f: log(f, *({"step": 1, "loss": 1, "sub_goal": f"g{n}"} for n in range(10_000))),
-    "sub-goals that climb": lambda f: log(f, {"step": 1, "sub_goal": "../x"}, {"step": 2, "sub_goal": ".."}),
-    "a sub-goal that is a list": lambda f: log(f, {"step": 1, "sub_goal": ["a"]}),
-    "a sub-goal of 200 signs": lambda f: log(f, {"step": 1, "sub_goal": "x" * 200}),
-    "names that are no UTF-8": lambda f: log(f / "\udcff", {"step": 1, "loss": 1}),
-    "names of markup": lambda f: log(f / "[bold red]x[/]", {"step": 1, "loss": 1}),
-    "1,000 artefacts": lambda f: logs(f, 1000),
-    "lines of other things": lambda f: log(f, {"step": 1, "a": [1], "b": {}, "c": None, "d": "x", "e": float("nan")}),
-    "a folder deep in folders": lambda f: log(f.joinpath(*"abcdefgh" * 20), {"step": 1, "loss": 1}),
-    "a link to the folder above": lambda f: log(f, {"step": 1, "loss": 1}, up=True),
-    "boards that are a link into nothing": lambda f: log(f, {"step": 1}, boards="none/x"),
-    "boards that are a link elsewhere": lambda f: log(f, {"step": 1, "loss": 1}, boards="../outside/new"),
-    "boards that are a link to themselves": lambda f: log(f, {"step": 1}, boards="boards"),
-}
-
-
-def boards(box: Any, rng: Rng, case: int) -> Made:
-    """A run whose logs go to TensorBoard."""
-    folder: Path = box.case / "run"
-    log(folder / "more", {"step": 1, "loss": 2.5, "success": 0.5}, {"step": 2, "loss": 1})
-    if case < len(BOARDS):
-        name, make = chosen(BOARDS, case)
-        make(folder)
-    else:
-        path = folder / "more" / "metrics.jsonl"
-        name, text = hostile_json(path.read_bytes(), rng, case - len(BOARDS))
-        path.write_bytes(text)
-    commands: list[list[object]] = [["watch", folder, "--once", "--tensorboard", box.case / "boards"]]
-    return Made(name, size_of(folder), commands, ("boards",))
-
-
 # HDF5.
 
 Change = Callable[[Any, str, Path], object]
@@ -899,7 +832,7 @@ def texts(box: Any, rng: Rng, case: int) -> Made:
             "layout": ("meta", "layout.json"),
         }[target]
         path = run / part / name
-        commands = [["verify", run / part], ["show", run / part], ["watch", run, "--once"], ["show", run]]
+        commands = [["verify", run / part], ["show", run / part], ["show", run]]
         if part == "evaluation":
             shutil.rmtree(run / "report")
             commands += [["report", run, "-q"]]
@@ -912,7 +845,6 @@ def texts(box: Any, rng: Rng, case: int) -> Made:
             ["sweep", "--out", run, "--status"],
             ["sweep", "--out", run, "--gather"],
             ["sweep", "--out", run, "--cancel"],
-            ["watch", run, "--once"],
         ]
     name, data = hostile_json(path.read_bytes(), rng, kind, most)
     path.write_bytes(data)

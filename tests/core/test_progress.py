@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import math
 import re
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from hypogoal.cli.common import print_outcome
 from hypogoal.core import progress
-from hypogoal.core.progress import Progress
+from hypogoal.core.errors import UserError
+from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.terminal import screen
 
 
@@ -85,3 +88,23 @@ def test_a_bar_has_a_pace_from_its_first_second(monkeypatch: pytest.MonkeyPatch)
     lines = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line).strip() for line in re.split(r"[\r\n]", drawn.getvalue())]
     last = next(line for line in reversed(lines) if line)
     assert len(last) <= 80 and "1234568/1500000" in last and "617,284/s" in last and "success 0.123" in last, last
+
+
+def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each number at its step, no text; the log's own lines are the same without it."""
+    loader = pytest.importorskip("tensorboard.backend.event_processing.event_file_loader")
+    plain, log = MetricsLog(tmp_path / "plain.jsonl"), MetricsLog(tmp_path / "log.jsonl", tmp_path / "board")
+    for each in (plain, log):
+        each.write(sub_goal="open-door", step=10, loss=0.5)
+        each.write(sub_goal="open-door", step=20, loss=0.25, episodes=3)
+        each.close()
+    assert (tmp_path / "log.jsonl").read_bytes() == (tmp_path / "plain.jsonl").read_bytes()
+    (file,) = (tmp_path / "board").iterdir()
+    found = []
+    for event in loader.EventFileLoader(str(file)).Load():
+        found += [(event.step, value.tag, value.tensor.float_val[0]) for value in event.summary.value]
+    assert found == [(10, "loss", 0.5), (20, "loss", 0.25), (20, "episodes", 3.0)]
+
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(UserError, match=r"pip install 'hypogoal\[tensorboard\]'"):
+        MetricsLog(tmp_path / "log.jsonl", tmp_path / "board")

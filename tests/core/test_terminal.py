@@ -102,7 +102,6 @@ def test_nothing_in_a_strangers_folder_drives_a_terminal(
     (run / LOGS / "d[red]x.log").write_text(f"started\nf{payload}", encoding="utf-8", errors="surrogateescape")
     seen = ""
     for command, code in (
-        (["watch", "--once", str(run)], 0),
         (["sweep", "--status", "--out", str(run)], 0),
         (["show", str(run)], 0),
         (["show", str(made)], 0),
@@ -151,7 +150,7 @@ MAKE = {
     "device": lambda path: os.symlink("/dev/zero", path),
     "folder": lambda path: os.makedirs(path / "folder"),
 }
-LIGHT = "watch --once run/sweep --status --out run/show run/verify run/report run"
+LIGHT = "sweep --status --out run/show run/verify run/report run"
 RUN = """/evaluate run --out out/report run --figures out/sweep --gather --out run
     train-options run|ensemble --out out
     train-meta run|ensemble --out run|new --resume
@@ -217,18 +216,6 @@ def test_no_command_waits_for_what_is_no_file(tmp_path: Path) -> None:
     assert done.returncode == 0, (last, done.stderr[-2000:])
     assert "Traceback" not in done.stderr and "internal error" not in done.stderr
     assert int(done.stdout.split()[-1]) > 250
-
-
-def test_a_log_is_followed_by_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec G2: however long it has become, and however long its last line."""
-    log = tmp_path / "run" / "meta" / "metrics.jsonl"
-    log.parent.mkdir(parents=True)
-    with log.open("wb") as file:
-        file.truncate(3 * 2**30)  # of which nothing is on the disk
-        file.seek(0, os.SEEK_END)
-        file.write(b'\n{"step": 7, "success": 0.5}\n')
-    assert main(["watch", "--once", str(tmp_path / "run")]) == 0
-    assert "success 0.5" in capsys.readouterr().out
 
 
 def test_a_strangers_draft_leads_nowhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -302,7 +289,7 @@ def test_a_reader_that_has_enough(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows deletes no folder that is somebody's current one")
 @pytest.mark.parametrize(
-    "line", ["show x", "verify x", "collect doorkey --out x.h5", "watch /", "config collect", "run doorkey --out x"]
+    "line", ["show x", "verify x", "collect doorkey --out x.h5", "config collect", "run doorkey --out x"]
 )
 def test_a_current_folder_that_was_deleted(tmp_path: Path, line: str) -> None:
     """Spec G2: one line, whatever the command."""
