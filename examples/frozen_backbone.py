@@ -1,17 +1,15 @@
-r"""Members on a frozen backbone: a small vision transformer sees images once, each member is a head on its features.
+r"""Members on a frozen backbone: a small vision transformer, the same in each member, and layers of its own behind it.
 
     hypogoal collect doorkey --out runs/backbone/data.h5
     export HYPOGOAL_TRUST=frozen_backbone:vit
-    hypogoal train-ensemble runs/backbone/data.h5 --out runs/backbone/ensemble --set network=frozen_backbone:vit \
-        --set encoder=frozen --set hidden_width=64
+    hypogoal train-ensemble runs/backbone/data.h5 --out runs/backbone/ensemble --set network=frozen_backbone:vit
     hypogoal train-options runs/backbone/ensemble --out runs/backbone/options --set steps=20000
     hypogoal train-meta runs/backbone/ensemble --options runs/backbone/options --out runs/backbone/meta \
         --set steps=20000
     hypogoal evaluate runs/backbone
     hypogoal report runs/backbone
 
-Its weights are random, so that nothing is downloaded; docs/extending.md has the line for one of timm's. It takes some
-five minutes of a CPU core.
+Its weights are random, so that nothing is downloaded. It takes some five minutes of a CPU core.
 """
 
 import torch
@@ -34,6 +32,25 @@ class ViT(nn.Module):
         return self.blocks(self.patches(images).flatten(2).mT + self.places).mean(1)
 
 
-def vit(observation_shape: tuple[int, ...]) -> nn.Module:
-    """An encoder: from the shape (H, W, C) of observations to a module."""
-    return ViT(observation_shape, width=96, depth=2)
+class Frozen(nn.Module):
+    """A backbone that stays as it is: weights without gradient, BatchNorm and Dropout always in evaluation mode."""
+
+    def __init__(self, backbone: nn.Module):
+        super().__init__()
+        self.backbone = backbone.requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> nn.Module:
+        """Leave the backbone in evaluation mode."""
+        return super().train(False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Float (N, C, H, W) in 0..1 -> features (N, F)."""
+        return self.backbone(images)
+
+
+def vit(observation_shape: tuple[int, ...]) -> tuple[list[nn.Module], tuple[int, ...]]:
+    """From the shape (H, W, C) of observations: the backbone, and the width of a hidden layer of each member's own."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)  # every member gets the same backbone
+        backbone = ViT(observation_shape, width=96, depth=2)
+    return [Frozen(backbone)], (64,)

@@ -93,7 +93,7 @@ SETTINGS: Schema = {
     "mask_reached": lambda value: isinstance(value, bool),
     **dict.fromkeys(("crop_height", "crop_width"), _size),
     **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), is_count),
-    **dict.fromkeys(("ended_at", "options_ended_at", "hidden_width"), is_count),
+    **dict.fromkeys(("ended_at", "options_ended_at"), is_count),
     **dict.fromkeys(("domain", "network", "setting", "agent", "termination", "chooser", "start"), is_text),
-    **dict.fromkeys(("view", "localiser", "diversity", "encoder", "layouts"), is_text),
+    **dict.fromkeys(("view", "localiser", "diversity", "layouts"), is_text),
 }

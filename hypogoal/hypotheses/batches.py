@@ -41,8 +41,6 @@ class TrainingStates:
         observations, labels: the members' view of the labelled states, (N, h, w, C) or (N, *shape), and labels (N,).
         unlabelled: the same of the unlabelled states. On a CPU these arrays are kept and not copied.
         network: any of the networks that will see them (their layers decide how images are stored).
-        trunk: the layers that the networks share. If it is ``frozen``, the features of all states are computed once
-            and kept in memory, or for each batch if states are changed at random.
         ladders: (N,), each labelled state's ladder, if batches are drawn by ladder.
         grey: whether a random function maps the shades of each state of a training batch.
         context: whether most states' surroundings are replaced before that: :func:`.changes.other_context`.
@@ -65,8 +63,6 @@ class TrainingStates:
         grey: bool = False,
         context: bool = False,
         jitter: int = 0,
-        trunk: nn.Sequential | None = None,
-        frozen: bool = False,
         standard: Standard | None = None,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
@@ -80,23 +76,14 @@ class TrainingStates:
         self._standard = [torch.from_numpy(values).to(device) for values in standard or ()]
         images = [np.require(some, requirements=["C", "W"]) for some in (observations, unlabelled)]
         tables = device.type == "cpu" and not (grey or jitter)  # changed images have changed patches
-        self._tables = patches.make_tables(images, trunk or network) if tables else None
+        self._tables = patches.make_tables(images, network) if tables else None
         self._labelled = images[0]
         self._images = [as_tensor(some).to(device) for some in images] if self._tables is None else []
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
-        self._trunk, self._features = trunk, None
-        self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # trained by all networks
-        if trunk is not None and frozen and not (grey or jitter):
-            size = at_once(EVALUATED_AT_ONCE, self._shape)
-            count = self.n_labelled + self.n_unlabelled
-            chunks = [np.arange(at, min(at + size, count)) for at in range(0, count, size)]
-            with torch.no_grad():
-                self._features = torch.cat([_forward(trunk, self._inputs([chunk]), [len(chunk)]) for chunk in chunks])
-            self._tables, self._images = None, []
 
     @property
     def whole(self) -> bool:
-        """Whether networks get the states themselves, not their patches or features."""
+        """Whether networks get the states themselves, not their patches."""
         return bool(self._images)
 
     def forward(
@@ -114,8 +101,6 @@ class TrainingStates:
         do not depend on the others.
         """
         sizes, inputs = [len(group) for group in groups], self._inputs(groups, changes)
-        if self._trunk is not None and self._features is None:
-            inputs = _forward(self._trunk, inputs, sizes, counted)
         features = [_forward(nn.Sequential(*list(network)[:-1]), inputs, sizes, counted) for network in networks]
         logits = [network[-1](hidden) for network, hidden in zip(networks, features, strict=True)]
         return Outputs(*([list(rows.split(sizes)) for rows in of_networks] for of_networks in (logits, features)))
@@ -123,11 +108,9 @@ class TrainingStates:
     def _inputs(
         self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator] = ()
     ) -> Tensor | patches.Batch:
-        """The networks' inputs for groups of states: images, their patches, or a frozen trunk's features."""
+        """The networks' inputs for groups of states: images, or their patches."""
         if self._tables is not None:
             return patches.take(self._tables, *groups)
-        if self._features is not None:
-            return self._features[torch.from_numpy(np.concatenate(groups)).to(self.device)]
         if changes and (self._grey or self._jitter):
             return torch.cat([self._images_of(*group) for group in zip(groups, changes, strict=True)])
         return self._images_of(np.concatenate(groups), None)
@@ -143,8 +126,7 @@ class TrainingStates:
             inputs = inputs[:, :, self._jitter : -self._jitter, self._jitter : -self._jitter]
         inputs = inputs.requires_grad_()
         with sdpa_kernel(SDPBackend.MATH):  # the only attention with a differentiable gradient
-            hidden = inputs if self._trunk is None else _forward(self._trunk, inputs, [len(states)], [False])
-            logits = [_forward(network, hidden, [len(states)], [False]) for network in networks]
+            logits = [_forward(network, inputs, [len(states)], [False]) for network in networks]
         gaps = [(each[:, 1] - each[:, 0]).sum() for each in logits]
         return torch.stack([torch.autograd.grad(gap, inputs, create_graph=True)[0].flatten(1) for gap in gaps])
 
@@ -152,7 +134,7 @@ class TrainingStates:
         self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
     ) -> None:
         """Update BatchNorm's running statistics, of networks in training mode, with states (B,), and nothing else."""
-        first = [_up_to_last_norm(network) for network in (networks if self._trunk is None else [self._trunk])]
+        first = [_up_to_last_norm(network) for network in networks]
         if not any(len(network) for network in first):
             return
         with torch.no_grad():

@@ -54,13 +54,6 @@ class EnsembleConfig:
         "pictures, mlp for other observations; of cameras and numbers by key: front=tiles,state=mlp",
         source="the paper's appendix",
     )
-    encoder: str = setting(
-        "separate",
-        "network up to the last layer: separate for each member; shared and trained; frozen, shared and untrained",
-        source="the paper; shared: DivDis (arXiv:2202.03418)",
-        choices=("separate", "shared", "frozen"),
-    )
-    hidden_width: int = setting(0, "units of each member's own layer after the encoder; 0: none", low=0, high=65535)
     steps: int = setting(
         150,
         "gradient steps (for each member if sequential)",

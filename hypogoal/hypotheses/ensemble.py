@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping
 from math import prod
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +29,6 @@ from hypogoal.hypotheses.networks import (
     folded,
     names_in,
     network_for,
-    redrawn,
     reordered,
 )
 from hypogoal.hypotheses.views import AgentView, FullView, standard_shape
@@ -51,15 +50,10 @@ class Ensemble(nn.Module):
         members: K, at least 1.
         generator: draws the initial weights.
         view: what members see of an observation; None: a whole picture.
-        encoder: as in ``TrainEnsembleConfig``.
-        hidden_width: as in ``TrainEnsembleConfig``.
 
     Attributes:
         members: K ``nn.Sequential``, from ``networks.as_input`` of the view (for pictures float (N, C, h, w) in 0..1)
             to logits (N, 2).
-        trunk: the encoder that members share, from the same input to (N, F); None if each has its own.
-        frozen: whether the trunk is frozen, and so always in evaluation mode.
-        parts: the trunk, run once, and the K networks behind it, which are ``networks`` without a trunk.
         networks: the members with their layers in the fastest order; weights and BatchNorm statistics are shared.
         thresholds: float32 (K,), the probabilities above which members' predictions are positive.
 
@@ -76,32 +70,14 @@ class Ensemble(nn.Module):
         members: int,
         generator: torch.Generator,
         view: FullView | AgentView | None = None,
-        encoder: str = "separate",
-        hidden_width: int = 0,
     ):
         super().__init__()
         self.observation_shape = tuple(int(size) for size in observation_shape)
         self.view = view or FullView(self.observation_shape)
         self.network = network = network_for(network, self.view.dtype)
-        self.trunk: nn.Sequential | None = None
-        self.frozen = encoder == "frozen"
-        count = members if encoder == "separate" else 1
-        settings = network, self.view.shape, generator, hidden_width, self.view.dtype
-        networks = [build_network(*settings) for _ in range(count)]
-        heads: list[nn.Sequential] = []
-        if encoder == "separate":
-            self.members: nn.ModuleList | tuple[nn.Sequential, ...] = nn.ModuleList(networks)
-        else:
-            layers, head_layers = list(networks[0]), 3 if hidden_width else 1
-            self.trunk = nn.Sequential(*layers[:-head_layers])
-            heads = [nn.Sequential(*layers[-head_layers:])]
-            heads += (redrawn(heads[0], generator) for _ in range(members - 1))
-            networks = [nn.Sequential(*layers[:-head_layers], *head) for head in heads]
-            self.heads, self.members = nn.ModuleList(heads), tuple(networks)
-            if self.frozen:
-                self.trunk.requires_grad_(False)
-        self.networks = tuple(map(reordered, networks))
-        self.parts = self.trunk and reordered(self.trunk), tuple(heads) or self.networks
+        shape, dtype = self.view.shape, self.view.dtype
+        self.members = nn.ModuleList(build_network(network, shape, generator, dtype) for _ in range(members))
+        self.networks = tuple(map(reordered, self.members))
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self.train()
 
@@ -112,13 +88,6 @@ class Ensemble(nn.Module):
     def __len__(self) -> int:
         """K, the number of members."""
         return len(self.members)
-
-    def train(self, mode: bool = True) -> Self:
-        """Set training or evaluation mode; a frozen trunk stays in evaluation mode."""
-        super().train(mode)
-        if self.trunk is not None and self.frozen:
-            self.trunk.eval()
-        return self
 
     @property
     def needs_positions(self) -> bool:
@@ -229,21 +198,20 @@ class Ensemble(nn.Module):
 
     def _logits(self, observations: Observations) -> Tensor:
         """Logits (K, N, 2); computes each distinct patch once if that pays."""
-        trunk, heads = self.parts
-        device = self.thresholds.device
+        networks, device = self.networks, self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables([observations], trunk or heads[0])
+            tables = patches.make_tables([observations], networks[0])
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
-                return _logits(trunk, heads, batch)
+                return torch.stack([patches.forward(network, batch) for network in networks])
         if len(observations) >= FOLD_FROM:
-            trunk, heads = trunk and folded(trunk), tuple(folded(head) for head in heads)
+            networks = tuple(map(folded, networks))
         size = (values_in(observations.shape[1:], observations.dtype),)
         chunk = at_once(IMAGES_AT_ONCE, size) if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
             inputs = as_input(as_tensor(observations[start : start + chunk]).to(device), observations.dtype)
-            logits.append(_logits(trunk, heads, inputs))
+            logits.append(torch.stack([network(inputs) for network in networks]))
         return torch.cat(logits, dim=1)
 
     def state(self) -> dict[str, Tensor]:
@@ -258,32 +226,22 @@ class Ensemble(nn.Module):
         members: int,
         state: Mapping[str, Tensor],
         view: FullView | AgentView | None = None,
-        **settings: Any,
     ) -> Ensemble:
         """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit.
 
         A state without thresholds, from an early version, gets 0.5.
         """
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
-        numbers = {name.split(".")[1] for name in state if name.startswith(("members.", "heads."))}
+        numbers = {name.split(".")[1] for name in state if name.startswith("members.")}
         if len(numbers) != members:
             fault = f"the weights do not fit the ensemble (of {len(numbers)} members)"
             raise UserError(fault, where, "Train it again.")
         state = {"thresholds": torch.full((members,), THRESHOLD), **state}
 
         def make() -> Ensemble:
-            return cls(network, observation_shape, members, torch.Generator(), view, **settings)
+            return cls(network, observation_shape, members, torch.Generator(), view)
 
         return load_fitting(make, state, where, custom=not NETWORKS.keys() >= {*names_in(network)}).eval()
-
-
-def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:
-    """Logits (K, N, 2) of images or their patches: each head's, behind the trunk, if any, which runs once."""
-    outputs = [
-        patches.forward(network, images) if isinstance(images, patches.Batch) else network(images)
-        for network in (heads if trunk is None else [trunk])
-    ]
-    return torch.stack(outputs if trunk is None else [head(outputs[0]) for head in heads])
 
 
 def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:
@@ -304,9 +262,8 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
     state = load_tensors(path)
     try:
         shape = tuple(config["observation_shape"])
-        settings = {name: config[name] for name in ("encoder", "hidden_width") if name in config}
         view = _view(shape, config, state)
-        return Ensemble.from_state(config["network"], shape, config["members"], state, view, **settings)
+        return Ensemble.from_state(config["network"], shape, config["members"], state, view)
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
 

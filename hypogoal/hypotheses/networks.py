@@ -12,7 +12,6 @@ network, which the paper does not have.
 
 from __future__ import annotations
 
-import copy
 import inspect
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
@@ -166,15 +165,14 @@ def build_network(
     name: str,
     observation_shape: tuple[int, ...],
     generator: torch.Generator,
-    hidden_width: int = 0,
     dtype: np.dtype[Any] = PICTURE,
 ) -> nn.Sequential:
     """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
-    ``generator`` draws the initial weights (PyTorch's default distributions); ``hidden_width`` above 0 adds a layer of
-    that width before the last. Of mixed observations, of type ``dtype``, each key has its network without the last
-    layer; a dense layer joins them. An unknown network (see :func:`load_network`), or observations that it does not
-    take, for example images too small for it, are a ``UserError``.
+    ``generator`` draws the initial weights (PyTorch's default distributions). Of mixed observations, of type ``dtype``,
+    each key has its network without the last layer; a dense layer joins them. An unknown network (see
+    :func:`load_network`), or observations that it does not take, for example images too small for it, are a
+    ``UserError``.
     """
     where = f"observation shape {tuple(observation_shape)}"
     parts_of = None if dtype.names else load_network(name)
@@ -183,7 +181,7 @@ def build_network(
         names = zip(names_in(network_for(name, dtype)), fields, strict=True)
         encoders = [build_network(of_key, shape, generator)[:-1] for of_key, (_, shape) in names]
         by_key = ByKey([as_input(torch.zeros(1, *shape)).shape[1:] for _, shape in fields], encoders)
-        joined: Parts = [by_key], () if hidden_width else (JOINT,)
+        joined: Parts = [by_key], (JOINT,)
     sizes = (values_in((), dtype),) if dtype.names else as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
@@ -202,20 +200,11 @@ def build_network(
             fault = f"the network {name!r} makes {features!r} of images, not a tensor"  # type: ignore[unreachable]
             raise UserError(fault, where, "Make a tensor.")
         layers.append(nn.Flatten())
-        *widths, last = filter(None, (features.numel(), *hidden, hidden_width))
+        *widths, last = features.numel(), *hidden
         for inputs, outputs in pairwise((*widths, last)):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         layers.append(nn.Linear(last, CLASSES))
     return nn.Sequential(*layers).train()
-
-
-def redrawn(head: nn.Sequential, generator: torch.Generator) -> nn.Sequential:
-    """A copy of dense layers with new weights, drawn as PyTorch does."""
-    head = copy.deepcopy(head)
-    for layer in (layer for layer in head if isinstance(layer, nn.Linear)):
-        for value in layer.parameters():
-            nn.init.uniform_(value, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
-    return head
 
 
 def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:

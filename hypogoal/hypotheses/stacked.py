@@ -27,8 +27,8 @@ class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
     The first convolution's filters are concatenated, later ones grouped; dense layers are batched products. Up to
-    rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers, or with a
-    shared encoder, are not ``joined``: each ensemble predicts by itself.
+    rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers are not
+    ``joined``: each ensemble predicts by itself.
 
     The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
     ``repeats``: states come from a grid world, so the convolutions' outputs for windows are kept, see
@@ -43,7 +43,7 @@ class StackedMembers:
         self._one_view = all(plain)
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
         self.count = len(networks)
-        self.joined = ensembles[0].trunk is None and _can_be_joined(networks[0])
+        self.joined = _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
         self._windows: KnownWindows | None = None
         if not self.joined:
@@ -72,7 +72,7 @@ class StackedMembers:
         """Whether it has :meth:`log_odds_of_cells`."""
         if not self.joined or not self._one_view or self.device.type != "cpu":
             return False
-        return patches.windows_of(self.ensembles[0].parts[1][0]) is not None
+        return patches.windows_of(self.ensembles[0].networks[0]) is not None
 
     def log_odds_of_cells(self, codes: NDArray[np.uint8], tiles: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Each ensemble's own ``log_odds`` of images made of cells, float32 (N, G*K), several times as fast.
@@ -82,7 +82,7 @@ class StackedMembers:
         """
         places, distinct = patches.distinct_items(codes.reshape(len(codes), -1))
         distinct = distinct.reshape(-1, *codes.shape[1:])
-        networks = [network for ensemble in self.ensembles for network in ensemble.parts[1]]
+        networks = [network for ensemble in self.ensembles for network in ensemble.networks]
         windows = patches.windows_of(networks[0])
         assert windows is not None
         rows = []

@@ -89,16 +89,11 @@ def fit(
     if len(unlabelled) == 0 and config.threshold in NEED_UNLABELLED:
         do = "Give some, or set threshold=0.5."
         raise UserError("unlabelled states are needed to set thresholds on", None, do)
-    if config.schedule == "sequential" and config.encoder == "shared":
-        fault = "members one after the other cannot share an encoder that learns"
-        raise UserError(fault, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")
     checkpoints = checkpoints or Checkpoints(None)
     saved, watcher = checkpoints.load(), watcher or Watcher()
     view = view_of(observations, unlabelled, config, seed_for(seed, "localiser"), origins, fitted=saved is None)
     generator = torch_generator(seed, "weights")
-    ensemble = Ensemble(
-        config.network, observations.shape[1:], config.members, generator, view, config.encoder, config.hidden_width
-    ).to(device)
+    ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view).to(device)
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
     def state(number: int, part: Round | None) -> State:
@@ -116,7 +111,7 @@ def fit(
                 raise ValueError("no such round")
             ensemble.load_state_dict(saved["ensemble"])
             watcher.restore(saved["watcher"])
-    trunk, networks = ensemble.parts
+    networks = ensemble.networks
     by_ladder = config.batch_kind == "per-ladder"
     ladders = require_origins(origins.labelled, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
     mixed = bool(view.dtype.names)  # standardised in each batch: a view of all states would copy their pictures
@@ -134,8 +129,6 @@ def fit(
         grey=config.augment != "none",
         context=config.augment == "grey-context",
         jitter=config.jitter,
-        trunk=trunk,
-        frozen=ensemble.frozen,
         standard=view.standard if mixed else None,
     )
     search = None
@@ -202,7 +195,7 @@ class Round(Resumable):
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
         self.optimiser = torch.optim.Adam(
-            [*states.shared, *(weight for network in self.networks for weight in network.parameters())],
+            [weight for network in self.networks for weight in network.parameters()],
             lr=config.learning_rate,
             weight_decay=config.l2_weight,
             fused=True,

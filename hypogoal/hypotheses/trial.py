@@ -57,8 +57,8 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     config = replace(config, diversity=objective, batch_kind="plain", steps=len(sizes) + 2)
     with torch.random.fork_rng(devices=[]):
         generator = torch_generator(0, "trial")
-        ensemble = Ensemble(config.network, shape, config.members, generator, view, config.encoder, config.hidden_width)
-        trunk, networks = ensemble.parts
+        ensemble = Ensemble(config.network, shape, config.members, generator, view)
+        networks = ensemble.networks
         batches = TrainingStates(
             states,
             np.arange(len(states)) % 2 == 0,
@@ -67,8 +67,6 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
             torch.device("cpu"),
             grey=pictures and config.augment != "none",
             jitter=margin if cut else 0,
-            trunk=trunk,
-            frozen=ensemble.frozen,
         )
         taught = torch.zeros(config.members, len(states)) if config.proposals == "joint" else None
         training = Round(networks, range(trained), batches, config, 0, 0, taught)
@@ -82,7 +80,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     kept_each, seconds_each = (max(0.0, rise) / max(1, more - fewer) for rise in (most - less, later - sooner))
     weights = sum(weight.nbytes for weight in ensemble.parameters())
     learning = LEARNING * sum(weight.nbytes for weight in training.optimiser.param_groups[0]["params"])
-    copies = 1.0 + BACKWARD / (trained if config.encoder == "separate" else 1)
+    copies = 1.0 + BACKWARD / trained
     memory = weights + learning + copies * (most - more * kept_each)
     memory += CONVOLUTIONS if batches.whole and any(isinstance(layer, nn.Conv2d) for layer in ensemble.modules()) else 0
     return StepCost(weights, memory, copies * kept_each, max(0.0, later - more * seconds_each), seconds_each)

@@ -38,8 +38,7 @@ class Terminations(Part):
 
     Args:
         classify: state ids (n,) -> log-odds float32 (n, O), or predictions, bool (n, O).
-        classify_group: state ids (n,) and the first option of a group -> log-odds (n, ``group``); None: classify all.
-        group: how many consecutive options it classifies for.
+        classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
         thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
         environments: E.
         length: the number in the rule's name (``dwell:3``).
@@ -74,13 +73,12 @@ class Terminations(Part):
         self,
         classify: Callable[[NDArray[np.int64]], NDArray[np.float32] | NDArray[np.bool_]],
         options: int,
-        classify_group: Callable[[NDArray[np.int64], int], NDArray[np.float32]] | None = None,
+        classify_one: Callable[[NDArray[np.int64], int], NDArray[np.float32]] | None = None,
         thresholds: NDArray[np.float32] | None = None,
         environments: int = 0,
         length: int = 0,
-        group: int = 1,
     ):
-        self.classify, self.options, self.classify_group, self.group = classify, options, classify_group, group
+        self.classify, self.options, self.classify_one = classify, options, classify_one
         self.thresholds = np.zeros(options, dtype=np.float32) if thresholds is None else thresholds
         self.environments, self.length = environments, length
         self._log_odds = np.full((1024, options), np.nan, dtype=np.float32)  # NaN: not classified yet
@@ -104,15 +102,13 @@ class Terminations(Part):
     def log_odds(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.float32]:
         """How sure the options that run are that their sub-goals hold: float32 (n,)."""
         self._grow(ids)
-        if self.classify_group is None:
+        if self.classify_one is None:
             self.of(ids)
         unknown = np.isnan(self._log_odds[ids, options])
-        firsts = options - options % self.group
-        for first in np.unique(firsts[unknown]):
-            assert self.classify_group is not None
-            fresh = np.unique(ids[unknown & (firsts == first)])
-            log_odds = self.classify_group(fresh, int(first)).reshape(len(fresh), self.group)
-            self._log_odds[fresh, first : first + self.group] = log_odds
+        for option in np.unique(options[unknown]):
+            assert self.classify_one is not None
+            fresh = np.unique(ids[unknown & (options == option)])
+            self._log_odds[fresh, option] = self.classify_one(fresh, int(option))
         return self._log_odds[ids, options]
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -275,7 +271,6 @@ def learned_terminations(
     stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
     networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
     members = len(ensembles[0])
-    shared = ensembles[0].trunk is not None  # all members cost little more than one
 
     def look_at(ids: NDArray[np.int64]) -> tuple[Observations, NDArray[np.int64] | None]:
         if stacked.needs_positions and not engine.position_names:
@@ -296,10 +291,8 @@ def learned_terminations(
             return stacked.log_odds(*states)
         return np.concatenate([ensemble.log_odds(*states) for ensemble in ensembles], axis=1)
 
-    def classify_group(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
+    def classify_one(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
         ensemble = ensembles[option // members]
-        if shared:
-            return ensemble.log_odds(*look_at(ids))
         views = ensemble.see(*look_at(ids))
         with torch.inference_mode():
             logits = networks[option](as_input(tensor(views, ensemble.thresholds.device)))
@@ -310,9 +303,8 @@ def learned_terminations(
     return termination(
         classify,
         len(networks),
-        classify_group if running_only else None,
+        classify_one if running_only else None,
         np.concatenate([ensemble.thresholds_as_log_odds() for ensemble in ensembles]),
         engine.count,
         length,
-        members if shared else 1,
     )

@@ -33,13 +33,11 @@ def drawn(rng: np.random.Generator) -> tuple[tuple[int, ...], TrainEnsembleConfi
     else:
         shape = (*(int(side) for side in rng.integers(41, 260, 2)), int(rng.integers(1, 5)))
         network = str(rng.choice(["doorkey", "montezuma", "tiles", "mlp"]))
-    encoder = str(rng.choice(["separate", "shared", "frozen"], p=[0.6, 0.2, 0.2]))
     return shape, TrainEnsembleConfig(
         members=int(rng.integers(1, 5)),
         network=network,
         diversity=str(rng.choice(DIVERSITY)),
-        schedule="simultaneous" if encoder == "shared" else str(rng.choice(["simultaneous", "sequential"])),
-        encoder=encoder,
+        schedule=str(rng.choice(["simultaneous", "sequential"])),
         batch_size=int(2 ** rng.uniform(1, 6.5)),
         steps=STEPS,
     )
@@ -84,7 +82,7 @@ def main() -> int:
         process.join()
         ratios = np.array([needs.memory, needs.seconds]) / taken
         out += np.abs(np.log(ratios)) > np.log(MAY_DIFFER)
-        settings = f"{config.network} x {config.members}, {config.encoder}, {config.schedule}, {config.diversity}"
+        settings = f"{config.network} x {config.members}, {config.schedule}, {config.diversity}"
         line = (
             f"{case} {shape} {settings}, batch {config.batch_size}: {needs.memory / 1e6:.0f} MB, {needs.seconds:.3f} s"
         )

@@ -68,14 +68,14 @@ def test_running_members_are_judged_alone_and_once() -> None:
     assert (wanted.any(0) & ~wanted.all(0)).all()
     verdicts = learned_terminations(engine, ensembles, running_only=True)
     asked: list[tuple[int, int]] = []
-    ask = verdicts.classify_group
+    ask = verdicts.classify_one
     assert ask is not None
 
     def counted(ids, option):
         asked.extend((int(identity), option) for identity in ids)
         return ask(ids, option)
 
-    verdicts.classify_group = counted
+    verdicts.classify_one = counted
     for _ in range(30):
         ids, options = rng.integers(engine.n_states, size=9), rng.integers(4, size=9)
         np.testing.assert_array_equal(verdicts.of_running(ids, options), wanted[ids, options])
