@@ -62,11 +62,6 @@ class Layout:
         """All but the agent: layouts with the same grid have the same states."""
         return self.walls, self.door, self.goal, self.keys
 
-    def key_cells(self) -> list[int]:
-        """The cells where a key can lie at the start: the agent's room without the agent's own cell."""
-        rows = [cell for cell in range(SIZE * SIZE) if cell % SIZE < self.door % SIZE]
-        return [cell for cell in rows if cell not in self.walls and cell != self.start]
-
 
 class _RingDoor(Door):
     """MiniGrid's door, opened by any held key of its colour instead of only the one in the hand."""

@@ -51,7 +51,7 @@ SECONDS = 60.0  # of the clock: the machine may be busy
 MEMORY = 2**30
 SUB_GOALS, MEMBERS, SHAPE, NETWORK = ("open-red-door", "go-to-goal"), 2, (24, 32, 3), "montezuma-crop"  # small
 PRESET = {
-    "collect": {"regime": "fixed", "unlabelled_seeds": [1, 2], "heldout_layouts": 20},
+    "collect": {"door_label": "open", "unlabelled_seeds": [1, 2], "heldout_layouts": 20},
     "train-ensemble": {"members": 3, "sub_goals": ["go-to-goal"], "diversity_weight": 1e-4, "network": "doorkey"},
     "train-options": {"steps": 100, "chooser": "random", "bootstrap_timeout": True},
     "train-meta": {"clip": 0.2, "decisions": 64, "termination": "learned"},

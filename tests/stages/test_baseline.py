@@ -205,7 +205,7 @@ def test_it_plays_in_the_agents_world(tmp_path):
     assert max(lengths) == math.ceil(1.5 * shortest)
     assert min(lengths) < shortest  # a wrong key
     with pytest.raises(UserError, match="no such setting"):
-        train_baseline("doorkey", BaselineConfig(world=("draws=3",)), tmp_path / "b", quiet=True)
+        train_baseline("doorkey", BaselineConfig(world=("labelled_seed=3",)), tmp_path / "b", quiet=True)
 
 
 def test_a_cap_that_is_a_whole_number_of_steps_is_that_many():
