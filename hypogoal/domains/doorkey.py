@@ -39,7 +39,6 @@ class DoorKeyConfig:
         source="in-front: paper; open: the authors' code",
         choices=env.DOOR_LABELS,
     )
-    keyring: bool = setting(True, "several keys can be held", source="the authors' code")
     wrong_key: str = setting(
         "harmless",
         "holding the blue or the green key is 'harmless', or 'ends' the episode without reward",
@@ -66,9 +65,7 @@ def _sweep(config: DoorKeyConfig, layout_seeds: Iterable[int], progress: Any) ->
     """All states of the layouts that an expert can reach: images, labels and origins."""
     swept = []
     for layout_seed in layout_seeds:
-        engine = DoorKeyEngine(
-            layout_seed, keyring=config.keyring, door_label=config.door_label, wrong_key=config.wrong_key
-        )
+        engine = DoorKeyEngine(layout_seed, door_label=config.door_label, wrong_key=config.wrong_key)
         ids = engine.reachable()
         origins = {"layout_seed": np.full(len(ids), layout_seed), **engine.origins(ids)}
         swept.append(States(engine.images(ids), engine.labels(ids), origins))
@@ -84,7 +81,7 @@ class DoorKeyDomain(Domain):
     sub_goals = env.SUB_GOALS
     observation_shape = env.OBSERVATION_SHAPE
     config_class = DoorKeyConfig
-    engine_settings = ("keyring", "door_label", "wrong_key")
+    engine_settings = ("door_label", "wrong_key")
     env_id = "hypogoal/DoorKey-8x8-v0"
     many_layouts = True
     packed = 20  # 26 measured
@@ -113,8 +110,8 @@ class DoorKeyDomain(Domain):
         unlabelled = _sweep(config, config.unlabelled_seeds, progress)
         heldout = _sweep(config, heldout_seeds, progress)
         heldout = leave_out(heldout, labelled.observations, unlabelled.observations)
-        where = f"labelled_seed={config.labelled_seed}, keyring={config.keyring}"
-        require_classes(labelled.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or keyring=true.")
+        where = f"labelled_seed={config.labelled_seed}, wrong_key={config.wrong_key}"
+        require_classes(labelled.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or wrong_key=harmless.")
         return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, labelled, unlabelled, heldout)
 
     def task(self, world: Mapping[str, Any]) -> str:

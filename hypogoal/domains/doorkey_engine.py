@@ -102,7 +102,6 @@ class DoorKeyEngine(Engine):
         layout: int | Layout | Layouts,
         count: int = 1,
         *,
-        keyring: bool = True,
         max_steps: int = MAX_STEPS,
         door_label: str = "open",
         wrong_key: str = "harmless",
@@ -111,7 +110,7 @@ class DoorKeyEngine(Engine):
         self.known: dict[int, Layout] = {0: layout} if isinstance(layout, Layout) else {}  # layouts played, by seed
         seed = 0 if isinstance(layout, Layout) else layout
         self.layouts: Layouts = seed if isinstance(seed, Layouts) else Layouts((seed,))
-        self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
+        self.count, self.max_steps, self.door_label = count, max_steps, door_label
         self.changes: dict[int, int] = {}  # computed next configurations, by configuration, cell, action
         self._numbers: dict[Configuration, int] = {}
         # For each configuration: its layout's seed and door cell; its door and keys; its cell codes without the agent,
@@ -183,7 +182,7 @@ class DoorKeyEngine(Engine):
             return changed
         (door, *keys), seed = self._places[configuration].tolist(), self._seeds[configuration]
         held = sum(place >= HELD for place in keys)
-        if action == PICKUP and front in keys and (self.keyring or not held):
+        if action == PICKUP and front in keys:
             keys[keys.index(front)] = HELD + held
         elif action == DROP and held and self._rows[configuration][front] == EMPTY:
             keys[keys.index(max(keys))] = front
@@ -287,7 +286,7 @@ class DoorKeyEngine(Engine):
         return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:
-        """The fewest primitive steps to the goal; None with several layouts, or if a key must be dropped."""
+        """The fewest primitive steps to the goal; None with several layouts, or if only a wrong key clears the way."""
         if self.layouts.many:
             return None
         ids, steps = self.distances()

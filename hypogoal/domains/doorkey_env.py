@@ -79,9 +79,9 @@ class _RingDoor(Door):
 class DoorKeyGrid(MiniGridEnv):
     """Three-key DoorKey with MiniGrid's dictionary observations; ``DoorKeyEnv`` returns the image instead.
 
+    Pickup puts a key onto a ring and drop takes the last one off, as in the authors' fork.
+
     Args:
-        keyring: True, pickup puts a key onto a ring and drop takes the last one off (the authors' fork);
-            False, MiniGrid's rule that the agent holds one key.
         max_steps: steps after which an episode is truncated.
         layout_seed: the layout of every episode; None, the layout follows from ``reset(seed)``.
             ``layout_seed=s`` is the layout of ``reset(seed=s)``.
@@ -91,7 +91,6 @@ class DoorKeyGrid(MiniGridEnv):
 
     def __init__(
         self,
-        keyring: bool = True,
         max_steps: int = MAX_STEPS,
         layout_seed: int | None = None,
         door_label: str = "open",
@@ -102,7 +101,6 @@ class DoorKeyGrid(MiniGridEnv):
             raise ValueError(f"door_label must be one of {DOOR_LABELS}, not {door_label!r}")
         if wrong_key not in WRONG_KEYS:
             raise ValueError(f"wrong_key must be one of {WRONG_KEYS}, not {wrong_key!r}")
-        self.keyring = keyring
         self.layout_seed = layout_seed
         self.door_label, self.wrong_key = door_label, wrong_key
         self.ring: list[Key] = []
@@ -117,9 +115,7 @@ class DoorKeyGrid(MiniGridEnv):
     @property
     def held(self) -> tuple[str, ...]:
         """Colours of the keys held, the last picked up last."""
-        if self.keyring:
-            return tuple(key.color for key in self.ring)
-        return (self.carrying.color,) if self.carrying is not None else ()
+        return tuple(key.color for key in self.ring)
 
     def _gen_grid(self, width: int, height: int) -> None:
         episode_rng = self._np_random
@@ -147,7 +143,7 @@ class DoorKeyGrid(MiniGridEnv):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """MiniGrid's step with a key ring; reward 1 at the goal, else 0."""
         played = action
-        if self.keyring and action in (self.actions.pickup, self.actions.drop):
+        if action in (self.actions.pickup, self.actions.drop):
             self._use_ring(pick_up=action == self.actions.pickup)
             played = self.actions.done  # MiniGrid only counts the step and observes
         observation, reward, terminated, truncated, info = super().step(played)

@@ -93,7 +93,7 @@ def make_seeds(root: Path) -> None:
     collected = Collected(SHAPE, SUB_GOALS, states(6), states(5), states(4))
     write_dataset(root / "data.h5", collected, domain="doorkey", config={"a": [1, 2]}, seed=3)
     about = {"sub_goals": list(SUB_GOALS), "members": MEMBERS, "network": NETWORK, "observation_shape": list(SHAPE)}
-    about |= {"domain": "doorkey", "domain_config": {"keyring": True}, "diversity": "dbat", "view": "full"}
+    about |= {"domain": "doorkey", "domain_config": {"wrong_key": "harmless"}, "diversity": "dbat", "view": "full"}
     with create_artefact(root / "ensemble", kind="ensemble", config=about, seed=0, inputs=[root / "data.h5"]) as folder:
         for sub_goal in SUB_GOALS:
             write_ensemble(folder, sub_goal, Ensemble(NETWORK, SHAPE, MEMBERS, torch_generator(0, sub_goal)))

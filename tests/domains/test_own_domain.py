@@ -135,14 +135,14 @@ def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeyp
 
 
 def test_baselines_play_in_the_world_of_the_data(tmp_path: Path) -> None:
-    """Spec E7: without the key ring, where the states were collected without it; not on states of another domain."""
+    """Spec E7: a wrong key ends episodes where it did in the data; not on states of another domain."""
     data = tmp_path / "data.h5"
-    few = [word for pair in ("keyring=false", "heldout_layouts=1", "labelled_seed=2") for word in ("--set", pair)]
+    few = [word for pair in ("wrong_key=ends", "heldout_layouts=1") for word in ("--set", pair)]
     assert main(["collect", "doorkey", "--out", str(data), *few, "-q"]) == 0
     steps = ["--set", "steps=64", "--set", "environments=2", "--layout-seed", "1", "-q"]
     assert main(["train-baseline", "doorkey", "--data", str(data), "--out", str(tmp_path / "ppo"), *steps]) == 0
-    world = {"keyring": False, "door_label": "open", "wrong_key": "harmless"}
+    world = {"door_label": "open", "wrong_key": "ends"}
     assert open_artefact(tmp_path / "ppo").config["domain_config"] == world
-    # On layout 1 nobody gets to the goal without the ring unless keys are dropped.
+    # On layout 1 a wrong key is in the way.
     assert json.loads((tmp_path / "ppo" / "layout.json").read_text())["shortest_path"] is None
     assert main(["train-baseline", "montezuma", "--data", str(data), "--out", str(tmp_path / "other"), *steps]) == 2

@@ -200,7 +200,8 @@ def test_a_broken_audit_is_resumed_to_the_last_bit(tmp_path: Path, monkeypatch: 
 def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two members, barely trained."""
     folder = tmp_path_factory.mktemp("member")
-    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,), keyring=False), folder / "d.h5", quiet=True)
+    config = DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,), wrong_key="ends")
+    collect(DOMAIN, config, folder / "d.h5", quiet=True)
     rule = "positives-median"
     few = TrainEnsembleConfig(steps=10, members=2, workers=1, sub_goals=("open-red-door",), threshold=rule)
     train_ensemble(folder / "d.h5", few, folder / "ensemble", quiet=True)
@@ -218,7 +219,7 @@ def test_a_member_is_audited_at_its_own_threshold(ensemble: Path, tmp_path: Path
     manifest = open_artefact(tmp_path / "audit", "audit").manifest
     assert [entry["kind"] for entry in manifest["inputs"]] == ["ensemble"] and manifest["config"]["member"] == 1
     assert manifest["config"]["domain_config"] == source.config["domain_config"]
-    assert manifest["config"]["domain_config"]["keyring"] is False and "visited.h5" in manifest["files"]
+    assert manifest["config"]["domain_config"]["wrong_key"] == "ends" and "visited.h5" in manifest["files"]
 
 
 DOOR = "--domain doorkey --sub-goal go-to-goal"
