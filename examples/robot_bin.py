@@ -1,7 +1,7 @@
 """Is the block in the bin? Recordings of a simulated arm, and the truth to judge classifiers by.
 
     python robot_bin.py record takes                     # a LeRobotDataset, labels of its demonstrations
-    python robot_bin.py answer AUDIT takes labels.csv    # a person's answers to `hypogoal label --next`
+    python robot_bin.py answer AUDIT takes labels.csv    # a person's answers to what an audit proposes
     python robot_bin.py judge ENSEMBLE ...               # is an arm fooled that stops at the first positive frame?
 
 docs/robot.md tells the story. Needs `pip install 'hypogoal[lerobot]' mujoco` and, without a screen, an EGL driver.
@@ -22,7 +22,7 @@ from PIL import Image
 from robot_arm import FPS, HEIGHT, KEYS, WIDTH, play
 
 import hypogoal
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.dataset import digest, open_dataset
 
 GOAL = "block-in-bin"
@@ -78,7 +78,7 @@ def answer(audit: Path, takes: Path, out: Path, count: int = 20, random: int | N
     ensemble = open_artefact(audit, "recorded-audit").input("ensemble")
     states = open_dataset(open_artefact(ensemble, "ensemble").input("data")).unlabelled()
     truth = json.loads((takes / "truth.json").read_text())
-    with (audit / f"next/{GOAL}.csv").open(newline="") as file:
+    with (audit / f"next/{GOAL}/{TO_FILL_IN}").open(newline="") as file:
         rows = list(csv.DictReader(file))[:count]
     if random is not None:
         drawn = np.random.default_rng(random).choice(len(states), count, replace=False).tolist()

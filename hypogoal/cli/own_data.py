@@ -1,9 +1,8 @@
-"""The commands for what users bring: ``check``, ``label``, ``import``, ``export``."""
+"""The commands for what users bring: ``import``, ``export``, ``check``."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +15,6 @@ from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import amount, give, say
 from hypogoal.settings import configuration
-
-PLAYED = "a domain, a Gymnasium environment's id, or module:object."
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
@@ -121,60 +118,6 @@ def export(
     give(out)
 
 
-@cli.command(cli.OWN, "label doorkey --out marks/door-open")
-def label(
-    source: Annotated[str, Argument(help=f"To look at: a data file, .npz file or folder of images; to play: {PLAYED}")],
-    out: Annotated[Path, Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
-    next_: Annotated[
-        int, Option("--next", min=0, help="Of an audit's folder: the first N states to label; --out is a .csv file.")
-    ] = 0,
-    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
-    arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
-    heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
-    resume: Annotated[bool, Option("--resume", help="Continue with an existing folder.")] = False,
-    record: Annotated[Path | None, Option(help="Write what you play into this file, for 'collect --play'.")] = None,
-) -> None:
-    """Mark states by hand, in a window; 'import' reads them.
-
-    Keys: p positive, n negative, u unlabelled. Every mark is saved at once.
-    --heldout adds states of other layouts to the folder, to score members on.
-    """
-    from hypogoal.core import own_code
-    from hypogoal.stages.label import label as stage
-    from hypogoal.stages.label import label_next
-
-    if next_:
-        counts, data, goal = label_next(Path(source), out, count=next_, resume=resume)
-        say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
-        more = data.with_name(f"{data.stem}-more.h5")
-        cli.print_next(False, "import", data, "--label", f"{goal}={out}", "--out", more)
-        give(out)
-        return
-    with own_code.given(source):
-        counts = stage(
-            source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout,
-            resume=resume, record=record,
-        )  # fmt: skip
-    say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
-    if all(counts.values()):
-        cli.print_next(False, "import", out, "--out", out.with_suffix(".h5"))
-    give(out)
-
-
-def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
-    """``KEY=VALUE`` by key; the value is parsed as JSON if it is valid JSON, else it is text."""
-    values: dict[str, Any] = {}
-    for assignment in assignments:
-        name, equals, value = assignment.partition("=")
-        if not (equals and name.isidentifier()):
-            raise UserError("--arg needs KEY=VALUE", assignment, "For example --arg layout_seed=3.")
-        try:
-            values[name] = json.loads(value)
-        except (ValueError, RecursionError):
-            values[name] = value
-    return values
-
-
 @cli.command(cli.OWN, "check mine:DOMAIN")
 def check(
     domain: Annotated[str | None, Argument(help=cli.DOMAINS, autocompletion=cli.offer("domain"))] = None,
@@ -219,7 +162,7 @@ def _verdicts(
         from hypogoal.domains.base import load_domain
 
         loaded = load_domain(domain, by_user=True)
-        yield from check_domain(loaded, config, name=domain, **options)
+        yield from check_domain(loaded, config, **options)
         seen = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective

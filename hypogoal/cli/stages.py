@@ -138,7 +138,7 @@ def audit(
 
 
 def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, member: int | None) -> None:
-    from hypogoal.core.artefacts import open_artefact
+    from hypogoal.core.artefacts import DATA, TO_FILL_IN, open_artefact
     from hypogoal.dataset import open_dataset
     from hypogoal.stages.audit_recorded import audit_recorded, lines_of
 
@@ -149,9 +149,13 @@ def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, memb
     parts = audit_recorded(Path(source), call.out, sub_goal=sub_goal, **how)
     for line in () if call.how["quiet"] else lines_of(parts):
         say(line)
-    table = call.out.with_name("labels.csv")  # the audit's own folder is sealed
-    several = len(open_dataset(open_artefact(call.out).input("data")).sub_goals) > 1  # which 'label' refuses
-    cli.print_next(call.how["quiet"] or several, "label", call.out, "--next", 20, "--out", table)
+    data = open_artefact(call.out).input(DATA)
+    goals = open_dataset(data).sub_goals
+    if len(goals) == 1 and not call.how["quiet"]:  # 'import' takes labels of a data file's only sub-goal
+        table = call.out / "next" / goals[0] / TO_FILL_IN
+        more = data.with_name(f"{data.stem}-more.h5")
+        say(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
+        cli.print_next(False, "import", data, "--label", f"{goals[0]}={table}", "--out", more)
     give(call.out / "index.html")
 
 

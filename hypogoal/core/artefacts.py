@@ -31,6 +31,7 @@ from hypogoal.core.manifests import (
 DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
 # How a file of a kind begins, and what is in its first bytes, even if the rest is cut off.
 SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations.npy")}
+TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
 DEPTH = 3  # levels of folders below a run that are searched for artefacts
 THE_FILE = "the file is"
 PIECE = 1 << 20  # bytes hashed at once
@@ -221,7 +222,7 @@ def create_artefact(
         yield work.files
         if text := card({**header, "inputs": entries}, work.files):
             (work.files / "README.md").write_bytes(text.encode())
-        written = sorted(file for file in work.files.rglob("*") if file.is_file())
+        written = sorted(file for file in work.files.rglob("*") if file.is_file() and file.name != TO_FILL_IN)
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
         manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
         manifest |= {"presets": presets} if (presets := preset_digests([work.command])) else {}
@@ -276,7 +277,7 @@ def file_faults(artefact: Artefact) -> dict[str, str]:
 
 
 def extra_files(artefact: Artefact) -> list[str]:
-    """Files in the artefact's folder that its manifest does not list; artefacts and drafts within are ignored."""
+    """Files in the artefact's folder that its manifest should list; artefacts and drafts within are ignored."""
     listed, present = {MANIFEST, *artefact.manifest["files"]}, []
     for place, folders, names in os.walk(artefact.path):
         inner = [Path(place, name) for name in folders if not name.endswith(drafts.PARTIAL)]
@@ -284,7 +285,7 @@ def extra_files(artefact: Artefact) -> list[str]:
         folders[:] = sorted(path.name for path in inner if not path.is_symlink())
         files = [*(Path(place, name) for name in names), *(path for path in inner if path.is_symlink())]
         present += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
-    return [name for name in present if name not in listed]
+    return [name for name in present if name not in listed and Path(name).name != TO_FILL_IN]
 
 
 def file_fault(folder: Path, name: str, digest: str) -> str:

@@ -14,7 +14,7 @@ from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
 from hypogoal.dataset import NUMBERS, Dataset, Observations, fields_of
-from hypogoal.own_data.parts import Parts, as_observations, require_memory
+from hypogoal.own_data.parts import Parts, require_memory
 
 NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
@@ -52,15 +52,6 @@ def read_arrays(path: Path) -> Parts:
             raise UserError(f"{name} are {arrays[name].dtype}, not texts", path, "Give numpy.array of str.")
     named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
     return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, **named)
-
-
-def read_states(path: Path) -> Observations:
-    """The states (N, *obs) of a ``.npz`` file without labels: ``unlabelled``, or else ``observations``."""
-    arrays = _file(path)
-    for name in ("unlabelled", "observations"):
-        if name in arrays:
-            return as_observations(arrays[name], f"the array {name!r}")
-    raise UserError("no array 'unlabelled' or 'observations'", path, "Give one (N, ...).")
 
 
 def write_arrays(path: Path, dataset: Dataset) -> None:

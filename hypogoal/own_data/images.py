@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import struct
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,11 +65,6 @@ def _files(folder: Path) -> list[Path]:
     do = "Put images into positive/, negative/ and unlabelled/, and, for evaluation, into heldout/positive/ and so on."
     if not folder.is_dir():
         raise UserError("no such folder", folder, do)
-    return image_files(folder, do)
-
-
-def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Path]:
-    """A folder's files for :func:`read_image`, by name; if there are none, a ``UserError`` with the advice ``do``."""
     files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in (*SUFFIXES, ARRAY))
     if not files:
         raise UserError(f"no images ({', '.join(SUFFIXES)})", folder, do)
@@ -141,9 +135,4 @@ def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArr
 
 def _size(image: NDArray[np.uint8]) -> str:
     """Height and width, and the number of channels unless it is 1 or 3."""
-    return size_text(image.shape[: 2 if image.shape[2] in (1, 3) else 3])
-
-
-def size_text(shape: Sequence[int]) -> str:
-    """``84 x 84 x 4``."""
-    return " x ".join(map(str, shape))
+    return " x ".join(map(str, image.shape[: 2 if image.shape[2] in (1, 3) else 3]))

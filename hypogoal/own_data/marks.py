@@ -1,28 +1,27 @@
 """A table of states to label: unlabelled states of a data file, and their labels once somebody gave them (Spec I6).
 
-``audit`` proposes it, ``label --next`` or a script fills it in, ``import`` moves those states to the labelled ones.
+``audit`` proposes it beside pictures of the states, a person or a script fills it in, ``import`` moves those states to
+the labelled ones.
 """
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_text, write_table
+from hypogoal.core.files import read_text
 from hypogoal.dataset import NUMBERS, Collected, Dataset, States, digest, joined
 
-# The row among the unlabelled states, its :func:`hypogoal.dataset.digest`, its label: 1, 0 or nothing yet.
-COLUMNS = ("row", "digest", "label", "disagreement")
-REQUIRED = COLUMNS[:3]
+# The picture's file, the label (1, 0 or nothing yet), the row among the unlabelled states and its
+# :func:`hypogoal.dataset.digest`, how much members disagree.
+COLUMNS = ("name", "label", "row", "digest", "disagreement")
+REQUIRED = ("label", "row", "digest")
 MOST_BYTES = 1 << 26
 PLACE = re.compile(r"[0-9]{1,12}")
-LABELS = {"positive": "1", "negative": "0"}
 BYTE_ORDER = "\ufeff"  # with which spreadsheets begin a table
 DO = "Give a table from 'audit', with 1 or 0 as labels."
 
@@ -34,58 +33,13 @@ def read_marks(path: Path) -> list[dict[str, str]]:
         reader = csv.DictReader(text.splitlines())
         if not set(REQUIRED) <= set(reader.fieldnames or ()):
             raise UserError(f"a table of labels has the columns {', '.join(REQUIRED)}", path, DO)
-        rows = [{name: row[name].strip() for name in COLUMNS if row.get(name) is not None} for row in reader]
+        rows = [{name: row[name].strip() for name in REQUIRED if row.get(name) is not None} for row in reader]
     except (csv.Error, AttributeError):
         raise UserError("the table of labels is damaged", path, DO) from None
     for number, row in enumerate(rows, 2):
         if not set(REQUIRED) <= set(row) or not PLACE.fullmatch(row["row"]) or row["label"] not in ("", "0", "1"):
             raise UserError("this is no row and label", f"{path}, line {number}", DO)
     return rows
-
-
-class MarkedTable:
-    """Marks of a table's states, of which the first are shown, instead of ``Marks``' files; each is saved at once."""
-
-    kinds = tuple(LABELS)
-
-    def __init__(self, path: Path, rows: Sequence[dict[str, str]], pictures: Sequence[NDArray[np.uint8]]):
-        self._path, self._rows = path, list(rows)
-        self._places: dict[bytes, list[int]] = {}  # states that look alike are marked together
-        for place, picture in enumerate(pictures):
-            self._places.setdefault(digest(picture), []).append(place)
-        self._before: list[tuple[list[int], str]] = []
-        self._save()
-
-    def of(self, state: NDArray[np.uint8]) -> str | None:
-        """The mark of a state that is shown, or None."""
-        label = self._rows[self._places[digest(state)][0]]["label"]
-        return next((kind for kind, text in LABELS.items() if text == label), None)
-
-    def mark(self, state: NDArray[np.uint8], kind: str) -> None:
-        """Mark a state that is shown, or change its mark."""
-        places = self._places[digest(state)]
-        self._before.append((places, self._rows[places[0]]["label"]))
-        self._write(places, LABELS[kind])
-
-    def undo(self) -> bool:
-        """Take back the last mark of this session; false if there is none."""
-        if not self._before:
-            return False
-        self._write(*self._before.pop())
-        return True
-
-    def counts(self) -> dict[str, int]:
-        """The number of states of each kind."""
-        labels = [row["label"] for row in self._rows]
-        return {kind: labels.count(text) for kind, text in LABELS.items()}
-
-    def _write(self, places: Sequence[int], label: str) -> None:
-        for place in places:
-            self._rows[place]["label"] = label
-        self._save()
-
-    def _save(self) -> None:
-        write_table(self._path, COLUMNS, [[row.get(name, "") for name in COLUMNS] for row in self._rows])
 
 
 def with_marks(dataset: Dataset, marks: Path, sub_goal: str) -> tuple[Collected, int]:
@@ -98,7 +52,7 @@ def with_marks(dataset: Dataset, marks: Path, sub_goal: str) -> tuple[Collected,
         raise UserError("a table labels data of one sub-goal, its own", f"{sub_goal}={marks}", do)
     rows = [row for row in read_marks(marks) if row["label"]]
     if not rows:
-        raise UserError("the table has no label yet", marks, "Fill in 1 or 0, or use 'label --next'.")
+        raise UserError("the table has no label yet", marks, "Fill in 1 or 0.")
     observations, origins = dataset.unlabelled(), dataset.unlabelled_origins()
     chosen, labels = np.array([int(row["row"]) for row in rows]), np.array([row["label"] == "1" for row in rows])
     fits = len(set(chosen.tolist())) == len(rows) and chosen.max() < len(observations)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.cards import create_artefact
-from hypogoal.core.artefacts import Artefact, claim, open_artefact, versions
+from hypogoal.core.artefacts import TO_FILL_IN, Artefact, claim, open_artefact, versions
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
@@ -19,6 +19,7 @@ from hypogoal.dataset import Observations, States, digest, joined, open_dataset,
 from hypogoal.evaluation import page, recorded
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Block
+from hypogoal.evaluation.pictures import image_png
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.own_data.marks import COLUMNS
 
@@ -56,9 +57,10 @@ def audit_recorded(
 ) -> list[dict[str, Any]]:
     """Audit the members of the ensemble artefact ``source`` on the data file that it was trained on; write ``out``.
 
-    ``audit.json``, the page ``index.html`` and, for each sub-goal (or the one that is named), ``next/SUB_GOAL.csv``:
-    the unlabelled states to label next, best first. Returns each sub-goal's part of ``audit.json``. An unknown
-    sub-goal, data that are gone or have no unlabelled states, and an ``out`` that exists are a ``UserError``.
+    ``audit.json``, the page ``index.html`` and, for each sub-goal (or the one that is named), ``next/SUB_GOAL/``: the
+    unlabelled states to label next, best first, as pictures and a table to fill in (:func:`write_next`). Returns each
+    sub-goal's part of ``audit.json``. An unknown sub-goal, data that are gone or have no unlabelled states, and an
+    ``out`` that exists are a ``UserError``.
     """
     device, artefact = prepare(device), open_artefact(source, "ensemble").whole()
     goals = artefact.config["sub_goals"]
@@ -72,11 +74,10 @@ def audit_recorded(
         create_artefact(out, **card, inputs=[source, data], force=force) as folder,
         Progress("audit", len(goals), quiet=quiet) as progress,
     ):
-        (folder / "next").mkdir()
         parts, sections = [], []
         for goal in goals:
             look = look_at(artefact, data, goal, device)
-            part, section = findings(look, folder / "next" / f"{goal}.csv")
+            part, section = findings(look, folder / "next" / goal)
             parts.append(part)
             sections.append(section)
             progress.advance()
@@ -105,8 +106,8 @@ def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
     )
 
 
-def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
-    """A sub-goal's numbers and its section of the page; the states to label next go into ``table``."""
+def findings(look: Look, folder: Path) -> tuple[dict[str, Any], Block]:
+    """A sub-goal's numbers and its section of the page; the states to label next go into ``folder``."""
     rows = spread_rows(len(look.unlabelled), COMPARED)  # the states that are compared
     states, scores = look.unlabelled[rows], look.scores[rows]
     sketches = recorded.sketches_of(states)
@@ -115,11 +116,7 @@ def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
     members = recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist())
     positive = scores > look.thresholds
     disagree = (positive.any(1) & ~positive.all(1)).mean()
-    write_table(
-        table,
-        COLUMNS,
-        [[int(rows[row]), digest(states[row]).hex(), "", round(float(disputed[row]), 4)] for row in proposed],
-    )
+    write_next(folder, states[proposed], rows[proposed], disputed[proposed])
     numbers = {
         "sub_goal": look.sub_goal,
         "known": len(look.known.labels),
@@ -129,6 +126,22 @@ def findings(look: Look, table: Path) -> tuple[dict[str, Any], Block]:
         "next": [int(rows[row]) for row in proposed[:CARDS]],
     }
     return numbers, _section(look, numbers, rows, sketches, proposed, disputed)
+
+
+def write_next(folder: Path, states: Observations, rows: NDArray[np.int64], disputed: NDArray[np.float64]) -> None:
+    """Write proposed states (N, *obs), rows of the unlabelled ones, as pictures and a table to fill in.
+
+    ``001.png``, ... are in the table's order; states without pictures have the table alone.
+    """
+    folder.mkdir(parents=True)
+    lines = []
+    for number, state in enumerate(states):
+        picture = recorded.picture_of(state)
+        name = "" if picture is None else f"{number + 1:03d}.png"
+        if picture is not None:
+            (folder / name).write_bytes(image_png(picture))
+        lines.append([name, "", int(rows[number]), digest(state).hex(), round(float(disputed[number]), 4)])
+    write_table(folder / TO_FILL_IN, COLUMNS, lines)
 
 
 def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:

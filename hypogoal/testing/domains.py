@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.commands import command
 from hypogoal.core.config import from_values, meant, resolve
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.preflight import human
@@ -49,28 +48,25 @@ def check_domain(
     layout_seed: int = 0,
     seed: int = 0,
     seconds: float = SECONDS,
-    name: str = "",
     progress: Progress | None = None,
 ) -> Iterator[Verdict]:
     """Whether a domain keeps the promises that the stages rely on.
 
     Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
     (None: the defaults). ``seed`` is for both. It plays less of a slow domain, so that it takes at most about
-    ``seconds``; what it then skips is a warning, and so is a sub-goal that play does not reach. ``name`` is the user's
-    name for the domain; ``progress`` shows how long this takes.
+    ``seconds``; what it then skips is a warning, and so is a sub-goal that play does not reach. ``progress`` shows
+    how long this takes.
     """
     progress = progress or Progress("check", total=1, quiet=True)
     progress.expect(PLAYS * COUNT * STEPS)
-    yield from run(_Contract(domain, config, layout_seed, seed, seconds, name, progress).tests())
+    yield from run(_Contract(domain, config, layout_seed, seed, seconds, progress).tests())
     progress.expect(progress.done)
 
 
 class _Contract:
-    def __init__(
-        self, domain: Domain, config: Any, layout_seed: int, seed: int, seconds: float, name: str, progress: Progress
-    ):
+    def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int, seconds: float, progress: Progress):
         self.domain, self.config, self.layout_seed, self.seed = domain, config, layout_seed, seed
-        self.seconds, self.name, self.progress = seconds, name, progress
+        self.seconds, self.progress = seconds, progress
         self.end, self.reached_all = monotonic() + seconds, True
         self.count = STEPS  # of each test of an engine
         self.spent, self.played = 0.0, 0  # seconds in ``steps``, and steps of single environments, for the pace
@@ -334,12 +330,7 @@ class _Contract:
         text = f"{goal} held in {'every' if always else 'no'} state that play met on the labelled layouts, "
         text += "in the time that there was: " if self.hurried else "so 'collect' would stop here: "
         text += f"it is {'hard to leave' if always else 'rare'}, or its function errs"
-        if self.domain.observation_dtype != PICTURE or not self.domain.has_env or not self.name:
-            return f"{text}. {GET_MORE}"
-        seeds = getattr(self.config, "labelled_seeds", (0,))[:1]
-        arguments = ("label", self.name, "--out", f"marks/{goal}", "--record", f"{goal}.json", "--layout-seed", *seeds)
-        do = f"Bring a policy that gets there, or play it by hand and give --play {goal}.json"
-        return f"{text}. {do}: {command(*arguments)}"
+        return f"{text}. {GET_MORE}"
 
     def actions(self, engine: Engine, *, timed: bool = False) -> Iterator[NDArray[np.int64]]:
         """Random actions (E,), the same at every call; ``timed``: play less from now on if the first steps are slow."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 import re
 import shlex
 import subprocess
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from keyboard import label
 from PIL import Image
 from typer.main import get_command
 
@@ -26,7 +24,7 @@ from hypogoal.evaluation.run import read_evaluation
 TESTS, PACKAGE = Path(__file__).parents[1], Path(own_code.__file__).parents[1]
 PRINTED = re.compile(r"(?:HYPOGOAL_TRUST=\S+ )?hypogoal .*$")
 OWN = """
-from corridor_env import NEVER, SUB_GOALS, CorridorEnv, Sensed
+from corridor_env import SUB_GOALS, CorridorEnv, Sensed
 from hypogoal import GymnasiumDomain
 from margin import pair_loss
 from wide_network import wide
@@ -104,8 +102,8 @@ def test_what_follows_allows_networks_and_objectives_too(shell: Shell) -> None:
     assert "next: " in shell(line)
 
 
-def test_what_follows_pictures_and_marks(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An imported folder of images, and states marked by hand; training is shortened by what is added behind."""
+def test_what_follows_pictures(shell: Shell) -> None:
+    """An imported folder of images; training is shortened by what is added behind."""
     few = " --steps 2 --members 2 --set workers=1"
     for number, kind in enumerate(("positive", "negative", "unlabelled")):
         folder = Path("my  photos") / kind
@@ -115,20 +113,6 @@ def test_what_follows_pictures_and_marks(shell: Shell, monkeypatch: pytest.Monke
             Image.fromarray(picture).save(folder / f"{index}.png")
     line = printed(shell("hypogoal import 'my  photos' --out 'my  photos.h5' --domain tiny:DOMAIN"), "next: ")
     assert line.startswith("HYPOGOAL_TRUST=tiny:DOMAIN ") and "next: " in shell(line + few)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    monkeypatch.setenv(TRUST, "tiny:DOMAIN")
-    assert label("n 1 p m 1 0 u 0 0 u", "tiny:DOMAIN", "--out", "the  marks", "--layout-seed", "1") == 0
-
-
-def test_a_rare_sub_goal_is_played_by_hand_as_printed(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command of ``check`` records play, and what it says of the file is what ``check`` then takes."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    text = shell("hypogoal check tiny:NEVER --set steps=150 --set heldout_seeds=4,5")
-    line = printed(text, "play it by hand and give --play on-the-moon.json: ")
-    assert label("0 1 1", *shlex.split(line)[2:]) == 0
-    assert json.loads(Path("on-the-moon.json").read_text()) == [{"layout_seed": 0, "actions": [0, 1, 1]}]
-    text = shell("hypogoal check tiny:NEVER --set steps=150 --set heldout_seeds=4,5 --play on-the-moon.json")
-    assert "ok   collected again" in text
 
 
 def test_what_an_error_says_to_do(shell: Shell) -> None:

@@ -168,9 +168,6 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     capsys.readouterr()
     for words in (["report", str(run), "--videos", "1", "--force"], ["show", data, "--pictures", str(tmp_path)]):
         assert main(words) == 2 and "pictures" in capsys.readouterr().err
-    for words in (["vector_goals:DOMAIN"], [data]):
-        assert main(["label", *words, "--out", str(tmp_path / "marked")]) == 2
-        assert "only observations that are images can be shown" in capsys.readouterr().err
     for setting in ("network=paper", "meta_network=paper"):
         assert (
             main(["train-meta", ensemble, "--out", str(tmp_path / "m"), "-q", *settings(setting, "experience=own")])

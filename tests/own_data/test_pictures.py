@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from keyboard import label
 from PIL import Image
 from test_import import arrays, pictures, save_images, save_minari
 
@@ -17,7 +16,6 @@ from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data.images import read_image, read_images
-from hypogoal.own_data.marking import recorded_states
 from hypogoal.own_data.parts import Parts, collected_of
 
 UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
@@ -75,7 +73,6 @@ def test_an_image_is_upright(tmp_path: Path, orientation: int) -> None:
         (tmp_path / "goal" / name).mkdir(parents=True)
         saved(tmp_path / "goal" / name / "1.png", STORED[orientation], exif_of(orientation))
     np.testing.assert_array_equal(read_images(tmp_path / "goal").observations, [UPRIGHT, UPRIGHT])
-    np.testing.assert_array_equal(recorded_states(tmp_path / "goal" / "positive"), [UPRIGHT])
 
 
 def test_an_orientation_that_is_none_is_ignored(tmp_path: Path) -> None:
@@ -122,19 +119,20 @@ def test_images_of_several_sizes_are_one_size_when_made_smaller(tmp_path: Path) 
         read_images(folder, resize=30)
 
 
-def test_marked_states_are_made_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6: pictures that were marked by hand, and stacks of frames, which are files of arrays."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    for channels in (3, 4):
-        states = np.random.default_rng(0).integers(0, 255, (5, 64, 48, channels), dtype=np.uint8)
-        np.savez(tmp_path / "states.npz", observations=states)
-        out = tmp_path / f"goal-{channels}"
-        assert label("p n n u", str(tmp_path / "states.npz"), "--out", str(out)) == 0
-        given = ["--heldout", "0.4", "--resize", "16", "-q"]
-        assert main(["import", str(out), "--out", str(tmp_path / f"{channels}.h5"), *given]) == 0
-        data = open_dataset(tmp_path / f"{channels}.h5")
-        wanted = states[3].reshape(16, 4, 12, 4, channels).mean((1, 3))
-        assert np.abs(data.unlabelled()[0] - wanted).max() <= 1
+def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
+    """Spec B6: a ``.npy`` file each; they keep their channels, and are made smaller like pictures."""
+    states = np.random.default_rng(0).integers(0, 255, (6, 64, 48, 4), dtype=np.uint8)
+    for number, state in enumerate(states):
+        folder = tmp_path / "goal" / ("positive", "negative", "unlabelled")[number % 3]
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"{number}.npy", state)
+    parts = read_images(tmp_path / "goal")
+    np.testing.assert_array_equal(parts.observations, states[[0, 3, 1, 4]])
+    np.testing.assert_array_equal(parts.unlabelled, states[[2, 5]])
+    given = ["--heldout", "0.4", "--resize", "16", "-q"]
+    assert main(["import", str(tmp_path / "goal"), "--out", str(tmp_path / "goal.h5"), *given]) == 0
+    wanted = states[[2, 5]].reshape(2, 16, 4, 12, 4, 4).mean((2, 4))
+    assert np.abs(open_dataset(tmp_path / "goal.h5").unlabelled() - wanted).max() <= 1
     many = np.random.default_rng(0).integers(0, 255, (4, 48, 60, 3), dtype=np.uint8)
     for name in ("positive", "negative", "unlabelled"):
         (tmp_path / "stacks" / name).mkdir(parents=True)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
-from keyboard import label
 
 from hypogoal.cli import main
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.dataset import digest, open_dataset
+from hypogoal.evaluation.recorded import picture_of
 from hypogoal.own_data.marks import read_marks
 from hypogoal.stages.audit_recorded import lines_of
 from tests.own_data import mixed
@@ -37,10 +39,11 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     """Numbers, the table and the page; the rows are states of the file, each once, disputed ones first."""
     audit, data = audited / "audit", open_dataset(audited / "data.h5")
     artefact = open_artefact(audit, "recorded-audit").whole()
-    assert artefact.manifest["files"].keys() == {"audit.json", "index.html", f"next/{GOAL}.csv", "README.md"}
+    pictures = {f"next/{GOAL}/{number:03d}.png" for number in range(1, 21)}
+    assert artefact.manifest["files"].keys() == {"audit.json", "index.html", "README.md", *pictures}
     [part] = json.loads((audit / "audit.json").read_text())["sub_goals"]
     assert (part["sub_goal"], part["known"], part["unlabelled"], len(part["members"])) == (GOAL, 56, 20, 2)
-    rows = read_marks(audit / "next" / f"{GOAL}.csv")
+    rows = read_marks(audit / "next" / GOAL / TO_FILL_IN)
     places = [int(row["row"]) for row in rows]
     assert sorted(places) == list(range(20)) and places == part["next"]
     assert all(digest(data.unlabelled()[place]).hex() == row["digest"] for place, row in zip(places, rows, strict=True))
@@ -49,31 +52,36 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     assert "Content-Security-Policy" in page and "http" not in page.replace("http-equiv", "")
 
 
-def test_what_is_labelled_next_becomes_data(
-    audited: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The window shows the first states of the table; marks are saved at once; ``import`` moves these states."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    table, more = tmp_path / "labels.csv", tmp_path / "more.h5"
-    assert label("p n p backspace n", str(audited / "audit"), "--next", "4", "--out", str(table)) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == "1 positive, 2 negative" and printed[-1] == str(table)
-    rows = read_marks(table)
-    assert [row["label"] for row in rows] == ["1", "0", "", "0", *[""] * 16]
-    assert label("", str(audited / "audit"), "--next", "1", "--out", str(table), "--resume") == 0
-    assert read_marks(table) == rows, "labels of states that are not shown stay"
-    assert main(["label", str(audited / "audit"), "--next", "4", "--out", str(table)]) == 2, "it exists"
-    assert "the table exists already" in capsys.readouterr().err
-    assert label("right right p", str(audited / "audit"), "--next", "4", "--out", str(table), "--resume") == 0
-    rows = read_marks(table)[:4]
-    assert [row["label"] for row in rows] == ["1", "0", "1", "0"]
-    assert main(["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", "--out", str(more), "-q"]) == 0
-    before, after = open_dataset(audited / "data.h5"), open_dataset(more)
-    places = [int(row["row"]) for row in rows]
+def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each state of the table is a picture; filled in, it is imported as the audit printed, and the audit is whole."""
+    audit = tmp_path / "audit"
+    assert main(["audit", str(audited / "ensemble"), "--out", str(audit)]) == 0
+    (printed,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
+    words = shlex.split(printed)[2:]
+    table = audit / "next" / GOAL / TO_FILL_IN
+    assert words[:4] == ["import", str((audited / "data.h5").resolve()), "--label", f"{GOAL}={table}"]
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    before = open_dataset(audited / "data.h5")
+    unlabelled = before.unlabelled()
+    for row in rows:
+        with PIL.Image.open(table.with_name(row["name"])) as image:
+            np.testing.assert_array_equal(np.asarray(image), picture_of(unlabelled[int(row["row"])]))
+    for row, answer in zip(rows[:4], "1010", strict=True):
+        row["label"] = answer
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    assert main(["verify", str(audit)]) == 0
+    more = tmp_path / "more.h5"
+    assert main([*words[:5], str(more), "-q"]) == 0
+    after = open_dataset(more)
+    places = [int(row["row"]) for row in rows[:4]]
     labelled = after.labelled(GOAL)
-    np.testing.assert_array_equal(labelled.observations[-4:], before.unlabelled()[places])
+    np.testing.assert_array_equal(labelled.observations[-4:], unlabelled[places])
     assert labelled.labels[-4:].tolist() == [True, False, True, False] and len(labelled.labels) == 44
-    np.testing.assert_array_equal(after.unlabelled(), np.delete(before.unlabelled(), places))
+    np.testing.assert_array_equal(after.unlabelled(), np.delete(unlabelled, places))
     np.testing.assert_array_equal(after.heldout(GOAL).observations, before.heldout(GOAL).observations)
     few = ["--set", "steps=2", "--set", "members=2"]
     assert main(["train-ensemble", str(more), "--out", str(tmp_path / "ensemble"), "-q", *few]) == 0
@@ -81,7 +89,7 @@ def test_what_is_labelled_next_becomes_data(
 
 def test_a_data_file_is_taken_as_it_is(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What ``import`` would do to other sources is not silently left out."""
-    out, table = tmp_path / "more.h5", audited / "audit/next" / f"{GOAL}.csv"
+    out, table = tmp_path / "more.h5", audited / "audit/next" / GOAL / TO_FILL_IN
     for words in (["--resize", "32"], ["--every", "2"], ["--domain", "doorkey"], ["--key", "front"], ["--stack"]):
         words = ["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", *words, "--out", str(out)]
         assert main(words) == 2
@@ -103,8 +111,9 @@ def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path, capsys: pytes
     for words in (["--sub-goal", "one", "--out", str(run / "of-one")], ["--out", str(run / "audit")]):
         assert main(["audit", str(run / "ensemble"), *words]) == 0
         assert "next:" not in capsys.readouterr().out
-    assert {path.name for path in (run / "audit/next").iterdir()} == {"one.csv", "two.csv"}
-    assert main(["label", str(run / "audit"), "--next", "3", "--out", str(run / "labels.csv")]) == 2
+    assert {path.name for path in (run / "audit/next").iterdir()} == {"one", "two"}
+    table = run / "audit/next/one" / TO_FILL_IN
+    assert main(["import", str(run / "data.h5"), "--label", f"one={table}", "--out", str(run / "more.h5")]) == 2
     assert "a table labels data of one sub-goal" in capsys.readouterr().err
 
 
@@ -133,7 +142,7 @@ def damaged(table: Path, out: Path, **cells: str) -> Path:
 def test_a_table_that_does_not_fit_is_refused(
     audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], cells: dict[str, str], says: str
 ) -> None:
-    table = damaged(audited / "audit/next" / f"{GOAL}.csv", tmp_path / "labels.csv", **cells)
+    table = damaged(audited / "audit/next" / GOAL / TO_FILL_IN, tmp_path / "labels.csv", **cells)
     out = tmp_path / "more.h5"
     assert main(["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", "--out", str(out)]) == 2
     error = capsys.readouterr().err
@@ -154,10 +163,6 @@ def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsy
         assert main(["audit", *words, "--out", str(out)]) == 2
         error = capsys.readouterr().err
         assert says in error and error.count("\n") == 1 and not out.exists()
-    assert main(["label", ensemble, "--next", "3", "--out", str(tmp_path / "labels.csv")]) == 2
-    assert "but recorded-audit is needed" in capsys.readouterr().err
-    assert main(["label", str(audited / "audit"), "--next", "3", "--out", str(tmp_path / "labels")]) == 2
-    assert "--next writes a table" in capsys.readouterr().err
 
 
 def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:
