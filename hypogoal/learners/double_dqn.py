@@ -1,12 +1,13 @@
 """Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies, exploration schedules, and steps."""
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
+from torch.nn.utils import clip_grad_norm_
 
 from hypogoal.core.errors import NumericalError
 
@@ -53,29 +54,25 @@ def follow(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> No
 
 
 def descend(
-    loss: Tensor, backward: Callable[[Tensor], Tensor], optimiser: torch.optim.Optimizer, owner: str, where: str
+    loss: Tensor,
+    network: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    owner: str,
+    where: str,
+    largest: float = math.inf,
 ) -> None:
-    """Spec G3: a step of ``optimiser`` down a loss; ``backward`` fills the gradients and returns their norm, ().
+    """Spec G3: a step of ``optimiser`` down a loss, with the network's gradients cut to the norm ``largest``.
 
     A loss or gradient with NaN or Inf is a ``NumericalError`` that names ``owner`` and ``where``; the weights stay.
     """
     if not torch.isfinite(loss):
         raise NumericalError(f"the loss of {owner} is {float(loss.detach())} {where}")
-    norm = backward(loss)
+    network.zero_grad()
+    loss.backward()
+    norm = clip_grad_norm_(network.parameters(), largest)
     if not torch.isfinite(norm):
         raise NumericalError(f"a gradient of {owner} is {float(norm)} {where}")
     optimiser.step()
-
-
-def backward_of(network: nn.Module) -> Callable[[Tensor], Tensor]:
-    """For :func:`descend`, of a network whose gradients are taken as they are."""
-
-    def backward(loss: Tensor) -> Tensor:
-        network.zero_grad(set_to_none=True)
-        loss.backward()
-        return get_total_norm([weight.grad for weight in network.parameters() if weight.grad is not None])
-
-    return backward
 
 
 def linear_epsilon(steps: NDArray[np.int64], over: int, final: float) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +18,6 @@ from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
-from hypogoal.learners.flat import FlatParameters
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
 from hypogoal.meta.smdp import smdp_advantages
@@ -70,8 +68,7 @@ class MetaPolicy(Chooser):
             self.network = network.to(self.device)
             self.head = HEADS[config.head](options).to(self.device)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head})
-        self._flat = FlatParameters(self.policy)
-        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.meta_learning_rate, eps=1e-5, fused=True)
+        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=config.meta_learning_rate, eps=1e-5, fused=True)
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         count = engine.count
@@ -171,15 +168,13 @@ class MetaPolicy(Chooser):
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)
                 loss = loss + VALUE_WEIGHT * (out[:, -1] - goal[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
-                self._step(loss, f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}")
+                where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"
+                descend(loss, self.policy, self.optimiser, "the meta-policy", where, GRADIENT_NORM)
         self.updates += 1
         return {**certainty, "value": float(values.mean())}
 
-    def _step(self, loss: Tensor, where: str) -> None:
-        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, "the meta-policy", where)
-
     def state(self) -> dict[str, Tensor]:
-        return {name: value.contiguous() for name, value in self.policy.state_dict().items()}
+        return dict(self.policy.state_dict())
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""

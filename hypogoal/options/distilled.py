@@ -11,7 +11,6 @@ Measured: docs/results/distilled.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +19,6 @@ from torch import Tensor
 
 from hypogoal.core.seeding import seed_for
 from hypogoal.learners.double_dqn import descend
-from hypogoal.learners.flat import FlatParameters
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration
@@ -61,8 +59,7 @@ class DistilledLearner(LightLearner):
             shape, standard = self.pictures.observation_shape, self.engine.standard
             network = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
         self.online = self.target = network.to(self.device)  # best actions are known: no target moves
-        self._flat = FlatParameters(self.online)
-        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
+        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.best = np.zeros((0, self.options), np.min_scalar_type(2 ** len(self.actions) - 1))
         self.kind = np.zeros(0, np.uint8)
         self.steps = self.updates = self._due = 0
@@ -139,8 +136,7 @@ class DistilledLearner(LightLearner):
         for group in self.optimiser.param_groups:
             group["lr"] = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
         where = f"in the batch of update {self.updates}, step {self.steps}"
-        backward = partial(self._flat.backward, largest=GRADIENT_NORM)
-        descend(loss, backward, self.optimiser, "the options", where)
+        descend(loss, self.online, self.optimiser, "the options", where, GRADIENT_NORM)
         self.updates += 1
         return {"option_loss": float(loss.detach()), "planned_states": float(len(planned))}
 

@@ -19,7 +19,7 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import backward_of, descend
+from hypogoal.learners.double_dqn import descend
 from hypogoal.options.networks import LightQNetwork, apply_to_states, standard_in
 
 NAME, PREFIX = "initiation.safetensors", "network."
@@ -121,7 +121,7 @@ class Initiation(Resumable):
         reached = tensor(self.reached[drawn], self.device).float()
         loss = torch.nn.functional.binary_cross_entropy_with_logits(of_option, reached)
         where = f"after {self.count} executions"
-        descend(loss, backward_of(self.network), self.optimiser, "the initiation sets", where)
+        descend(loss, self.network, self.optimiser, "the initiation sets", where)
         return {"initiation_loss": float(loss.detach())}
 
     def state(self) -> dict[str, Tensor]:

@@ -198,7 +198,7 @@ class Learner(Part, ABC):
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""
-        state = {name: value.contiguous() for name, value in self.weights().items()}
+        state = dict(self.weights())
         if len(self.actions) < self.engine.n_actions:
             state["actions"] = torch.from_numpy(self.actions.copy())
         return state | {name: torch.from_numpy(getattr(self, name).copy()) for name in COUNTERS}

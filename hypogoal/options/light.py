@@ -23,7 +23,6 @@ from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow
-from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import FULL, STACK, OptionConfig
@@ -87,8 +86,7 @@ class LightLearner(Learner):
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
         self.pixels = Pixels(self.pictures, 2 * config.option_batch, self.device) if pictures else None
-        self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
-        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
+        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, Lessons)
         self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
         self.steps = self.updates = self._due = 0
@@ -209,10 +207,10 @@ class LightLearner(Learner):
         finite = bool(torch.isfinite(loss))
         owner = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
         where = f"in the batch of update {self.updates}, step {self.steps}"
-        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, owner, where)
+        descend(loss, self.online, self.optimiser, owner, where, GRADIENT_NORM)
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
-            follow([self._flat_target.vector], [self._flat.vector], self.config.target_tau)
+            follow(self.target.parameters(), self.online.parameters(), self.config.target_tau)
 
     def weights(self) -> dict[str, Tensor]:
         return {f"online.{name}": value for name, value in self.online.state_dict().items()}

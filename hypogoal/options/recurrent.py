@@ -23,7 +23,7 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.dataset import PICTURE, Observations
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import backward_of, descend, double_q_targets, follow
+from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
@@ -191,7 +191,7 @@ class RecurrentLearner(Learner):
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber * self.tensor(weights)).mean()
         where = f"in the batch of its update {member.updates}, its step {self.option_steps[option]}"
-        descend(loss, backward_of(member.online), member.optimiser, f"option {option}", where)
+        descend(loss, member.online, member.optimiser, f"option {option}", where)
         member.updates += 1
         if member.updates % config.target_interval == 0:
             networks = (member.target, member.online)

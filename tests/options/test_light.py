@@ -20,15 +20,15 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
         engine.step(rng.integers(engine.n_actions, size=4))
     learner = LightLearner(engine, oracle_terminations(engine, range(5)), OptionConfig(environments=4), 0)
     with torch.no_grad():
-        learner._flat_target.vector.mul_(0.9)  # so that the target is another network
+        for weight in learner.target.parameters():
+            weight.mul_(0.9)  # so that the target is another network
     s, following = rng.integers(20, size=(2, 64))
     weights = torch.from_numpy(rng.normal(size=(64, 5, 7)).astype(np.float32))
 
     def slopes(values: torch.Tensor) -> torch.Tensor:
-        assert learner._flat.vector.grad is not None
-        learner._flat.vector.grad.zero_()
-        (values * weights).sum().backward()
-        return learner._flat.vector.grad.clone()
+        loss = (values * weights).sum()
+        gradients = torch.autograd.grad(loss, [*learner.online.parameters()])
+        return torch.cat([gradient.flatten() for gradient in gradients])
 
     here, next_online, next_target = learner._values(s, following)
     fast = slopes(here)
