@@ -26,7 +26,7 @@ from benchmarks.doorkey import machine
 from hypogoal.dataset import digest
 from hypogoal.domains.montezuma_emulator import N_ACTIONS, Emulator, Position
 from hypogoal.domains.montezuma_ladders import LADDERS
-from hypogoal.domains.montezuma_states import PLAYS, Shown, emulator_of_process, gather, labels_of
+from hypogoal.domains.montezuma_states import Shown, emulator_of_process, expert_play, gather, labels_of
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
 
 WANTED_RATE = 700  # made
@@ -47,7 +47,7 @@ def make(room: int, count: int, seed: int) -> int:
     """Distinct stacks of the expert's rollouts, with their labels, until there are so many; positives among them."""
     rng = np.random.default_rng(seed)
     found: dict[bytes, Shown] = {}
-    for shown in PLAYS["expert"](emulator_of_process(), room, rng, [CLIMB_DOWN]):
+    for shown in expert_play(emulator_of_process(), room, rng, [CLIMB_DOWN]):
         found.setdefault(digest(shown.stack), shown)
         if len(found) == count:
             break

@@ -28,7 +28,6 @@ from hypogoal.domains.montezuma_env import BEGINNINGS, MAX_STEPS, beginning_name
 from hypogoal.domains.montezuma_ladders import GROUPS, distance_to, distance_to_base
 from hypogoal.domains.montezuma_states import (
     KINDS,
-    PLAYS,
     RoomStates,
     emulator_of_process,
     gather,
@@ -74,13 +73,6 @@ class MontezumaConfig:
         f"what is labelled: {', '.join(SUB_GOALS)}; others than ladders have five or three groups",
         source="paper; the others: the authors' code",
     )
-    unlabelled_rooms: tuple[int, ...] = setting(
-        (),
-        "rooms of the unlabelled states; empty: two, for ladders one with an unlabelled ladder, and 18, without one",
-        source="paper: for N = 1 one room of each kind",
-        low=0,
-        high=ROOMS - 1,
-    )
     states_per_room: int = setting(
         600, "labelled states of each room of the groups", unit="states", source="own choice", low=1, high=100_000
     )
@@ -91,12 +83,6 @@ class MontezumaConfig:
         300, "held-out states of each of the 24 rooms", unit="states", source="own choice", low=1, high=100_000
     )
     heldout_seed: int = setting(0, "another number draws other held-out states and changes nothing else", low=0)
-    unlabelled_from: str = setting(
-        "expert",
-        "who plays in the unlabelled rooms: the labelled states' expert, or uniform-random actions from their sides",
-        source="expert: own choice; random: the paper's suggestion",
-        choices=PLAYS,
-    )
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
 
     def __post_init__(self) -> None:
@@ -131,13 +117,11 @@ def labelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
 
 
 def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
-    """The rooms of the unlabelled states: the configured ones, or the first sub-goal's.
+    """The two rooms of the unlabelled states.
 
-    These are one without labels where it holds somewhere and one where it holds nowhere; or two of these, if all others
-    have labels.
+    One without labels where the first sub-goal holds somewhere and one where it holds nowhere; or two of these, if all
+    others have labels. Source: the paper, for N = 1.
     """
-    if config.unlabelled_rooms:
-        return tuple(dict.fromkeys(config.unlabelled_rooms))
     first = chosen(config)[0]
     left = [room for room in first.unlabelled if room not in labelled_rooms(config)]
     return (left[0], first.others[0]) if left else first.others
@@ -202,17 +186,17 @@ class MontezumaDomain(Domain):
         that keep each room's states until all rooms are complete; a room kept there is not gathered again. All three
         sets have labels (the unlabelled states' are for tests only). Origins: see ``montezuma_states.origins_of``;
         held-out states also have ``seen``: 0 the room is in no training set, 1 it is an unlabelled room, 2 a labelled
-        one. An unknown room, no emulator, or a room with too few different states is a ``UserError``.
+        one. No emulator, or a room with too few different states is a ``UserError``.
         """
         sub_goals, labelled, unlabelled = chosen(config), labelled_rooms(config), unlabelled_rooms(config)
         tasks: list[_Task] = []
         expected = 0
-        for name, rooms, wanted, stream, play in (
-            ("labelled", labelled, config.states_per_room, (), "expert"),
-            ("unlabelled", unlabelled, config.unlabelled_per_room, (), config.unlabelled_from),
-            ("heldout", range(ROOMS), config.heldout_per_room, (config.heldout_seed,), "expert"),
+        for name, rooms, wanted, stream in (
+            ("labelled", labelled, config.states_per_room, ()),
+            ("unlabelled", unlabelled, config.unlabelled_per_room, ()),
+            ("heldout", range(ROOMS), config.heldout_per_room, (config.heldout_seed,)),
         ):
-            draw = partial(gather, play=play, held_out=name == "heldout", unclear=name == "unlabelled")
+            draw = partial(gather, held_out=name == "heldout", unclear=name == "unlabelled")
             for room in rooms:
                 job = partial(draw, room, wanted, seed, ("montezuma", name, *stream), sub_goals=sub_goals)
                 tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None)))

@@ -1,4 +1,4 @@
-"""States of a room of Montezuma's Revenge from scripted or random play, with kinds and labels (Spec B4, B5, B7)."""
+"""States of a room of Montezuma's Revenge from scripted play, with kinds and labels (Spec B4, B5)."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -45,7 +45,6 @@ MOST_STEPS = 60  # agent steps per state to keep, after which a room is given up
 HELD_OUT_EACH = 3  # every third stack, by digest, is for the held-out set
 
 ROLLOUT_STEPS = 40
-RANDOM_STEPS = 200
 SETTLE = 4  # agent steps that fill the stack with frames of the start
 PHASES = (2, 200)  # frames for which the room's enemies move before the first step
 ROLLOUTS_PER_PHASE = 4
@@ -148,20 +147,19 @@ def gather(
     stream: tuple[str | int, ...],
     *,
     sub_goals: Sequence[SubGoal],
-    play: str,
     held_out: bool,
     unclear: bool,
 ) -> RoomStates:
     """``wanted`` different states of a room: rollouts until there are enough, then a choice among them.
 
-    ``seed`` and ``stream`` determine all randomness, see ``rng_for``; ``play``, a name in ``PLAYS``, is how the agent
-    plays; ``held_out``, the side of ``may_be_held_out``; ``unclear``, whether to keep states at unclear places, such as
-    bases of ladders that continue through the floor. A room with too few different states is a ``UserError``.
+    ``seed`` and ``stream`` determine all randomness, see ``rng_for``; ``held_out``, the side of ``may_be_held_out``;
+    ``unclear``, whether to keep states at unclear places, such as bases of ladders that continue through the floor. A
+    room with too few different states is a ``UserError``.
     """
     rng = rng_for(seed, *stream, room)
     left_out = set() if unclear else {(goal.name, place) for goal in sub_goals for place in goal.unclear}
     here = {(goal.name, place) for goal in sub_goals for place, at in enumerate(goal.places) if at.room == room}
-    positives = dict.fromkeys(here - left_out if play == "expert" else (), 0)
+    positives = dict.fromkeys(here - left_out, 0)
 
     def enough() -> bool:
         if len(pool) < SPARE * wanted:
@@ -171,7 +169,7 @@ def gather(
 
     seen: set[bytes] = set()
     pool: list[Shown] = []
-    for step, shown in enumerate(PLAYS[play](emulator_of_process(), room, rng, sub_goals)):
+    for step, shown in enumerate(expert_play(emulator_of_process(), room, rng, sub_goals)):
         if enough() or step == MOST_STEPS * wanted:
             break
         looks = digest(shown.stack)
@@ -257,22 +255,7 @@ def expert_play(
                 yield from _rollout(emulator, room, begun, _expert_actions(emulator, spots, rng))
 
 
-def random_play(
-    emulator: Emulator, room: int, rng: np.random.Generator, sub_goals: Sequence[SubGoal]
-) -> Iterator[Shown]:
-    """Spec B7: endlessly, the states of uniform-random actions from the sides of a room, whatever the sub-goals."""
-    places = standing_places(emulator, room)
-    row = places[places[:, 1] == places[:, 1].max()]
-    sides = [Placing(*row[row[:, 0].argmin()].tolist()), Placing(*row[row[:, 0].argmax()].tolist())]
-    while True:
-        emulator.restore(_scene(emulator, room, rng))
-        if (begun := _begin(emulator, room, sides[rng.integers(2)])) is not None:
-            yield from _rollout(emulator, room, begun, rng.integers(game.N_ACTIONS, size=RANDOM_STEPS).tolist())
-
-
-def _rollout(
-    emulator: Emulator, room: int, begun: tuple[int, int], actions: Iterator[int] | Sequence[int]
-) -> Iterator[Shown]:
+def _rollout(emulator: Emulator, room: int, begun: tuple[int, int], actions: Iterator[int]) -> Iterator[Shown]:
     shown = Shown(emulator.stack, emulator.ram().copy(), *begun)
     yield shown
     for action in actions:
@@ -319,7 +302,7 @@ def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> game.Snap
             return scene
 
 
-def _begin(emulator: Emulator, room: int, start: Placing, spots: Sequence[Position] = ()) -> tuple[int, int] | None:
+def _begin(emulator: Emulator, room: int, start: Placing, spots: Sequence[Position]) -> tuple[int, int] | None:
     """Bring the agent to its start and fill the stack; the last two actions, None unless it is alive in the room."""
     emulator.write("x", start.x)
     emulator.write("y", start.y)
@@ -395,9 +378,3 @@ def _climbs(ladder: Ladder) -> list[tuple[Position, int, int]]:
     up = (ladder.top.y if one_room else SHAFT_ENTRY) - ladder.base.y
     down = ladder.top.y - (ladder.base.y if one_room else SHAFT_EXIT)
     return [(ladder.base, game.UP, up // STRIDE - 1), (ladder.top, game.DOWN, down // STRIDE - 1)]
-
-
-PLAYS: dict[str, Callable[[Emulator, int, np.random.Generator, Sequence[SubGoal]], Iterator[Shown]]] = {
-    "expert": expert_play,
-    "random": random_play,
-}

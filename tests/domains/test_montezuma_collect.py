@@ -24,7 +24,6 @@ from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig, labelled_rooms, 
 from hypogoal.domains.montezuma_emulator import (
     DOWN,
     FRAME_SKIP,
-    N_ACTIONS,
     NOOP,
     RAM,
     ROOMS,
@@ -38,11 +37,11 @@ from hypogoal.domains.montezuma_emulator import (
 from hypogoal.domains.montezuma_ladders import LADDERS
 from hypogoal.domains.montezuma_states import (
     KINDS,
-    PLAYS,
     POSITIVE,
     RoomStates,
     choose,
     emulator_of_process,
+    expert_play,
     gather,
     kinds_of,
     labels_of,
@@ -76,15 +75,15 @@ def two() -> Collected:
 
 @pytest.fixture(scope="module")
 def fresh() -> tuple[Collected, Progress]:
-    """N = 1, other held-out states, random play in the unlabelled rooms."""
+    """N = 1, other held-out states."""
     progress = Progress("collect", 1, quiet=True)
-    return DOMAIN.collect(replace(TINY, heldout_seed=1, unlabelled_from="random"), SEED, progress), progress
+    return DOMAIN.collect(replace(TINY, heldout_seed=1), SEED, progress), progress
 
 
 @pytest.fixture(scope="module")
 def first_room() -> RoomStates:
     """Labelled states of room 1."""
-    return gather(1, 150, SEED, ("test",), play="expert", held_out=False, unclear=False, sub_goals=[CLIMB_DOWN])
+    return gather(1, 150, SEED, ("test",), held_out=False, unclear=False, sub_goals=[CLIMB_DOWN])
 
 
 def part(states: States, where: NDArray[np.bool_], without: str = "") -> dict[str, NDArray[np.generic]]:
@@ -151,7 +150,7 @@ def test_states_are_those_of_the_game(first_room: RoomStates, monkeypatch: pytes
     played: list[int] = []
     step = emulator.step
     monkeypatch.setattr(emulator, "step", lambda action: (played.append(action), step(action))[1])
-    for _ in islice(PLAYS["expert"](emulator, 1, rng_for(SEED, "test", 1), [CLIMB_DOWN]), 5000):
+    for _ in islice(expert_play(emulator, 1, rng_for(SEED, "test", 1), [CLIMB_DOWN]), 5000):
         index = wanted.pop(digest(emulator.stack), None)
         if index is not None:
             room, x, y = emulator.position()
@@ -210,7 +209,7 @@ def test_bases_that_run_on_are_labelled_nowhere(one: Collected, two: Collected) 
     for states in (one.labelled, two.labelled, one.heldout):
         assert not RUNNING_ON & set(states.origins["ladder"].tolist())
     for unclear in (False, True):
-        found = gather(4, 60, SEED, ("test",), play="expert", held_out=False, unclear=unclear, sub_goals=[CLIMB_DOWN])
+        found = gather(4, 60, SEED, ("test",), held_out=False, unclear=unclear, sub_goals=[CLIMB_DOWN])
         assert (RUNNING_ON & set(origins_of(found, CLIMB_DOWN)["ladder"].tolist()) != set()) == unclear
 
 
@@ -244,7 +243,7 @@ def test_seeds(one: Collected, fresh: tuple[Collected, Progress]) -> None:
     """Spec A8, F1: a stream's states are the same in any order of rooms; held-out draws leave the rest alone."""
 
     def draw(room: int, seed: int) -> RoomStates:
-        return gather(room, 5, seed, ("test",), play="expert", held_out=True, unclear=False, sub_goals=[CLIMB_DOWN])
+        return gather(room, 5, seed, ("test",), held_out=True, unclear=False, sub_goals=[CLIMB_DOWN])
 
     first, second = draw(6, 0), draw(23, 0)
     assert np.array_equal(draw(23, 0).observations, second.observations)
@@ -262,18 +261,6 @@ def test_unlabelled_rooms() -> None:
     for groups, rooms in enumerate(chosen, start=1):
         assert not set(rooms) & set(labelled_rooms(MontezumaConfig(groups=groups)))
     assert len(labelled_rooms(MontezumaConfig(groups=7))) == 16
-    assert unlabelled_rooms(MontezumaConfig(unlabelled_rooms=(5, 0, 5))) == (5, 0)
-
-
-def test_random_play(one: Collected, fresh: tuple[Collected, Progress]) -> None:
-    """Spec B7: unlabelled states of random actions from a room's sides; each action is as likely."""
-    shown = list(islice(PLAYS["random"](emulator_of_process(), 6, np.random.default_rng(0), [CLIMB_DOWN]), 1500))
-    drawn = Counter(state.action for state in shown)
-    assert set(drawn) == set(range(N_ACTIONS))
-    del drawn[NOOP]  # every start is looked at, too
-    assert max(drawn.values()) < 2 * min(drawn.values())
-    assert Counter(fresh[0].unlabelled.origins["room"].tolist()) == {9: 10, 18: 10}
-    assert not np.array_equal(one.unlabelled.observations, fresh[0].unlabelled.observations)
 
 
 def test_progress_counts_states(fresh: tuple[Collected, Progress]) -> None:
@@ -283,14 +270,11 @@ def test_progress_counts_states(fresh: tuple[Collected, Progress]) -> None:
 
 def test_what_cannot_be_collected(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2: one line for a room that does not exist, and for more states than a room shows."""
-    progress = Progress("collect", 1, quiet=True)
     with pytest.raises(UserError, match=r"no such room: 24\. Rooms are 0 to 23"):
-        DOMAIN.collect(replace(TINY, unlabelled_rooms=(9, 24)), SEED, progress)
-    with pytest.raises(UserError, match="out of range"):
-        from_values(MontezumaConfig, {"unlabelled_rooms": "9,24"}, "collect")
+        gather(24, 5, SEED, ("test",), held_out=False, unclear=False, sub_goals=[CLIMB_DOWN])
     monkeypatch.setattr(montezuma_states, "MOST_STEPS", 1)
     with pytest.raises(UserError, match="room 16 does not show 50 different states"):
-        gather(16, 50, SEED, ("test",), play="expert", held_out=False, unclear=False, sub_goals=[CLIMB_DOWN])
+        gather(16, 50, SEED, ("test",), held_out=False, unclear=False, sub_goals=[CLIMB_DOWN])
 
 
 def test_stopped_processes_are_not_waited_for() -> None:
@@ -301,7 +285,7 @@ def test_stopped_processes_are_not_waited_for() -> None:
             raise KeyboardInterrupt
 
     begin = time.monotonic()
-    config = replace(TINY, workers=2, unlabelled_rooms=(6,), unlabelled_per_room=10_000, heldout_per_room=1)
+    config = replace(TINY, workers=2, states_per_room=10_000, heldout_per_room=1)
     with pytest.raises(KeyboardInterrupt):
         DOMAIN.collect(config, SEED, Stopped("collect", 1, quiet=True))
     assert not multiprocessing.active_children()
