@@ -21,7 +21,7 @@ TESTS = Path(__file__).parent
 FEW = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
 # What settings do not say.
-MAY = {"README.md", "executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")
+MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")
 
 
 @pytest.fixture(scope="module")

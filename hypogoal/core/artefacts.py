@@ -8,7 +8,7 @@ import contextlib
 import hashlib
 import os
 import platform
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -195,9 +195,8 @@ def create_artefact(
     inputs: Sequence[Path] = (),
     force: bool = False,
     resume: bool = False,
-    card: Callable[[dict[str, Any], Path], str] = lambda header, folder: "",
 ) -> Iterator[Path]:
-    """A folder to fill; at the end its ``card`` and manifest are written and it is renamed to ``out``.
+    """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
 
     ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are the artefact folders or data files
     that were read. ``checkpoints_of`` finds the checkpoints beside the folder. If the block raises, ``out`` stays as it
@@ -220,8 +219,6 @@ def create_artefact(
         raise drafts.check_complete({**manifest, "inputs": hashes}, identity, requested)
     with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
-        if text := card({**header, "inputs": entries}, work.files):
-            (work.files / "README.md").write_bytes(text.encode())
         written = sorted(file for file in work.files.rglob("*") if file.is_file() and file.name != TO_FILL_IN)
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
         manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.core.training import training
 from hypogoal.dataset import Standard
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation import exploits

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.cards import create_artefact
-from hypogoal.core.artefacts import TO_FILL_IN, Artefact, claim, open_artefact, versions
+from hypogoal.core.artefacts import TO_FILL_IN, Artefact, claim, create_artefact, open_artefact, versions
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
@@ -69,9 +68,9 @@ def audit_recorded(
     goals = [sub_goal] if sub_goal is not None else goals
     data = artefact.input("data")
     out = claim(out, kind="recorded-audit", inputs=[source, data], force=force)
-    card: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": list(goals)}, "seed": 0}
+    about: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": list(goals)}, "seed": 0}
     with (
-        create_artefact(out, **card, inputs=[source, data], force=force) as folder,
+        create_artefact(out, **about, inputs=[source, data], force=force) as folder,
         Progress("audit", len(goals), quiet=quiet) as progress,
     ):
         parts, sections = [], []

@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.cards import create_artefact
-from hypogoal.core.artefacts import claim, versions
+from hypogoal.core.artefacts import claim, create_artefact, versions
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.run import fitting, read_evaluation

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.cards import create_artefact
-from hypogoal.core.artefacts import claim
+from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5

@@ -7,8 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hypogoal.cards import create_artefact
-from hypogoal.core.artefacts import Artefact, claim, find_artefacts, versions
+from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text, replacing
 from hypogoal.dataset import PICTURE
@@ -38,8 +37,8 @@ def report(run: Path, *, videos: int | None = None, force: bool = False, resume:
     claim(out, kind="report", force=force, resume=resume)
     films, missing = _films(run, videos)
     inputs = [evaluation.source.path, *dict.fromkeys(episode.agent.path for episode in films)]
-    card: dict[str, Any] = {"kind": "report", "config": {"videos": len(films)}, "seed": 0, "inputs": inputs}
-    with create_artefact(out, **card, force=force, resume=resume) as folder:
+    about: dict[str, Any] = {"kind": "report", "config": {"videos": len(films)}, "seed": 0, "inputs": inputs}
+    with create_artefact(out, **about, force=force, resume=resume) as folder:
         metrics = {**evaluation.metrics, "missing": [*evaluation.metrics["missing"], *missing]}
         shown = [film(episode.gif, episode.caption) for episode in films[:1] if len(episode.gif) <= MOST_BYTES]
         material = Material(metrics, evaluation.arrays, films=shown)

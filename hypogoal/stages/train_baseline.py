@@ -4,12 +4,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
+from hypogoal.core.training import training
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain, require_one_kind
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
@@ -20,6 +19,7 @@ from hypogoal.core.files import json_lines, read_end
 from hypogoal.core.manifests import LOG, SCORES
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
+from hypogoal.core.training import training
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, Observations, States, open_dataset, type_text
 from hypogoal.diversity import load_objective

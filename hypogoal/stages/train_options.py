@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
+from hypogoal.core.training import training
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import (

@@ -156,7 +156,7 @@ IMAGES: Makers = {
 
 
 def images(box: Any, rng: Rng, case: int) -> Made:
-    """A folder of images with a hostile one in a place of its own or of a good one; or marks that are gone on with."""
+    """A folder of images with a hostile one in a place of its own or of a good one."""
     folder: Path = box.case / "goal"
     for number, kind in enumerate(("positive", "negative", "unlabelled")):
         (folder / kind).mkdir(parents=True)

@@ -287,7 +287,7 @@ def test_no_room_leaves_nothing(tmp_path: Path) -> None:
     for limit in (*range(0, 120, 8), *range(120, 1500, 60)):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
         try:
-            with create_artefact(tmp_path / "out", **ABOUT, card=lambda about, folder: "a card\n" * 20) as folder:
+            with create_artefact(tmp_path / "out", **ABOUT) as folder:
                 (folder / "half").write_text("x" * 200)
                 write_table(folder / "numbers.csv", ["a"], [["b" * 300]])
         except OSError:

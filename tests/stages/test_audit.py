@@ -134,7 +134,7 @@ def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Pa
         assert drawn.n_frames == steps + 1, "from where it began"
     artefact = open_artefact(out, "audit")
     more = artefact.manifest["files"].keys() - files_of("audit", artefact.config)
-    assert more == {film, "README.md"}
+    assert more == {film}
     assert f"  {film} {before['fooled']:4d} x  while collect-blue-key holds" in list(lines_of(report))
     assert max(map(len, lines_of(report))) <= 80
 

@@ -180,7 +180,7 @@ def test_the_artefact_says_what_happened(tmp_path):
     assert facts["random_episodes"] == 20
     assert load_tensors(tmp_path / "a" / "policy.safetensors")["q_net.q_net.0.weight"].shape == (7, 128)
     names = {path.name for path in artefact.path.iterdir()}
-    assert names == {"README.md", "manifest.json", "episodes.csv", "layout.json", "metrics.jsonl", "policy.safetensors"}
+    assert names == {"manifest.json", "episodes.csv", "layout.json", "metrics.jsonl", "policy.safetensors"}
     for name in names - {"manifest.json"}:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
