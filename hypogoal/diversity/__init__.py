@@ -42,22 +42,15 @@ class Context:
         labels: int64 (B,), 1 where the sub-goal holds.
         labelled: float (K, B, 2), logits of labelled states.
         unlabelled: float (K, N, 2), logits of unlabelled states.
-        labelled_features: float (K, B, D), the last hidden layer's outputs.
-        unlabelled_features: float (K, N, D), the same for unlabelled states.
         frozen: float (F, N, 2), logits of members trained earlier (schedule=sequential), which get no gradient.
         positives: the share of positives among all labelled states, not only this batch's; strictly between 0 and 1.
-        input_gradients: computes float (K, B, C * H * W), the differentiable gradients of each member's log-odds with
-            respect to the pixels of the labelled states. Costs another pass through the members.
     """
 
     labels: Tensor
     labelled: Tensor
     unlabelled: Tensor
-    labelled_features: Tensor
-    unlabelled_features: Tensor
     frozen: Tensor
     positives: float
-    input_gradients: Callable[[], Tensor]
 
 
 class Objective:

@@ -38,7 +38,7 @@ NOT_A_VARIANT = frozenset(
 IDLE = {"single CNN": {"diversity", "diversity_weight", "schedule", "members"}, "no diversity": {"diversity_weight"}}
 METHODS = {"dbat": "D-BAT", "no diversity": "an ensemble without diversity", "single CNN": "a single CNN"}
 ORACLE = "oracle termination"
-OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "hsic": "HSIC"}
+OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis"}
 ONE = "one classifier"
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, repeat
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
@@ -23,15 +21,6 @@ from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
 
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
 LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
-
-
-class Outputs(NamedTuple):
-    """K networks' outputs for groups of states: by network and group, logits (B, 2) and features (B, D), the last
-    hidden layer's outputs.
-    """
-
-    logits: list[list[Tensor]]
-    features: list[list[Tensor]]
 
 
 class TrainingStates:
@@ -77,7 +66,6 @@ class TrainingStates:
         images = [np.require(some, requirements=["C", "W"]) for some in (observations, unlabelled)]
         tables = device.type == "cpu" and not (grey or jitter)  # changed images have changed patches
         self._tables = patches.make_tables(images, network) if tables else None
-        self._labelled = images[0]
         self._images = [as_tensor(some).to(device) for some in images] if self._tables is None else []
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
 
@@ -92,8 +80,8 @@ class TrainingStates:
         *groups: NDArray[np.int64],
         counted: Sequence[bool] = (),
         changes: Sequence[np.random.Generator] = (),
-    ) -> Outputs:
-        """Each network's outputs for groups of states (B,).
+    ) -> list[Tensor]:
+        """All K networks' logits, float (K, B, 2), of each group of states (B,).
 
         BatchNorm sees each group on its own; all other layers take them together, which reads the weights once. In
         training mode, BatchNorm's running statistics include the ``counted`` groups, all if that is empty. With
@@ -101,9 +89,8 @@ class TrainingStates:
         do not depend on the others.
         """
         sizes, inputs = [len(group) for group in groups], self._inputs(groups, changes)
-        features = [_forward(nn.Sequential(*list(network)[:-1]), inputs, sizes, counted) for network in networks]
-        logits = [network[-1](hidden) for network, hidden in zip(networks, features, strict=True)]
-        return Outputs(*([list(rows.split(sizes)) for rows in of_networks] for of_networks in (logits, features)))
+        logits = torch.stack([_forward(network, inputs, sizes, counted) for network in networks])
+        return list(logits.split(sizes, dim=1))
 
     def _inputs(
         self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator] = ()
@@ -114,21 +101,6 @@ class TrainingStates:
         if changes and (self._grey or self._jitter):
             return torch.cat([self._images_of(*group) for group in zip(groups, changes, strict=True)])
         return self._images_of(np.concatenate(groups), None)
-
-    def input_gradients(self, networks: Sequence[nn.Sequential], states: NDArray[np.int64]) -> Tensor:
-        """Gradients float (K, B, numbers) of each network's log-odds with respect to its inputs for states.
-
-        They can be differentiated. In training mode BatchNorm uses the batch's statistics and leaves its running ones
-        alone, so a gradient includes a state's effect on the others of its batch.
-        """
-        inputs = as_input(as_tensor(self._labelled[states]).to(self.device), self._dtype, self._standard)
-        if self._jitter:
-            inputs = inputs[:, :, self._jitter : -self._jitter, self._jitter : -self._jitter]
-        inputs = inputs.requires_grad_()
-        with sdpa_kernel(SDPBackend.MATH):  # the only attention with a differentiable gradient
-            logits = [_forward(network, inputs, [len(states)], [False]) for network in networks]
-        gaps = [(each[:, 1] - each[:, 0]).sum() for each in logits]
-        return torch.stack([torch.autograd.grad(gap, inputs, create_graph=True)[0].flatten(1) for gap in gaps])
 
     def count_in(
         self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
@@ -169,8 +141,8 @@ class TrainingStates:
             network.eval()
         with torch.no_grad():
             size = at_once(EVALUATED_AT_ONCE, self._shape)
-            chunks = [self.forward(networks, states[at : at + size]).logits for at in range(0, len(states), size)]
-        return torch.stack([torch.cat([chunk[member][0] for chunk in chunks]) for member in range(len(networks))])
+            chunks = [self.forward(networks, states[at : at + size])[0] for at in range(0, len(states), size)]
+        return torch.cat(chunks, dim=1)
 
     def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see ``batch_kind``.

@@ -243,32 +243,25 @@ class Round(Resumable):
         diversity_losses = torch.zeros(0, device=states.device)
         if self.objective is not None or self.taught is not None:
             counted = (True, config.unlabelled_bn)
-            outputs = states.forward(self.networks, labelled, unlabelled, counted=counted, changes=self.changes)
+            logits = states.forward(self.networks, labelled, unlabelled, counted=counted, changes=self.changes)
         else:
-            outputs = states.forward(self.networks, labelled, changes=self.changes[:1])
+            logits = states.forward(self.networks, labelled, changes=self.changes[:1])
             if config.unlabelled_bn and len(unlabelled):
                 states.count_in(self.networks, unlabelled, self.changes[1])
-        losses = torch.stack(
-            [functional.cross_entropy(logits, targets, self.class_weights) for logits, *_ in outputs[0]]
-        )
+        losses = torch.stack([functional.cross_entropy(each, targets, self.class_weights) for each in logits[0]])
         numbers = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
         if self.objective is not None:
-            logits, features = ([torch.stack(group) for group in zip(*each, strict=True)] for each in outputs)
             context = Context(
                 labels=targets,
                 labelled=logits[0],
                 unlabelled=logits[1],
-                labelled_features=features[0],
-                unlabelled_features=features[1],
                 frozen=self.frozen[:, numbers],
                 positives=float(states.labels.mean()),
-                input_gradients=partial(states.input_gradients, self.networks, labelled),
             )
             diversity_losses = self.objective.losses(context)
         if self.taught is not None:
             scores = self.taught[:, numbers]  # (K, N)
-            answers = torch.stack([each[1] for each in outputs.logits]).mT  # (K, 2, N)
-            errors = functional.cross_entropy(answers, (scores > 0).long(), reduction="none")
+            errors = functional.cross_entropy(logits[1].mT, (scores > 0).long(), reduction="none")
             losses = losses + (errors * scores.abs().clamp(max=1.0)).mean(1)
         return losses, diversity_losses
 

@@ -77,30 +77,22 @@ def context_of(
 
     unlabelled = gap * normal(members + frozen, states, 2)
     unlabelled[1:, : states // 2] = unlabelled[:1, : states // 2]
-    gradients = normal(members, 6, 12).requires_grad_()
     return Context(
         torch.tensor([0, 1, 0, 1, 1, 0]),
         (gap * normal(members, 6, 2)).requires_grad_(),
         unlabelled[:members].clone().requires_grad_(),
-        normal(members, 6, 5).relu().requires_grad_(),
-        normal(members, states, 5).relu().requires_grad_(),
         unlabelled[members:],
         0.25,
-        lambda: gradients,
     )
 
 
 def rearranged(context: Context, members: Tensor, states: Tensor) -> Context:
     """The batch with its members and its unlabelled states in another order."""
-    gradients = context.input_gradients()
     return replace(
         context,
         labelled=context.labelled[members],
         unlabelled=context.unlabelled[members][:, states],
-        labelled_features=context.labelled_features[members],
-        unlabelled_features=context.unlabelled_features[members][:, states],
         frozen=context.frozen[:, states],
-        input_gradients=lambda: gradients[members],
     )
 
 
@@ -138,7 +130,7 @@ def finite_at_extreme_logits(objective: Objective) -> str:
 
 
 def gradient_does_not_vanish(objective: Objective, gap: float = 10.0) -> str:
-    """Each of three members gets a gradient, through its logits, features or input gradients.
+    """Each of three members gets a gradient.
 
     Of a pair, confident members that agree must also be pushed apart. An objective that compares members across states,
     such as mutual information, has no gradient if each predicts one class for all states, so one of three cases
@@ -159,8 +151,7 @@ def gradient_does_not_vanish(objective: Objective, gap: float = 10.0) -> str:
 
 def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
     """Gradients by all parts of a context, 0 for those that the loss does not depend on."""
-    leaves = [context.labelled, context.unlabelled, context.labelled_features, context.unlabelled_features]
-    leaves.append(context.input_gradients())
+    leaves = [context.labelled, context.unlabelled]
     if not loss.requires_grad:
         return [torch.zeros_like(leaf) for leaf in leaves]
     return list(torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True))

@@ -22,7 +22,7 @@ from hypogoal.needs import ensemble_needs
 
 MAY_DIFFER = 1.5  # times
 STEPS = 3
-DIVERSITY = ("dbat", "divdis", "none", "input-gradients")
+DIVERSITY = ("dbat", "divdis", "none")
 
 
 def drawn(rng: np.random.Generator) -> tuple[tuple[int, ...], TrainEnsembleConfig]:

@@ -24,7 +24,7 @@ CASES = {
         "threshold": "unlabelled-q95",
     },
     "changed shades": {"diversity": "none", "augment": "grey"},
-    **{name: {"diversity": name} for name in ("ace", "hsic", "input-gradients", "repulsive", "weak-negatives")},
+    **{name: {"diversity": name} for name in ("ace", "repulsive")},
 }
 
 

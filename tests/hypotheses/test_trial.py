@@ -28,11 +28,10 @@ def noise(*shape: int) -> NDArray[np.uint8]:
     [
         EnsembleConfig(batch_size=BATCH),
         EnsembleConfig(batch_size=BATCH, schedule="sequential"),
-        EnsembleConfig(batch_size=BATCH, diversity="input-gradients"),
         EnsembleConfig(batch_size=BATCH, network="tiles", view="agent-crop", jitter=2, augment="grey"),
         EnsembleConfig(batch_size=BATCH, members=1),
     ],
-    ids=["separate", "sequential", "input-gradients", "windows", "one member"],
+    ids=["separate", "sequential", "windows", "one member"],
 )
 def test_two_small_batches_say_what_a_large_one_takes(config: EnsembleConfig) -> None:
     """Spec G1: for every way to train, as much as was measured where the true batch was tried."""

@@ -109,13 +109,6 @@ def test_a_joint_network_uses_every_key(run: Path) -> None:
             assert not torch.allclose(network(as_input(as_tensor(other), dtype)), before, atol=1e-7)
 
 
-@pytest.mark.parametrize("more", ["diversity=input-gradients", "diversity=hsic"])
-def test_other_settings_train_too(run: Path, tmp_path: Path, more: str) -> None:
-    few = [word for pair in ("steps=2", "members=2", more) for word in ("--set", pair)]
-    assert main(["train-ensemble", str(run / "data.h5"), "--out", str(tmp_path / "e"), "-q", *few]) == 0
-    assert hypogoal.load_ensemble(tmp_path / "e", GOAL).predict(states(3)[0]).shape == (3, 2)
-
-
 class Broken(Exception):
     """The training stops here."""
 

@@ -467,10 +467,17 @@ def spread(channels: int) -> nn.Module:
     return nn.Sequential(nn.Conv2d(channels, 4, 8, 8), nn.Flatten(), nn.Softmax(0))
 
 
+class Detached(nn.Conv2d):
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(input).detach()
+
+
 def dead(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
-    layers = [nn.Conv2d(channels, 4, 8, 8), nn.ReLU()]
-    layers[0].weight.requires_grad_(False)  # type: ignore[union-attr]
-    return layers, (8,)
+    return [Detached(channels, 4, 8, 8), nn.ReLU()], (8,)
+
+
+def frozen(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [nn.Conv2d(channels, 4, 8, 8).requires_grad_(False), nn.ReLU()], (8,)
 
 
 FAULTS = [("spread", "same answers however asked"), ("dead", "gradients"), ("missing", "builds")]
@@ -481,6 +488,12 @@ def test_networks_are_checked(name: str, fault: str, monkeypatch: pytest.MonkeyP
     """Spec C5: what cannot be asked or learned is named."""
     monkeypatch.setenv("HYPOGOAL_TRUST", f"test_check:{name}")
     assert first_fault(check_network(f"test_check:{name}")).name == fault
+
+
+def test_weights_may_be_frozen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5: what is to have no gradient needs none."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "test_check:frozen")
+    require(check_network("test_check:frozen"))
 
 
 @pytest.mark.parametrize(("name", "method"), [("squeezed", "integrated gradients"), ("tiles", "DeepLift")])
