@@ -29,8 +29,8 @@ from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.hypotheses.views import positions_of
 from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
-from studies.ladders import HELDOUT, states_of
 from studies.ladders import METHODS as OF_LADDERS
+from studies.ladders import states_of
 
 METHODS = ("dbat", "none", "dbat-unpaired")
 MEMBERS = 6
@@ -95,7 +95,7 @@ def near(values: NDArray[np.floating], places: NDArray[np.float64]) -> NDArray[n
 def run_cell(method: str, seed: int) -> list[Row]:
     """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and look where its members look."""
     prepare()
-    data = states_of(1, CLIMB_DOWN.name, HELDOUT)
+    data = states_of(1)
     unseen = np.flatnonzero(data.heldout.origins["seen"] == SEEN_NOWHERE)
     labels = data.heldout.labels[unseen, 0]
     bases = unseen[labels]

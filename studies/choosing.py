@@ -4,8 +4,6 @@ hypogoal run doorkey --preset choosing --out runs/choosing
 python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run which-feature --out runs/which-feature
 python -m studies.choosing runs/which-feature docs/results/which-feature-rooms.csv
-hypogoal run which-feature --preset four --out runs/four
-python -m studies.choosing runs/four docs/results/which-feature-four.csv
 hypogoal sweep examples.preference:preference --out runs/preference
 python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
 python -m studies.choosing --tables docs/results/choosing-doorkey.csv
@@ -25,7 +23,6 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
 from hypogoal.evaluation.curves import LEARNED
-from hypogoal.which_feature.states import FACTORS
 from studies.cells import difference, interval, table
 
 ENSEMBLES = {
@@ -35,15 +32,9 @@ ENSEMBLES = {
     "none": "no diversity, K = 3",
     "one": "one classifier, K = 1",
 }
-FOUR = {
-    "joint": "joint, K = 4",
-    "dbat": "D-BAT, K = 5",
-    "none": "no diversity, K = 5",
-    "one": "one classifier, K = 1",
-}
 IN_ROOMS = {
     f"{method}-truth-{truth}": f"{truth}: {title}"
-    for truth, (method, title) in product(("shape", "place", "colour", "count"), ENSEMBLES.items())
+    for truth, (method, title) in product(("shape", "place"), ENSEMBLES.items())
 }
 METHODS = IN_ROOMS | {  # by what the names of artefacts have in them, the longest first
     "dbat-k3": "D-BAT, K = 3",
@@ -241,46 +232,6 @@ def rooms(path: Path) -> Iterator[str]:
         )
 
 
-def four(path: Path) -> Iterator[str]:
-    """One ensemble, four tasks: by the rewarded feature, and on how many seeds an ensemble serves how many of them."""
-    rows = _read(path)
-    solved = {
-        method: np.stack([solved_by(rows, f"{method}-truth-{truth}", "agent") for truth in FACTORS]) for method in FOUR
-    }
-    served = {method: (shares >= HIGH).sum(axis=0) for method, shares in solved.items()}
-    yield SHARES
-    yield ""
-    yield from table(
-        ["", *FACTORS, "tasks at .9, mean", "fewest to most", "seeds with all four"],
-        (
-            [
-                title,
-                *(_shown(rows, f"{method}-truth-{truth}") for truth in FACTORS),
-                f"{served[method].mean():.1f}",
-                f"{served[method].min()} to {served[method].max()}",
-                f"{(served[method] == len(FACTORS)).sum()} of {len(served[method])}",
-            ]
-            for method, title in FOUR.items()
-        ),
-    )
-    yield "Joint minus the other, seed by seed: the mean of the four tasks, with Student's interval."
-    yield ""
-    yield from table(
-        ["", "joint minus it"],
-        (
-            [FOUR[method], difference((solved["joint"] - shares).mean(axis=0), 2)]
-            for method, shares in solved.items()
-            if method != "joint"
-        ),
-    )
-    yield "Joint, seed by seed."
-    yield ""
-    seeds = sorted({row["layout"] for row in rows}, key=int)
-    yield from table(
-        ["", *seeds], ([truth, *(f"{v:.2f}" for v in solved["joint"][place])] for place, truth in enumerate(FACTORS))
-    )
-
-
 def _mean(values: NDArray[np.float64]) -> str:
     defined = values[~np.isnan(values)]
     few = f" (n = {len(defined)})" if len(defined) < len(values) else ""
@@ -304,7 +255,7 @@ def main() -> None:
     if arguments.csv.stem.startswith("which-feature-rooms"):
         arguments.csv, drawn = arguments.csv.with_stem("which-feature-rooms"), rooms
     else:
-        drawn = four if arguments.csv.stem == "which-feature-four" else tables
+        drawn = tables
     print("\n".join(drawn(arguments.csv)))
 
 

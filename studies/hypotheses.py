@@ -20,42 +20,30 @@ import csv
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
-from itertools import product
 from pathlib import Path
-from typing import Any, cast
-from unittest import mock
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from hypogoal.core.compute import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected, States
+from hypogoal.dataset import Collected
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from hypogoal.hypotheses import patches, proposals
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
-from hypogoal.hypotheses.scores import cross_fitted
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import Watcher, fit
-from hypogoal.stages.train_ensemble import score_rows
-from studies.cells import Row, difference, interval, parser_of, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, printed, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
     "none": {"diversity": "none"},
     "dbat-unpaired": {"diversity": "dbat-unpaired"},
-    "weak-negatives": {"diversity": "weak-negatives"},
     "cnn": {"members": 1, "diversity": "none"},
 }
-ALONE = "alone"  # proposals one by one: the terms of their independence are left out
-OTHERS: dict[str, dict[str, Any]] = {
-    "joint": {"diversity": "none", "proposals": "joint"},
-    ALONE: {"diversity": "none", "proposals": "joint", "agreement": "0"},
-}
-WEIGHTS = (1e-5, 1e-4, 1e-3, 1e-2)
 LOOKS = (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1300, 1600, 2000, 2600)
 LONG = (150, 600, 1000, 2600)  # looks at the seed that was trained longer
 LAYOUTS = {"choice": 500, "test": 1000}  # the first of twenty held-out layouts
@@ -65,12 +53,6 @@ OF_HALVES = ("ranking", "balanced_accuracy", "at_q95")
 COLUMNS = (*KEYS, *OF_ALL, *(f"{name}_{half}" for half in ("first", "second") for name in OF_HALVES))
 
 
-def settings_of(method: str) -> dict[str, Any]:
-    """What a method changes: one of ``METHODS`` or an objective's name, with ``@`` and a weight behind it or not."""
-    name, _, weight = method.partition("@")
-    return (METHODS | OTHERS).get(name, {"diversity": name}) | ({"diversity_weight": float(weight)} if weight else {})
-
-
 @lru_cache(maxsize=1)
 def states_of(layouts: str) -> Collected:
     """The labelled and unlabelled states of ``hypogoal collect doorkey``, and held-out ones of these layouts."""
@@ -78,39 +60,19 @@ def states_of(layouts: str) -> Collected:
     return DOMAIN.collect(config, 0, Progress("collect", 1, quiet=True))
 
 
-class Looked:
-    """An ensemble that predicts the states of :func:`states_of` again and again: their patches are found once."""
-
-    def __init__(self, ensemble: Ensemble, layouts: str):
-        self.ensemble, self.layouts = ensemble, layouts
-
-    def __len__(self) -> int:
-        return len(self.ensemble)
-
-    def predict(self, observations: NDArray[np.uint8], positions: None = None) -> NDArray[np.float32]:
-        """As :meth:`Ensemble.predict`."""
-        networks = self.ensemble.eval().networks
-        with torch.inference_mode():
-            rows = [
-                torch.stack([patches.forward(network, batch) for network in networks]).softmax(dim=-1)[..., 1].T.numpy()
-                for batch in _batches(self.layouts, observations is states_of(self.layouts).unlabelled.observations)
-            ]
-        self.ensemble.train()
-        return np.concatenate(rows)
-
-
-@lru_cache(maxsize=2)
-def _batches(layouts: str, unlabelled: bool) -> list[patches.Batch]:
-    """The distinct patches of the held-out or the unlabelled states, in the chunks of :meth:`Ensemble.predict`."""
-    split = states_of(layouts).unlabelled if unlabelled else states_of(layouts).heldout
-    observations = split.observations
-    network = Ensemble(EnsembleConfig().network, observations.shape[1:], 1, torch.Generator()).networks[0]
-    batches = []
-    for start in range(0, len(observations), PATCH_CHUNK):
-        tables = patches.make_tables([observations[start : start + PATCH_CHUNK]], network)
-        assert tables is not None
-        batches.append(patches.take(tables, np.arange(len(observations[start : start + PATCH_CHUNK]))))
-    return batches
+def scores_of(
+    probabilities: NDArray[np.float32], labels: NDArray[np.bool_], quantiles: NDArray[np.float32]
+) -> dict[str, NDArray[np.float64]]:
+    """``OF_ALL``, each (K,), of members' probabilities (N, K); ``at_q95`` is above their ``quantiles`` (K,)."""
+    at_half = member_scores(probabilities > 0.5, labels)
+    return {
+        "ranking": ranking(probabilities, labels),
+        "balanced_accuracy": at_half["balanced_accuracy"],
+        "precision": at_half["precision"],
+        "recall": at_half["recall"],
+        "at_q95": member_scores(probabilities > quantiles, labels)["balanced_accuracy"],
+        "at_best": best_threshold(probabilities, labels)[1],
+    }
 
 
 def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequence[int] = LOOKS) -> list[Row]:
@@ -118,29 +80,32 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
     prepare()
     data = states_of(layouts)
     column = data.sub_goals.index(sub_goal)
-    heldout = States(data.heldout.observations, data.heldout.labels[:, column], data.heldout.origins)
-    rows: dict[tuple[int, int], Row] = {}
+    labels = data.heldout.labels[:, column]
+    first = halves(data.heldout.origins["layout_seed"])
+    assert first is not None
+    rows: list[Row] = []
 
     def look(step: int, ensemble: Ensemble) -> None:
-        for scores in score_rows(
-            cast(Ensemble, Looked(ensemble, layouts)), heldout, data.unlabelled.observations, None
-        ):
-            key = (layouts, method, sub_goal, seed, step, scores["member"])
-            row = rows.setdefault((step, scores["member"]), dict(zip(KEYS, key, strict=True)))
-            half = "" if scores["scope"] == "all" else f"_{scores['scope']}"
-            row |= {f"{name}{half}": scores[name] for name in (OF_HALVES if half else OF_ALL)}
+        probabilities = ensemble.predict(data.heldout.observations)
+        elsewhere = ensemble.predict(data.unlabelled.observations)
+        quantiles = np.quantile(elsewhere, 0.95, axis=0, method="higher").astype(np.float32)
+        columns = scores_of(probabilities, labels, quantiles)
+        for half, inside in (("first", first), ("second", ~first)):
+            of_half = scores_of(probabilities[inside], labels[inside], quantiles)
+            columns |= {f"{name}_{half}": of_half[name] for name in OF_HALVES}
+        for member in range(len(ensemble)):
+            place = dict(zip(KEYS, (layouts, method, sub_goal, seed, step, member), strict=True))
+            rows.append(place | {name: float(values[member]) for name, values in columns.items()})
 
-    config = dataclasses.replace(EnsembleConfig(steps=looks[-1]), **settings_of(method))
-    with mock.patch.object(proposals, "TOGETHER", 0.0 if method == ALONE else proposals.TOGETHER):
-        fit(
-            data.labelled.observations,
-            data.labelled.labels[:, column],
-            data.unlabelled.observations,
-            config,
-            seed_for(seed, "ensemble", sub_goal),
-            Watcher(look=look, look_at=looks),
-        )
-    return list(rows.values())
+    fit(
+        data.labelled.observations,
+        data.labelled.labels[:, column],
+        data.unlabelled.observations,
+        dataclasses.replace(EnsembleConfig(steps=looks[-1]), **METHODS[method]),
+        seed_for(seed, "ensemble", sub_goal),
+        Watcher(look=look, look_at=looks),
+    )
+    return rows
 
 
 Cell = tuple[str, str, int]  # method, sub-goal, seed
@@ -176,10 +141,7 @@ def curve(numbers: Numbers, method: str, score: Callable[[dict[str, NDArray[np.f
 
 def lengths(choice: Numbers) -> dict[str, int]:
     """The rule: each method's length is the look with the highest cross-fitted ranking on the layouts for choosing."""
-    others = sorted({method for method, _, _ in choice} - set(METHODS))
-    curves = {
-        method: curve(choice, method, lambda members: crossed(members, "ranking")) for method in (*METHODS, *others)
-    }
+    curves = {method: curve(choice, method, lambda members: crossed(members, "ranking")) for method in METHODS}
     return {method: max(steps, key=lambda step: steps[step]) for method, steps in curves.items() if steps}
 
 
@@ -207,8 +169,7 @@ CROSSED = ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     choice, test = read(path, "choice"), read(path, "test")
-    everything = lengths(choice)
-    chosen = {method: steps for method, steps in everything.items() if method in METHODS}
+    chosen = lengths(choice)
     scores = "ranking / balanced accuracy at 0.5 of the cross-fitted best member, by steps"
     yield f"Layouts for choosing, {_seeds(choice)}: {scores}; in bold the chosen length."
     yield ""
@@ -218,11 +179,6 @@ def tables(path: Path) -> Iterator[str]:
     yield f"Seed {first} alone, trained longer: the same."
     yield ""
     yield from _curves(alone, dict.fromkeys(chosen, 0), LONG)
-    if len(everything) > len(chosen):
-        yield f"Other weights and objectives there, seed {first} alone: the highest ranking by weight (at steps)."
-        yield ""
-        yield from table(["", *(f"{weight:g}" for weight in WEIGHTS)], _weights(alone))
-    chosen = everything
     tested = [method for method in chosen if any(name == method for name, _, _ in test)]
     if not tested:
         return
@@ -248,31 +204,6 @@ def tables(path: Path) -> Iterator[str]:
     yield from table(["", "all", *every], _differences(test, chosen, tested))
 
 
-def beside_others(path: Path, published: Path, steps: int = 150) -> Iterator[str]:
-    """Members taught by proposals minus others of the same seeds, on the test layouts: a table for each score."""
-    numbers, every = read(path, "test") | read(published, "test"), DOMAIN.sub_goals
-    chosen = lengths(read(published, "choice")) | dict.fromkeys(OTHERS, steps)
-    seeds = {method: {seed for name, _, seed in numbers if name == method} for method in chosen}
-
-    def both(name: str, methods: tuple[str, str], goals: Sequence[str]) -> list[NDArray[np.float64]]:
-        shared = set.intersection(*(seeds[method] for method in methods))
-        cells = {cell: looks for cell, looks in numbers.items() if cell[2] in shared}
-        return [by_seed(cells, method, chosen[method], SHOWN[name], goals) for method in methods]
-
-    for name in CROSSED:
-        yield f"{name}: its mean, the other's, and differences seed by seed, over sub-goals and for each."
-        yield ""
-        rows = []
-        for methods in (methods for methods in product(OTHERS, chosen) if len(set(methods)) == 2):
-            scores = both(name, methods, every)
-            goals = ([goal] for goal in every)
-            differences = (difference(ours - theirs) for ours, theirs in (both(name, methods, goal) for goal in goals))
-            if len(scores[0]):
-                means = (str(len(scores[0])), *map(interval, scores), difference(scores[0] - scores[1]))
-                rows.append([" minus ".join(methods), *means, *differences])
-        yield from table(["", "seeds", "its", "the other's", "difference", *every], rows)
-
-
 def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> Iterator[str]:
     curves = {method: [curve(numbers, method, SHOWN[name]) for name in CROSSED] for method in chosen}
     looks = [step for step in shown if any(step in scores for scores, _ in curves.values())]
@@ -282,20 +213,6 @@ def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> I
         return f"**{text}**" if step == chosen[method] else text
 
     yield from table(["", *map(str, looks)], ([m, *(cell(m, step) for step in looks)] for m in chosen))
-
-
-def _weights(numbers: Numbers) -> Iterator[list[str]]:
-    methods = dict.fromkeys(method.partition("@")[0] for method, _, _ in numbers if method not in ("none", "cnn"))
-    for method in methods:
-        cells = []
-        for weight in WEIGHTS:
-            weighted = f"{method}@{weight:g}"
-            if weight == EnsembleConfig().diversity_weight and weighted not in {name for name, _, _ in numbers}:
-                weighted = method
-            steps = curve(numbers, weighted, SHOWN["ranking, cross-fitted best"])
-            best = max(steps, key=lambda step: steps[step]) if steps else 0
-            cells.append(f"{steps[best]:.3f} ({best})" if steps else "-")
-        yield [method, *cells]
 
 
 def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -> Iterator[list[str]]:
@@ -320,13 +237,8 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
-    parser.add_argument("--joint", type=Path, metavar="CSV", help="print cells of joint beside those in this file")
     arguments = parser.parse_args()
-    if arguments.joint:
-        print("\n".join(beside_others(arguments.csv, arguments.joint)))
-        return
-    if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+    if printed(arguments, tables):
         return
     methods = arguments.methods.split(",")
     chosen = lengths(read(arguments.csv, "choice")) if arguments.chosen else {}

@@ -1,6 +1,6 @@
 """What members know of rooms of Montezuma's Revenge nobody labelled, by labelled ladder groups and length of training.
 
-    python -m studies.ladders docs/results/hypotheses-ladders.csv --groups 1 --seeds 0-9
+    python -m studies.ladders docs/results/figure3-ladders.csv --groups 1 --seeds 0-9
 
 A cell is N (labelled ladder groups), a method and a seed: one training, looked at after each of ``LOOKS`` steps.
 Up to N = 3, length and member are picked on half of the rooms and scored on the other half, and the other way round.
@@ -38,9 +38,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "none": {"diversity": "none"},
     "cnn": {"members": 1, "diversity": "none"},
     "dbat-unpaired": {"diversity": "dbat-unpaired"},
-    "weak-negatives": {"diversity": "weak-negatives"},
 }
-OTHERS: dict[str, dict[str, Any]] = {"joint": {"diversity": "none", "proposals": "joint"}}
 MEMBERS = 3
 LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
 SHOWN = (10, 25, 50, 100, 300, 600, 1000)  # of these in the table
@@ -82,24 +80,16 @@ AUTHORS = {
 
 
 @lru_cache(maxsize=1)
-def states_of(groups: int, sub_goal: str, heldout: int) -> Collected:
-    """The states of ``collect montezuma --set groups=N --set sub_goals=SUB_GOAL --set heldout_per_room=HELDOUT``."""
-    config = MontezumaConfig(groups=groups, sub_goals=(sub_goal,), heldout_per_room=heldout, workers=1)
+def states_of(groups: int) -> Collected:
+    """The states of ``collect montezuma --set groups=N --set heldout_per_room=HELDOUT``, of the paper's sub-goal."""
+    config = MontezumaConfig(groups=groups, sub_goals=(CLIMB_DOWN.name,), heldout_per_room=HELDOUT, workers=1)
     return DOMAIN.collect(config, 0, Progress("collect", 1, quiet=True))
 
 
-def run_cell(
-    groups: int,
-    method: str,
-    seed: int,
-    looks: tuple[int, ...],
-    sub_goal: str = CLIMB_DOWN.name,
-    heldout: int = HELDOUT,
-    **changes: Any,
-) -> list[Row]:
-    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, with ``changes``, and score it on the way."""
+def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> list[Row]:
+    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and score it on the way."""
     prepare()
-    data = states_of(groups, sub_goal, heldout)
+    data = states_of(groups)
     labels, unseen = data.heldout.labels[:, 0], data.heldout.origins["seen"] == SEEN_NOWHERE
     first = halves(data.heldout.origins["room"][unseen])
     assert first is not None
@@ -126,8 +116,8 @@ def run_cell(
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
-        dataclasses.replace(config, **(METHODS | OTHERS)[method], **changes),
-        seed_for(seed, "ensemble", sub_goal),
+        dataclasses.replace(config, **METHODS[method]),
+        seed_for(seed, "ensemble", CLIMB_DOWN.name),
         Watcher(look=look, look_at=looks),
     )
     return rows
@@ -137,11 +127,11 @@ Seeds = dict[int, dict[int, dict[str, NDArray[np.float64]]]]  # by seed, step an
 Numbers = dict[str, Seeds]  # by method
 
 
-def read(path: Path, groups: int, sub_goal: str | None = None) -> Numbers:
-    """The cells of one N, and of one sub-goal where a file has several; only seeds that every method has."""
+def read(path: Path, groups: int) -> Numbers:
+    """The cells of one N; only seeds that every method has."""
     numbers: Numbers = {}
     for row in read_rows(path):
-        if int(row["groups"]) == groups and row.get("sub_goal") == sub_goal:
+        if int(row["groups"]) == groups:
             steps = numbers.setdefault(row["method"], {}).setdefault(int(row["seed"]), {})
             columns = steps.setdefault(int(row["step"]), {})
             for name in COLUMNS[len(KEYS) :]:
@@ -189,16 +179,6 @@ def tables(path: Path) -> Iterator[str]:
             yield from _tables(groups, numbers)
         elif seeds > 1:
             yield from _tables_of_all_rooms(groups, numbers)
-
-
-def beside_others(joint: Path, others: Path) -> Iterator[str]:
-    """The tables of joint beside three other methods at N = 1, of the seeds and looks that all have."""
-    numbers = read(others, 1) | read(joint, 1)
-    shown = [numbers[name] for name in ("dbat", "none", "cnn", "joint")]
-    seeds = sorted(set.intersection(*map(set, shown)))
-    looks = sorted(set.intersection(*(set(method[seed]) for method in shown for seed in seeds)))
-    alike = ({seed: {look: method[seed][look] for look in looks} for seed in seeds} for method in shown)
-    yield from _tables(1, dict(zip(("dbat", "none", "cnn", "joint"), alike, strict=True)))
 
 
 def _tables_of_all_rooms(groups: int, numbers: Numbers) -> Iterator[str]:
@@ -281,11 +261,7 @@ def main() -> None:
     parser.add_argument("--groups", type=parse_integers, default=[1], help="labelled ladder groups: 1 or 1-4")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
-    parser.add_argument("--joint", type=Path, metavar="CSV", help="print cells of joint beside those in this file")
     arguments = parser.parse_args()
-    if arguments.joint:
-        print("\n".join(beside_others(arguments.csv, arguments.joint)))
-        return
     if printed(arguments, tables):
         return
     looks = tuple(step for step in LOOKS if step <= arguments.until)

@@ -1,6 +1,5 @@
 """Published tables are drawn from the committed cells (Spec F5, H7)."""
 
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -12,68 +11,23 @@ import pytest
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS
-from hypogoal.learners.episodes import EpisodeRecorder
-from studies import (
-    attention,
-    bandits,
-    choosing,
-    distilled,
-    distilled_agents,
-    figure6,
-    finished,
-    game_agents,
-    hypotheses,
-    initiation,
-    labels,
-    labels_next,
-    ladder_options,
-    ladder_stops,
-    ladders,
-    late_subgoals,
-    many_layouts,
-    other_subgoals,
-    precision,
-    shock,
-    thresholds,
-    tuning,
-    ways,
-    which_feature,
-)
+from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders
 from studies.cells import collect_once, difference, interval, run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
     "distilled": distilled.tables,
-    "distilled-agents": distilled_agents.tables,
+    "distilled-agents": distilled.tables_of_agents,
     "figure2-ladders": attention.tables,
     "figure3-ladders": ladders.tables,
     "figure4-ladders": ladder_options.tables,
     "figure5-ladders": ladder_stops.tables,
     "figure6-doorkey": figure6.tables,
-    "finished-episodes": finished.tables,
     "hypotheses-doorkey": hypotheses.tables,
-    "hypotheses-ladders": ladders.tables,
-    "initiation": initiation.tables,
-    "labels-doorkey": labels.tables,
-    "labels-next": labels_next.tables,
-    "late-subgoals": late_subgoals.tables,
-    "many-layouts": many_layouts.tables,
-    "other-subgoals": other_subgoals.tables,
-    "montezuma-agents": game_agents.tables,
     "options-that-hold": ladder_options.tables_that_hold,
-    "precision": precision.tables,
     "preference-doorkey": choosing.tables,
-    "shock-doorkey": shock.tables,
-    "thresholds-doorkey": thresholds.tables,
-    "tuning-baselines": tuning.tables,
-    "which-feature": which_feature.tables,
-    "which-feature-bandits": bandits.tables,
-    "which-feature-four": choosing.four,
     "which-feature-rooms": choosing.rooms,
-    "which-feature-two": which_feature.tables_of_two,
-    "which-feature-ways": ways.tables,
 }
 
 
@@ -93,9 +47,20 @@ def tables_in(lines: Iterable[str]) -> list[list[str]]:
 
 
 def test_no_page_has_a_table_without_cells() -> None:
-    """Numbers that no study can redraw stand in sentences; the first page's tables are taken from the others."""
+    """Numbers that no study can redraw stand in sentences or in the history; the first page's are the others'."""
     with_tables = {page.stem for page in RESULTS.glob("*.md") if "\n|" in page.read_text(encoding="utf-8")}
-    assert with_tables == {"index", *PAGES}
+    assert with_tables == {"index", "history", *PAGES}
+
+
+def test_history_is_short_and_each_row_whole() -> None:
+    """A question, what ran, its effect, how many, and the commit where that is not the last with the code."""
+    text = (RESULTS / "history.md").read_text(encoding="utf-8")
+    rows = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| ")]
+    assert len(text.split()) <= 900 and len(rows) > 30
+    for row in rows:
+        *cells, commit = (cell.strip() for cell in row)
+        assert len(cells) == 4 and all(cells)
+        assert re.fullmatch("commit|[0-9a-f]{7,8}|", commit)
 
 
 def test_tables_of_the_readme_and_the_first_page_have_the_numbers_of_the_pages() -> None:
@@ -167,17 +132,6 @@ def test_agents_of_figure_6_are_told_apart() -> None:
     assert figure6.method_of({"bonus": 0.0}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
 
 
-def test_tuned_is_what_the_search_found() -> None:
-    """By its rule, from the cells; the drawn settings are those that ran, and Figure 6 pays the best bonus."""
-    trials = tuning.read(RESULTS / "tuning-baselines.csv")
-    for agent in tuning.AGENTS:
-        for trial, rows in trials[agent, tuning.SHORT].items():
-            assert {row["settings"] for row in rows} == {tuning.text_of(agent, tuning.settings_of(agent, trial))}
-        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(trials, agent))
-    figure = (RESULTS.parents[1] / "examples" / "figure6.py").read_text(encoding="utf-8")
-    assert re.findall(r"bonus=([\d.]+)", figure) == [str(tuning.best_bonus(trials))]
-
-
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
     """A mean over some of the sub-goals is of no use beside one over all."""
     lines = (RESULTS / "hypotheses-doorkey.csv").read_text(encoding="utf-8").splitlines()
@@ -221,26 +175,6 @@ def test_leads_on_ladders_are_means_over_seeds_of_what_has_no_labels() -> None:
     assert mean == "no diversity minus D-BAT, mean member: 7 [-6, 20], 2 ladders"  # 6 and 8; t(1) = 12.7
 
 
-def test_agents_of_a_game_are_gathered_a_row_each(tmp_path: Path) -> None:
-    """The first reward and the last hundred; of options, what a positive prediction ended, and how much was near."""
-    place = tmp_path / "game" / "meta"
-    place.mkdir(parents=True)
-    manifest = {"config": {"steps": 900, "members": 2, "sub_goals": ["up", "down"]}}
-    (place / "manifest.json").write_text(json.dumps(manifest))
-    (place / "layout.json").write_text(json.dumps({"rooms": {"1": 9, "2": 1}}))
-    episodes = [f"{step},{step % 7},{100.0 * (step in (5, 90))},1,0" for step in range(1, 121)]
-    (place / "episodes.csv").write_text("\n".join(["step,length,reward,terminated,succeeded", *episodes]))
-    chosen = ["9,0,4,3,2.5,1,30", "9,3,4,2,2.5,2,20", "18,3,4,1,2.5,0,10"]
-    (place / "choices.csv").write_text("\n".join(["step,option,offered,chosen,expected,reached,duration", *chosen]))
-    ends = ["8,3,1,1,1.5,-2", "9,3,1,0,1.5,-2", "9,3,0,1,1.5,-2", "9,0,1,0,1.5,-2"]
-    (place / "exploits.csv").write_text("\n".join(["step,option,reached,near,best_near,best_far", *ends]))
-    game_agents.gather(tmp_path / "game", tmp_path / "agents.csv")
-    lengths = np.mean([step % 7 for step in range(21, 121)])
-    assert (tmp_path / "agents.csv").read_text().splitlines()[1:] == [f"meta,900,120,2,5,1,{lengths:.1f},1 2"]
-    options = (tmp_path / "agents-options.csv").read_text().splitlines()[1:]
-    assert options == ["meta,up,0,3,1,30,1,0", "meta,down,1,3,2,30,2,1"]
-
-
 def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
     """Begun again, it goes on with the states it has; with other settings it says so."""
     path, config = tmp_path / "data.h5", DoorKeyConfig(heldout_layouts=1)
@@ -250,17 +184,3 @@ def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
     assert path.read_bytes() == states
     with pytest.raises(UserError, match="heldout_layouts"):
         collect_once(DOMAIN, replace(config, heldout_layouts=2), path)
-
-
-@pytest.mark.parametrize("share", [0.8, 1.0])
-def test_an_agent_is_not_at_95_percent_because_its_failures_take_longer(share: float) -> None:
-    """Until the cap only successes end; of episodes begun one after the other those that go on count as failures."""
-    rng, episodes = np.random.default_rng(0), EpisodeRecorder(64)
-    elapsed, succeeds = np.zeros(64, np.int64), rng.random(64) < share
-    for _ in range(400):
-        episodes.steps, elapsed = episodes.steps + 64, elapsed + 1
-        for number in np.flatnonzero(succeeds & (elapsed == 30)):
-            episodes.append((episodes.steps, 30, 1.0, 1, 1))
-            elapsed[number], succeeds[number] = 0, rng.random() < share
-    assert episodes.solved(0.95)  # whatever the share
-    assert late_subgoals.settled(episodes, elapsed) == (share == 1.0)

@@ -7,4 +7,4 @@ from typing import Any
 # So that options behind other options learn in time.
 LEARNING: Mapping[str, Any] = MappingProxyType({"epsilon_steps": 2_000, "update_interval": 8})
 DEFAULTS = MappingProxyType({"train-options": LEARNING, "train-meta": LEARNING})
-SOURCES = MappingProxyType(dict.fromkeys(DEFAULTS, "ours: docs/results/late-subgoals.md"))
+SOURCES = MappingProxyType(dict.fromkeys(DEFAULTS, "ours: docs/results/history.md"))

@@ -23,8 +23,6 @@ from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_baseline import train_baseline
 from hypogoal.stages.train_options import train_options
-from studies.cells import read_rows
-from studies.game_agents import play
 
 BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "environments": 4, "warm_up": 60}
 
@@ -183,23 +181,3 @@ def test_a_baseline_begins_where_it_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="unknown start: nowhere"):
         train_baseline("montezuma", replace(config, start="nowhere"), tmp_path / "none", quiet=True)
     assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.atari
-def test_where_agents_of_a_game_end_is_kept(tmp_path: Path) -> None:
-    """Spec I4: an episode ends in a death, or where it is cut, at a place of the room that it was played in."""
-    from hypogoal.domains.montezuma import DOMAIN as montezuma
-
-    ensemble = ensemble_of(tmp_path / "ensemble", montezuma, members=2)
-    few = ("start=game", "termination=oracle", "steps=240", "environments=2", "warm_up=60", "max_episode_steps=30")
-    settings = [word for setting in few for word in ("--set", setting)]
-    assert main(["train-meta", str(ensemble), "--out", str(tmp_path / "game" / "agent"), "-q", *settings]) == 0
-    play(tmp_path / "game", tmp_path / "ends.csv", episodes=3)
-    rows = read_rows(tmp_path / "ends.csv")
-    assert [row["agent"] for row in rows] == ["agent"] * 3 and [row["episode"] for row in rows] == ["0", "1", "2"]
-    for row in rows:
-        assert (int(row["length"]) == 30) >= (row["died"] == "0") and int(row["length"]) <= 30
-        assert (row["room"], row["sub_goal"], row["reward"]) == ("1", "climb-down-ladder", "0")
-        assert 0 <= int(row["x"]) < 256 and 140 <= int(row["y"]) <= 256
-    play(tmp_path / "game", tmp_path / "uniform.csv", episodes=2, uniform=True)
-    assert [row["agent"] for row in read_rows(tmp_path / "uniform.csv")] == ["agent, uniform"] * 2

@@ -46,7 +46,7 @@ class DQNSettings:
 
 # By agent and setting. The paper's are the defaults above. Four environments with one update per joint step are
 # its "update interval 4" with a quarter of the overhead. The tuned settings are the best of a random search on
-# three-key DoorKey, thirty of each agent on layouts 400 to 402 (docs/results/tuning-baselines.md): of PPO the one that
+# three-key DoorKey, thirty of each agent on layouts 400 to 402 (docs/results/history.md): of PPO the one that
 # was tuned by hand before, of DQN trial 8, which keeps exploring until it has seen the goal once and then for long.
 HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
     ("ppo", "paper"): PPOSettings(),
