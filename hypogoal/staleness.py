@@ -1,7 +1,7 @@
 """Which artefacts of a run are out of date, why, and the commands that renew them, for ``hypogoal status``.
 
-An artefact is stale if an input is gone, was changed or is stale itself, if its files were changed, or if the preset
-file that its command names was edited since. An evaluation is stale, too, if the run got an artefact that it lacks.
+An artefact is stale if an input is gone, was changed or is stale itself, or if its files were changed. An evaluation is
+stale, too, if the run got an artefact that it lacks.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hypogoal.core.artefacts import Artefact, check_files, find_input, open_artefact
-from hypogoal.core.config import preset_digest
 from hypogoal.inspection import EVALUATION, parts_of
 
 READS_ALL = (EVALUATION, "comparison", "report")  # kinds that other artefacts are not made from
@@ -38,7 +37,6 @@ def states_of(run: Path) -> list[State]:
         reasons = (
             *_faults(artefact),
             *_of_inputs(artefact, states),
-            *_of_presets(artefact),
             *_since(artefact, artefacts),
         )
         command = _command(artefact) if reasons else ""
@@ -86,13 +84,6 @@ def _of_inputs(artefact: Artefact, states: Mapping[Path, State]) -> Iterator[str
             yield f"its input {_shown(place)} is {fault}"
         elif place in states and states[place].reasons:
             yield f"its input {_shown(place)} is stale"
-
-
-def _of_presets(artefact: Artefact) -> Iterator[str]:
-    """Preset files that were edited since; a manifest of before 0.17 does not record them."""
-    for path, digest in artefact.manifest.get("presets", {}).items():
-        if preset_digest(path) != digest:
-            yield f"its preset {path} was changed since"
 
 
 def _since(artefact: Artefact, artefacts: Mapping[Path, Artefact]) -> Iterator[str]:

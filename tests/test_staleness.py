@@ -75,17 +75,6 @@ def test_an_evaluation_lacks_what_was_made_since(run: Path) -> None:
     assert stale(run) == {"evaluation": "run/ppo was made since"}
 
 
-def test_an_edited_preset_makes_its_artefact_stale(run: Path) -> None:
-    preset = run.parent / "my.toml"
-    preset.write_text("[train-options]\nsteps = 5\n")
-    make(run, "more", "options", "ensemble", command="hypogoal train-options e --preset my.toml --out run/more")
-    assert "more" not in stale(run)
-    preset.write_text("# a remark\n[train-options]\nsteps = 5\n")
-    assert "more" not in stale(run)
-    preset.write_text("[train-options]\nsteps = 6\n")
-    assert "my.toml was changed since" in stale(run)["more"]
-
-
 def test_the_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make(run, "ppo", "baseline")
     assert main(["status", "run"]) == 0

@@ -83,7 +83,7 @@ PLAN_FAULTS: list[tuple[str, Any]] = [
     ("workers", 0), ("workers", -1), ("workers", True), ("workers", 1.5), ("workers", "2"), ("workers", 10**400),
     ("workers", None),
     ("experiment", 3), ("experiment", None), ("cells", {}), ("cells", 7), ("anew", "data"),
-    ("presets", [1]), ("presets", {"a": 1}), ("format", None), ("format", -1), ("format", "1"),
+    ("format", None), ("format", -1), ("format", "1"),
 ]  # fmt: skip
 CELL_FAULTS: list[tuple[str, Any]] = [
     ("arguments", ["evaluate", "/"]), ("arguments", ["report", "/"]), ("arguments", ["evaluate", "{run}/.."]),

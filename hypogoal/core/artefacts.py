@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from hypogoal.core import drafts
-from hypogoal.core.config import as_dict, preset_digests
+from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MAX_NAME_BYTES, inside, is_hole, open_file, read_json, visible
 from hypogoal.core.manifests import (
@@ -222,7 +222,6 @@ def create_artefact(
         written = sorted(file for file in work.files.rglob("*") if file.is_file() and file.name != TO_FILL_IN)
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
         manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
-        manifest |= {"presets": presets} if (presets := preset_digests([work.command])) else {}
         (work.files / MANIFEST).write_bytes(sealed(manifest))
         drafts.put_in_place(work.files, out)
 

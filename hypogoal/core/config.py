@@ -6,16 +6,13 @@ use them too. Precedence: ``--set`` > option > preset > the domain's default > d
 
 import dataclasses
 import difflib
-import hashlib
 import inspect
-import json
 import math
 import os
 import re
 import typing
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from importlib import resources
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -80,28 +77,6 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
     if not isinstance(values, dict):
         raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
     return values
-
-
-def preset_digests(commands: Iterable[Sequence[str]]) -> dict[str, str]:
-    """The preset files that commands name, as ``--preset FILE`` or ``--preset=FILE``, each with its digest."""
-    words = [word for command in commands for option in command for word in option.split("=", 1)]
-    named = {value for option, value in pairwise(words) if option == "--preset" and value.endswith(".toml")}
-    files = map(os.path.abspath, named)
-    return {path: preset_digest(path) for path in sorted(files)}
-
-
-def preset_digest(path: str) -> str:
-    """The sha256 of a preset file's settings of stages, however they are written; empty if it cannot be read.
-
-    ``[run]`` is left out: it determines the cells, and a sweep may get more of them.
-    """
-    try:
-        text = read_text(Path(path), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
-        table = parse_toml(text, path, "the preset is", "Mend the file.")
-        text = json.dumps({**table, "run": None}, sort_keys=True, default=str)
-    except (UserError, ValueError, RecursionError):
-        return ""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:

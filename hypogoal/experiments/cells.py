@@ -1,8 +1,8 @@
 """Experiments as data: cells, each one ordinary command with its own output (Spec A6, G4)."""
 
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,8 +67,6 @@ class Plan:
     cells: list[Cell]  # in an order in which they can run
     workers: int  # cores used at once
     anew: frozenset[str] = frozenset()  # names of cells to be made again, even if they were complete before
-    # The preset files that its commands name, each with its digest at the last start of the sweep.
-    presets: Mapping[str, str] = field(default_factory=dict)
 
     def of_stage(self, stage: str) -> frozenset[str]:
         """The names of a stage's cells; none is a ``UserError``."""

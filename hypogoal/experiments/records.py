@@ -14,7 +14,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hypogoal.core.config import preset_digest
 from hypogoal.core.drafts import PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
@@ -108,7 +107,6 @@ def write_plan(run: Path, plan: Plan) -> None:
     run.mkdir(parents=True, exist_ok=True)
     head = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers}
     head |= {"anew": sorted(plan.anew)} if plan.anew else {}
-    head |= {"presets": dict(plan.presets)} if plan.presets else {}
     lines = ",\n".join(f"  {json.dumps(_row(cell, run))}" for cell in plan.cells)
     replace_text(run / PLAN, f'{json.dumps(head)[:-1]}, "cells": [\n{lines}\n]}}\n')
 
@@ -148,8 +146,7 @@ def read_plan(run: Path) -> Plan:
         outs.add(cells[-1].out)
     if len({cell.name for cell in cells}) < len(cells):
         raise LostPlan("the sweep's plan is damaged (the names of cells)", path, GIVE)
-    anew, presets = frozenset(content.get("anew", ())), content.get("presets", {})
-    return Plan(content["experiment"], cells, content["workers"], anew, presets)
+    return Plan(content["experiment"], cells, content["workers"], frozenset(content.get("anew", ())))
 
 
 def _is_place(value: Any) -> bool:
@@ -194,21 +191,17 @@ PLAN_KEYS: Schema = {
     "workers": lambda value: is_count(value) and value > 0,
     "cells": is_list(_is_cell),
 }
-PLAN_MAY: Schema = {"anew": is_list(is_text), "presets": is_table(is_text)}
+PLAN_MAY: Schema = {"anew": is_list(is_text)}
 
 
 def check_same(run: Path, cells: Sequence[Cell], anew: Set[str] = frozenset()) -> None:
-    """Refuse (``UserError``) cells that lack any of the folder's plan, or have other commands or presets.
+    """Refuse (``UserError``) cells that lack any of the folder's plan, or have other commands.
 
-    The commands of those called ``anew`` may be others; with any of these a preset, too.
+    The commands of those called ``anew`` may be others.
     """
     do = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
-    before, digests = read_plan(run), preset_digests(cells)
-    for path, digest in before.presets.items():
-        if digests.get(path, digest) != digest and not anew:
-            raise UserError("this preset was changed since the sweep here was begun", path, do)
     by_place = {cell.out: cell for cell in cells}
-    for cell in before.cells:
+    for cell in read_plan(run).cells:
         if cell.out not in by_place:
             raise UserError(f"the sweep here has a cell that this one lacks: {cell.name}", run, do)
         old, new = _meaning(cell), _meaning(by_place[cell.out])
@@ -222,10 +215,3 @@ def check_same(run: Path, cells: Sequence[Cell], anew: Set[str] = frozenset()) -
 def _meaning(cell: Cell) -> dict[tuple[str, str], str]:
     """A cell's command in parts, whose order does not matter; of a setting the last counts."""
     return {(part[0], part[-1].partition("=")[0]): " ".join(part) for part in cell.parts}
-
-
-def preset_digests(cells: Sequence[Cell]) -> dict[str, str]:
-    """The preset files that commands name, each with its digest."""
-    options = (option for cell in cells for option in cell.parts[1:])
-    files = {option[-1] for option in options if option[0] == "--preset" and option[-1].endswith(".toml")}
-    return {path: preset_digest(path) for path in sorted(files)}

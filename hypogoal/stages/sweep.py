@@ -245,7 +245,8 @@ def _begun(
         else:
             before, lost = _before(planned, out)
             anew, todo = planned.anew, to_run(planned, out, only)
-            unplanned = [cell for cell in _doubted(before, planned) if cell.name not in anew and stamp_of(cell)]
+            names = {cell.name for cell in before.cells} | anew
+            unplanned = [cell for cell in planned.cells if cell.name not in names and stamp_of(cell)]
             planned = replace(planned, anew=before.anew | anew)
         _forecast(replace(planned, cells=todo) if only else planned, todo, say, confirm)
         (out / records.LOGS).mkdir(parents=True, exist_ok=True)
@@ -260,20 +261,8 @@ def _begun(
             elif record.code:  # it is tried again
                 records.write_record(out, cell, replace(record, code=None))
             (out / records.FINISHED).unlink(missing_ok=True)
-        planned = replace(planned, presets=records.preset_digests(planned.cells))
         records.write_plan(out, planned)
         yield planned, todo
-
-
-def _doubted(before: Plan, planned: Plan) -> list[Cell]:
-    """The cells that the folder's plan lacks, and those whose preset was changed since."""
-    names, digests = {cell.name for cell in before.cells}, records.preset_digests(planned.cells)
-    changed = {path for path, digest in before.presets.items() if digests.get(path) != digest}
-    return [
-        cell
-        for cell in planned.cells
-        if cell.name not in names or (changed and not changed.isdisjoint(records.preset_digests([cell])))
-    ]
 
 
 def _before(planned: Plan, out: Path) -> tuple[Plan, str]:
