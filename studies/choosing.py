@@ -2,8 +2,8 @@
 
 hypogoal run doorkey --preset choosing --out runs/choosing
 python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
-hypogoal run which-feature --out runs/which-feature
-python -m studies.choosing runs/which-feature docs/results/which-feature-rooms.csv
+hypogoal run rooms --out runs/rooms
+python -m studies.choosing runs/rooms docs/results/rooms.csv
 hypogoal sweep examples.preference:preference --out runs/preference
 python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
 python -m studies.choosing --tables docs/results/choosing-doorkey.csv
@@ -252,8 +252,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.tables:
         collect(arguments.run, arguments.csv, arguments.baselines)
-    if arguments.csv.stem.startswith("which-feature-rooms"):
-        arguments.csv, drawn = arguments.csv.with_stem("which-feature-rooms"), rooms
+    if arguments.csv.stem.startswith("rooms"):
+        arguments.csv, drawn = arguments.csv.with_stem("rooms"), rooms
     else:
         drawn = tables
     print("\n".join(drawn(arguments.csv)))

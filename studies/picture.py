@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("out", type=Path, help="a .png file")
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.5), sharey=True, layout="constrained")
-    settings = [f"which-feature-rooms{which}.csv" for which in ("-first", "-second", "")]
+    settings = [f"rooms{which}.csv" for which in ("-first", "-second", "")]
     rooms = {
         method: [value for name in settings for value in solved(name, method=f"{method}-truth-shape")]
         for method in ("dbat", "none", "one")

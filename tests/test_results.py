@@ -27,7 +27,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "hypotheses-doorkey": hypotheses.tables,
     "options-that-hold": ladder_options.tables_that_hold,
     "preference-doorkey": choosing.tables,
-    "which-feature-rooms": choosing.rooms,
+    "rooms": choosing.rooms,
 }
 
 
