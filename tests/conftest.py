@@ -1,18 +1,24 @@
 """One thread per process, as the stages do it: two threads with a busy neighbour are ten times slower."""
 
 import os
+import shutil
 import signal
 from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: tests of Ctrl-C would wait for ever
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest
+import shared_runs
 import torch
+from command_line import run, trusting
 
 torch.set_num_threads(1)
 
+OWN_DOMAINS = ("own_domain:DOMAIN", "own_domain:ODD")
 # Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
 LONGEST = (
     "test_sweep",
@@ -67,3 +73,41 @@ def small_gru(monkeypatch: pytest.MonkeyPatch) -> None:
     from hypogoal.options.paper_network import PaperQNetwork
 
     monkeypatch.setattr(PaperQNetwork, "HIDDEN", 32)
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A run of every stage on DoorKey, to be read only: ``shared_runs.DOORKEY_RUN`` says what is in it."""
+    yield from shared_runs.built_once(tmp_path_factory, "tiny", partial(shared_runs.make, shared_runs.DOORKEY_RUN))
+
+
+@pytest.fixture
+def tiny_copy(tiny_run: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return shutil.copytree(tiny_run, tmp_path / "tiny")
+
+
+@pytest.fixture(scope="session")
+def built_corridor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What ``corridor_run`` hands out."""
+
+    def build(folder: Path) -> None:
+        with trusting(*OWN_DOMAINS):
+            shared_runs.make(shared_runs.CORRIDOR_RUN, folder)
+        other = shutil.copytree(folder, folder.with_name("corridor-other"), dirs_exist_ok=True)
+        run("compare", folder, other, "--out", folder / "comparison")
+
+    yield from shared_runs.built_once(tmp_path_factory, "corridor", build)
+
+
+@pytest.fixture
+def corridor_run(built_corridor: Path) -> Iterator[Path]:
+    """A run of every stage on the corridor, which is cheap, to be read only; its domain is trusted meanwhile."""
+    with trusting(*OWN_DOMAINS):
+        yield built_corridor
+
+
+@pytest.fixture
+def corridor_copy(corridor_run: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return shutil.copytree(corridor_run, tmp_path / "corridor")

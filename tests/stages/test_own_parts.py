@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import refuses, run, settings, trusting
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
@@ -24,7 +24,7 @@ from hypogoal.options.tables import Choices
 from hypogoal.options.termination import Terminations
 from hypogoal.stages import train_meta, train_options
 
-FEW = ["--set", "steps=300", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
+FEW = [*settings("steps=300", "environments=4", "random_episodes=5"), "-q"]
 
 
 class FirstOffered(Chooser):
@@ -85,27 +85,9 @@ class AtLeast(Terminations):
         return self.of_running(ids, options) & (age >= self.length)
 
 
-@pytest.fixture(scope="module")
-def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("own-parts")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
-        data = str(folder / "data.h5")
-        assert main(["collect", "corridor_env:DOMAIN", "--out", data, "-q"]) == 0
-        few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
-        assert main(["train-ensemble", data, "--out", str(folder / "ensemble"), *few]) == 0
-    return folder / "ensemble"
-
-
-@pytest.fixture(autouse=True)
-def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
-
-
-def train(stage: str, ensemble: Path, out: Path, *settings: str) -> dict[str, Any]:
+def train(stage: str, source: Path, out: Path, *pairs: str) -> dict[str, Any]:
     """The configuration of what a stage makes with these settings."""
-    words = [word for setting in settings for word in ("--set", setting)]
-    assert main([stage, str(ensemble), "--out", str(out), *FEW, *words]) == 0
+    run(stage, source / "ensemble", "--out", out, *FEW, *settings(*pairs))
     return open_artefact(out).whole().config
 
 
@@ -114,23 +96,22 @@ OWN = {"chooser": "FirstOffered", "network": "Straight", "policy_view": "UpperHa
 
 @pytest.mark.parametrize("stage", ["train-options", "train-meta"])
 @pytest.mark.parametrize("setting", OWN)
-def test_one_file_is_enough(setting: str, stage: str, ensemble: Path, tmp_path: Path) -> None:
+def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_path: Path) -> None:
     """Spec A3, A4, G2: the setting names the class; what is trained is played again where the user allows it."""
     name = f"{__name__}:{OWN[setting]}"
-    assert train(stage, ensemble, tmp_path / "made", f"{setting}={name}")[setting] == name
+    assert train(stage, corridor_run, tmp_path / "made", f"{setting}={name}")[setting] == name
     if setting == "chooser":
         choices = Choices.read(tmp_path / "made" / "choices.csv")
         np.testing.assert_array_equal(choices.total("chosen", 1)[0], choices.total("offered", 1)[0])
     if stage == "train-meta":
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("HYPOGOAL_TRUST", f"corridor_env:DOMAIN,{name}")
+        with trusting("own_domain:DOMAIN", name):
             assert len(play_episode(agent_of(open_artefact(tmp_path / "made"), seed=0), 2)) > 1
         with pytest.raises(UserError, match="names code of its own"):
             agent_of(open_artefact(tmp_path / "made"), seed=0)
 
 
 @pytest.mark.parametrize(
-    ("settings", "fault"),
+    ("pairs", "fault"),
     [
         (["network={}:Straight", "experience=own"], "straight options have no experience: experience=own"),
         (["chooser={}:Straight"], "this is no chooser"),
@@ -139,43 +120,33 @@ def test_one_file_is_enough(setting: str, stage: str, ensemble: Path, tmp_path: 
         (["network={}:Straight", "policy_view={}:UpperHalf"], ":Straight needs policy_view=full"),
     ],
 )
-def test_what_does_not_fit_is_one_line(
-    settings: list[str], fault: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Spec G2: exit code 2, nothing written."""
-    words = [word for setting in settings for word in ("--set", setting.format(__name__))]
-    assert main(["train-options", str(ensemble), "--out", str(tmp_path / "out"), *FEW, *words]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert fault in line and not any(tmp_path.iterdir())
+def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_run: Path, tmp_path: Path) -> None:
+    """Spec G2."""
+    own = settings(*(pair.format(__name__) for pair in pairs))
+    refuses(fault, "train-options", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *own)
 
 
 @pytest.mark.parametrize(
-    ("settings", "fault"),
-    [
-        (["entropy=0.1", "chooser=random"], "does nothing with chooser=random: entropy=0.1"),
-        (["replay=500", "network=planned"], "does nothing with network=planned: replay=500"),
-    ],
+    ("pair", "does_nothing_with"), [("entropy=0.1", "chooser=random"), ("replay=500", "network=planned")]
 )
 def test_settings_that_do_nothing_are_refused(
-    settings: list[str], fault: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pair: str, does_nothing_with: str, corridor_run: Path, tmp_path: Path
 ) -> None:
     """Spec G2: where they were given; those of a preset, or of an experiment for all its cells, pass."""
-    words = [word for setting in settings for word in ("--set", setting)]
-    command = ["train-meta", str(ensemble), "--out", str(tmp_path / "out"), *FEW]
-    assert main([*command, *words]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert fault in line and not any(tmp_path.iterdir())
+    command = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW]
+    refuses(f"does nothing with {does_nothing_with}: {pair}", *command, *settings(pair, does_nothing_with))
     preset = tmp_path / "all.toml"
     preset.write_text("[train-meta]\nentropy = 0.1\n")
-    assert main([*command, "--preset", str(preset), "--set", "chooser=random"]) == 0
+    run(*command, "--preset", preset, "--set", "chooser=random")
 
 
 @pytest.mark.parametrize("stage", [train_options, train_meta])
 def test_what_is_complete_is_not_built_again(
-    stage: Any, ensemble: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: Any, corridor_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Spec A6, G1: ``--resume`` looks at the manifest, and makes neither engine nor networks."""
-    command = [stage.__name__.rpartition(".")[2].replace("_", "-"), str(ensemble), "--out", str(tmp_path / "out"), *FEW]
-    assert main(command) == 0
+    name = stage.__name__.rpartition(".")[2].replace("_", "-")
+    command = [name, corridor_run / "ensemble", "--out", tmp_path / "out", *FEW]
+    run(*command)
     monkeypatch.setattr(stage, "assemble", None)
-    assert main([*command, "--resume"]) == 0
+    run(*command, "--resume")

@@ -1,0 +1,80 @@
+"""Commands of hypogoal in this process: those that succeed, and those that are refused."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from hypogoal.cli import main
+
+
+class Printed(NamedTuple):
+    """What a command printed."""
+
+    out: str
+    err: str
+
+    @property
+    def path(self) -> Path:
+        """The last line of standard output, which is where the result is."""
+        return Path(self.out.splitlines()[-1])
+
+
+def settings(*pairs: str) -> list[str]:
+    """``--set`` before each ``key=value``."""
+    words = []
+    for pair in pairs:
+        words += ["--set", pair]
+    return words
+
+
+def run(*words: object) -> Printed:
+    """What a command prints that must succeed."""
+    code, printed = _called(words)
+    assert code == 0, (words, printed.err)
+    return printed
+
+
+def refuses(wanted: str, *words: object) -> str:
+    """The one line in which a command refuses: exit code 2, ``wanted`` in it, and nothing else printed or written."""
+    out = _output_of(words)
+    before = _names_beside(out)
+    code, printed = _called(words)
+    lines = printed.err.strip().splitlines()
+    assert (code, len(lines), printed.out) == (2, 1, ""), (words, code, printed)
+    assert lines[0].startswith("hypogoal: ") and lines[0].isprintable(), lines
+    assert wanted in lines[0], lines
+    assert _names_beside(out) == before, words
+    return lines[0]
+
+
+@contextmanager
+def trusting(*names: str) -> Iterator[None]:
+    """Within it the user allows this code, which files name."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HYPOGOAL_TRUST", ",".join(names))
+        yield
+
+
+def _called(words: tuple[object, ...]) -> tuple[int, Printed]:
+    """The exit code and what was printed."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main([str(word) for word in words])
+    return code, Printed(out.getvalue(), err.getvalue())
+
+
+def _output_of(words: tuple[object, ...]) -> Path | None:
+    if "--out" not in words:
+        return None
+    return Path(str(words[words.index("--out") + 1]))
+
+
+def _names_beside(out: Path | None) -> list[Path]:
+    """Everything in the folder that an output is in, drafts too."""
+    return [] if out is None else sorted(out.parent.rglob("*"))
