@@ -3,7 +3,7 @@ PYTHON ?= python3
 JOBS ?= 2
 DEMO ?= runs/demo
 ROOMS ?= runs/rooms
-ONLY ?= doorkey montezuma training options verdicts loop ahead startup
+ONLY ?= doorkey montezuma training options verdicts loop startup
 
 VENV := .venv
 BIN := $(VENV)/bin

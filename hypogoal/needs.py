@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from hypogoal.hypotheses.trial import StepCost
 
 BASE = 400e6  # a process with torch, before it does anything
-AHEAD = 100e6  # the process that plays ahead, without torch: 82 MB with sixteen games
 MEMBER = 8e6  # weights of a member with the user's network, which is not run
 WINDOWS = 6e6  # a member's cached windows (hypotheses.known_windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
@@ -163,9 +162,8 @@ def play_needs(domain: Domain, ensemble: dict[str, Any], config: TrainOptionsCon
     classifiers = sub_goals * members * judging_member(ensemble.get("network", "auto"), shape, dtype)
     batch = config.option_batch + (config.meta_batch if isinstance(config, TrainMetaConfig) else 0)
     packed = stops / domain.packed
-    base = BASE + AHEAD * (isinstance(config, TrainOptionsConfig) and config.play_ahead)
     # While a checkpoint is written, memory holds a copy of the state.
-    memory = base + 2 * (state + stops) + classifiers + batch * LEARNED * np.prod(shape)
+    memory = BASE + 2 * (state + stops) + classifiers + batch * LEARNED * np.prod(shape)
     return Needs(memory, weights + packed + CHECKPOINTS * (state + packed) + LOGS)
 
 

@@ -1,6 +1,5 @@
 """Work on several cores, in processes of its own, none of which outlives its parent."""
 
-import contextlib
 import ctypes
 import multiprocessing
 import os
@@ -9,9 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import Connection
-from multiprocessing.util import Finalize
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import Killed
@@ -75,55 +72,6 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-class Companion:
-    """A process beside this one that answers messages, in their order, until this object or this process ends.
-
-    There ``create(*arguments)`` makes the function from a message to its answer. Signals are left to this process.
-    """
-
-    def __init__(self, create: Callable[..., Callable[[Any], Any]], *arguments: Any):
-        spawn = multiprocessing.get_context("spawn")
-        self._connection, other = spawn.Pipe()
-        words = (os.getpid(), other, create, *arguments)
-        with environment(**SAFE_PATH):
-            spawn.Process(target=_answer, args=words, daemon=True).start()
-        other.close()
-        # It ends when nobody can send to it any more; at exit that must be before multiprocessing waits for it.
-        Finalize(self, self._connection.close, exitpriority=0)
-
-    def send(self, message: Any) -> None:
-        """Send a message, for :meth:`receive` to get its answer."""
-        with contextlib.suppress(ConnectionError):  # it has ended: receive knows why
-            self._connection.send(message)
-
-    def receive(self) -> Any:
-        """The answer to the first message that was not answered yet.
-
-        An error there is raised here; a process that the system killed is ``Killed``.
-        """
-        try:
-            answer = self._connection.recv()
-        except (EOFError, ConnectionError):
-            fault = "the second process was killed by the system, most likely for lack of memory"
-            raise Killed(fault, None, "Free some memory.") from None
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-
-def _answer(parent: int, connection: Connection, create: Callable[..., Callable[[Any], Any]], *arguments: Any) -> None:
-    _begin(parent)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent, too, may get it, and then asks for what it has to save
-    try:
-        answer = create(*arguments)
-        while True:
-            connection.send(answer(connection.recv()))
-    except (EOFError, ConnectionError):  # the parent has ended, or needs it no longer
-        pass
-    except Exception as error:  # noqa: BLE001 - it is raised again in the parent
-        connection.send(error)
 
 
 def _begin(parent: int) -> None:

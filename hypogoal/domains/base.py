@@ -112,7 +112,6 @@ class Engine(ABC):
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
         restarts: whether it has :meth:`restart`; resumes: whether it has :meth:`snapshot` and :meth:`restore`.
-        ahead: whether it plays a step from :meth:`begin_step` on, while its user does something else.
     """
 
     n_actions: int
@@ -128,7 +127,7 @@ class Engine(ABC):
     action_sets: Mapping[str, tuple[int, ...]] = MappingProxyType({})
     position_names: tuple[str, ...] = ()
     layouts: Layouts | None = None
-    restarts = resumes = ahead = False
+    restarts = resumes = False
 
     @property
     @abstractmethod
@@ -144,9 +143,6 @@ class Engine(ABC):
     @abstractmethod
     def step(self, actions: NDArray[np.int64]) -> Step:
         """Step every environment with actions (E,); where an episode ends, ``ids`` becomes a start state."""
-
-    def begin_step(self, actions: NDArray[np.int64]) -> None:  # noqa: B027 - there is nothing to begin by default
-        """Begin the step that :meth:`step` with the same actions ends; until then nothing else changes."""
 
     @abstractmethod
     def images(self, ids: NDArray[np.int64], out: Any = None) -> Observations:
@@ -323,7 +319,6 @@ class Domain(ABC):
         starts: names of places where episodes begin; ``make_engine`` takes one as ``start``.
         many_starts: ``start`` may also be several names, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
-        plays_ahead: ``make_engine`` also takes ``play_ahead=True``, for an engine that plays ``ahead``.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence for people on how to read its observations.
         labels_stand_in: for people, where the domain's author adds a sub-goal.
@@ -342,7 +337,7 @@ class Domain(ABC):
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
     many_starts: bool = False
-    many_layouts = plays_ahead = False
+    many_layouts = False
     reading = ""
     labels_stand_in = "its sub_goals and what its engine's labels() return"
     measures = pictures = sees_agent = False

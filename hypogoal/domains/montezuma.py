@@ -21,7 +21,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
-from hypogoal.domains.montezuma_ahead import AheadEngine
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observed_pixel, picture, pixel
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import BEGINNINGS, MAX_STEPS, beginning_named
@@ -137,7 +136,7 @@ class MontezumaDomain(Domain):
     config_class = MontezumaConfig
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(BEGINNINGS)
-    many_starts = plays_ahead = True
+    many_starts = True
     packed = 20  # 24 measured
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
@@ -238,16 +237,14 @@ class MontezumaDomain(Domain):
         max_steps: int = MAX_STEPS,
         *,
         start: str = next(iter(BEGINNINGS)),
-        play_ahead: bool = False,
         **arguments: Any,
     ) -> MontezumaEngine:
-        """An engine of ``count`` games that begin at ``start``, with ``play_ahead`` in a second process.
+        """An engine of ``count`` games that begin at ``start``.
 
         The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``. Other
         arguments as for ``MontezumaEngine``.
         """
-        kind = AheadEngine if play_ahead else MontezumaEngine
-        return kind(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
+        return MontezumaEngine(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
 
     def task(self, world: Mapping[str, Any]) -> str:
         return "Reach a sub-goal, such as the base of a ladder, from a start; a lost life ends the episode."

@@ -58,7 +58,7 @@ class MontezumaEngine(TurnEngine):
         self.count, self.max_steps, self.end_at_death = count, max_steps, end_at_death
         self.memory: int = memory
         self.room = memory
-        self._emulators = self._make_emulators(seed)
+        self._emulators = [game.Emulator(seed + number) for number in range(count)]
         emulator, beginnings = game.Emulator(seed), map(beginning_named, start.split(","))
         starts = [make_starts(emulator, beginning, start_states, seed) for beginning in beginnings]
         self.starts: list[Start] = [*chain(*starts)]
@@ -67,9 +67,6 @@ class MontezumaEngine(TurnEngine):
         self._facts = bytearray(b"".join(bytes(begin.facts) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
-
-    def _make_emulators(self, seed: int) -> list[Any]:
-        return [game.Emulator(seed + number) for number in range(self.count)]
 
     @property
     def n_states(self) -> int:

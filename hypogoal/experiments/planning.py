@@ -126,8 +126,6 @@ def _cells(commands: Sequence[Command], out: Path, common: Mapping[str, Sequence
         # Options of all cells of a stage stand before the cell's own: the last setting of a name counts, so --set
         # cannot turn a method or a control into another.
         words[2:2] = common[words[0]]
-        if any(word.removeprefix("--set=").startswith("play_ahead=") for word in words):
-            raise UserError("play_ahead is for single runs: a sweep's cells have the cores already", where, MEND)
         target = out / (place + (".h5" if words[0] == "collect" else ""))
         arguments, needs = (*words, "--out", str(target)), tuple(source.out for source in sources)
         cells[command.name] = Cell(place.replace("/", "-"), arguments, target, needs, cost, _axes(command))

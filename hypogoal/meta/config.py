@@ -111,12 +111,6 @@ class TrainOptionsConfig(PlayConfig):
         choices=("random", "even"),
         own=True,
     )
-    play_ahead: bool = setting(
-        False,
-        "a second process plays each step while options learn from the steps before it: for a single run on two cores "
-        "(Montezuma's Revenge)",
-        source="ours: docs/performance.md",
-    )
 
 
 @dataclass(frozen=True)
@@ -140,7 +134,6 @@ class AuditConfig(TrainOptionsConfig):
     """How policies learn to fool a classifier, and what is tried against them."""
 
     policy_view: str = fixed(FULL)  # a classifier has no localiser
-    play_ahead: bool = fixed(False)
     until: float = fixed(0.0)  # policies that fool a classifier do not bring the task to success
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")

@@ -19,7 +19,6 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
-from hypogoal.core.workers import CORES, allowed
 from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
 from hypogoal.hypotheses.ensemble import read_ensemble
@@ -181,19 +180,11 @@ def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termin
 
 
 def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
-    """Spec D4, H6: an engine's arguments: where episodes begin, and ``play_ahead``; none where nothing is chosen.
+    """Spec D4, H6: an engine's arguments: where episodes begin; none where nothing is chosen.
 
-    An unknown start, no start where the domain has several, layouts where it has one, or ``play_ahead`` where nothing
-    can play ahead is a ``UserError``.
+    An unknown start, no start where the domain has several, or layouts where it has one is a ``UserError``.
     """
     more: dict[str, Any] = {}
-    if isinstance(config, TrainOptionsConfig) and config.play_ahead:
-        if not domain.plays_ahead:
-            fault = "an engine of this domain plays in the process that learns"
-            raise UserError(fault, f"{domain.name}, play_ahead=true", "Leave it out.")
-        if allowed(2) < 2:
-            raise UserError("play_ahead needs two cores, one is allowed here", f"{CORES}=1", "Leave it out.")
-        more["play_ahead"] = True
     if config.layouts.strip():
         if not domain.many_layouts:
             raise UserError(ONE_LAYOUT, f"{domain.name}, layouts={config.layouts}", "Leave it out.")

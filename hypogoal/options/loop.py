@@ -77,20 +77,8 @@ class OptionLoop(Resumable):
         engine.reset()
 
     def step(self) -> dict[str, float]:
-        """One step of every environment, then the updates that are due; returns numbers to log.
-
-        Engines that play ``ahead`` play during the updates, which know nothing of this step yet.
-        """
-        if not self.engine.ahead:
-            self.advance()
-            return self._learn()
-        actions = self._act()
-        self.engine.begin_step(actions)
-        numbers = self._learn()
-        self._move(actions)
-        return numbers
-
-    def _learn(self) -> dict[str, float]:
+        """One step of every environment, then the updates that are due; returns numbers to log."""
+        self.advance()
         numbers = self.learner.learn() | self.chooser.learn()
         return numbers | self.initiation.learn() if self.initiation else numbers
 
@@ -99,16 +87,9 @@ class OptionLoop(Resumable):
 
         Without ``learning`` the agent is frozen: options are greedy, and nothing is kept that could be learned from.
         """
-        return self._move(self._act(learning=learning), learning=learning)
-
-    def _act(self, *, learning: bool = True) -> NDArray[np.int64]:
-        """Choose options where none runs, and every running option's action, int64 (E,)."""
         self._choose()
-        return self.learner.act(self.engine.ids.copy(), self.option.copy(), self.age, explore=learning)
-
-    def _move(self, actions: NDArray[np.int64], *, learning: bool = True) -> Transitions:
-        """Play these actions, int64 (E,), and see what became of the options."""
         ids, option = self.engine.ids.copy(), self.option.copy()
+        actions = self.learner.act(ids, option, self.age, explore=learning)
         layouts = [*self.engine.layouts.now] if self.engine.layouts else None
         step = step_of(self.engine, actions)
         reached = self.terminations.reached(step.next_ids, option, self.age)

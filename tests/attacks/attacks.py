@@ -313,9 +313,7 @@ def disk(box: Box, rng: Rng, case: int) -> bool:
     return accepted
 
 
-STATEFUL = (
-    *("rooms", "ensemble", "sequential", "climbers", "options", "meta", "descent", "ahead", "audit", "ppo", "dqn"),
-)
+STATEFUL = (*("rooms", "ensemble", "sequential", "climbers", "options", "meta", "descent", "audit", "ppo", "dqn"),)
 GROWING = ("/numbers", "/told/numbers", "/agent/logged")  # dicts of numbers to log, which have no fixed names
 LONGER = ("rows", "items", "drop item", "number")  # what only a value may tell: a list may have any length
 

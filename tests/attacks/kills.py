@@ -100,11 +100,6 @@ _ALL = (
     ),
     Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
     Stage(
-        "ahead",
-        ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", "play_ahead=true", *DESCENT)),
-        ("climbers",),
-    ),
-    Stage(
         "audit",
         (
             *("audit", "{ensemble}", "--domain", "doorkey", "--sub-goal", "open-red-door"),

@@ -69,51 +69,6 @@ def loop_of(engine, learner, chooser, **changes):
     return OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=0.9), recorder
 
 
-class Ordered(Corridor):
-    """An engine that says when it plays."""
-
-    def __init__(self, events: list[str], *, ahead: bool):
-        self.events, self.ahead = events, ahead
-        super().__init__(1)
-
-    def begin_step(self, actions):
-        self.events.append("begin")
-
-    def step(self, actions):
-        self.events.append("play")
-        return super().step(actions)
-
-
-class Watched(Scripted):
-    """A learner that says when it does what."""
-
-    def __init__(self, events: list[str]):
-        super().__init__(1)
-        self.events = events
-
-    def act(self, *arguments, **more):
-        self.events.append("act")
-        return super().act(*arguments, **more)
-
-    def observe(self, moved):
-        self.events.append("observe")
-
-    def learn(self):
-        self.events.append("learn")
-        return {"loss": 1.0}
-
-
-@pytest.mark.parametrize(
-    ("ahead", "order"),
-    [(False, ["act", "play", "observe", "learn"]), (True, ["act", "begin", "learn", "play", "observe"])],
-)
-def test_an_engine_that_plays_ahead_plays_while_options_learn(ahead: bool, order: list[str]) -> None:
-    """DEV-52: so an action follows weights that have seen all but the last step."""
-    events: list[str] = []
-    loop, _ = loop_of(Ordered(events, ahead=ahead), Watched(events), FirstOption())
-    assert [loop.step(), loop.step()] == [{"loss": 1.0}] * 2 and events == 2 * order
-
-
 def test_an_option_ends_at_its_own_sub_goal_and_pays_the_smdp_return() -> None:
     """Spec D1, E1: option left-end walks 2 steps and ends there; nothing was earned; tau is 2."""
     chooser = FirstOption()
