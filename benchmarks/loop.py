@@ -16,7 +16,6 @@ import io
 import statistics
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -34,8 +33,8 @@ LAYOUT = 100
 WANTED = {"train-meta": 15.0}
 HALF = "update_interval=16"  # the default of other domains
 WANTED_SHARE = 0.1  # of verdicts, at most
-CLIMBING = {"train-options at a ladder": (), "policy_pixels=half": ("policy_pixels=half",)}
-WANTED_OF_CEILING = dict.fromkeys(CLIMBING, 0.8)
+CLIMBING = "train-options at a ladder"
+WANTED_OF_CEILING = {CLIMBING: 0.8}
 
 
 def quietly(*command: object) -> None:
@@ -112,9 +111,9 @@ def stage(steps: int, folder: Path, *command: object) -> float:
     return (seconds(steps) - seconds(few)) / (steps - few)
 
 
-def climbing(ensemble: Path, steps: int, folder: Path, *more: str) -> float:
-    """An agent step of ``train-options`` at a ladder, with ``more`` settings."""
-    changes = ("start=1L", "termination=oracle", "random_episodes=0", *more)
+def climbing(ensemble: Path, steps: int, folder: Path) -> float:
+    """An agent step of ``train-options`` at a ladder."""
+    changes = ("start=1L", "termination=oracle", "random_episodes=0")
     return stage(steps, folder, "train-options", ensemble, *(word for pair in changes for word in ("--set", pair)))
 
 
@@ -159,10 +158,7 @@ def main() -> None:
         climbed = timing.alternated(
             {
                 "the emulator's ceiling": lambda: ceiling(1_000),
-                **{
-                    name: partial(climbing, folder / "climbers", climbs, folder, *more)
-                    for name, more in CLIMBING.items()
-                },
+                CLIMBING: lambda: climbing(folder / "climbers", climbs, folder),
             },
             repeats,
         )

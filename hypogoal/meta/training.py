@@ -58,7 +58,7 @@ def assemble(
     """
     first = partial(read_ensemble, ensemble, dict(ensemble_config), ensemble_config["sub_goals"][0])
     learner, chooser = load_learner(config.network), load_chooser(config.chooser)
-    views = views_in(config.policy_view, config.policy_pixels)
+    views = views_in(config.policy_view)
     if config.termination == ORACLE:
         columns_of(domain, ensemble_config["sub_goals"])
     world = domain.world(played_world(domain, ensemble_config["domain_config"], config.world))

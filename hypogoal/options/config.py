@@ -113,12 +113,6 @@ class OptionConfig:
         choices=(FULL, "agent-crop"),
         own=True,
     )
-    policy_pixels: str = setting(
-        "all",
-        "the policies' pictures: all pixels, or half the side, means of 2 x 2, faster with convolutions (light)",
-        source="ours: docs/performance.md",
-        choices=("all", "half"),
-    )
     exploration: str = setting(
         "independent",
         "how long a random action lasts: one step, or several",

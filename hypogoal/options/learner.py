@@ -97,7 +97,7 @@ class Learner(Part, ABC):
     """
 
     FILE: ClassVar[str] = "options.safetensors"
-    NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO, "policy_view": FULL, "policy_pixels": "all"}
+    NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO, "policy_view": FULL}
     ONCE: ClassVar[bool] = False
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "view", *COUNTERS)
 

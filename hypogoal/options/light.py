@@ -227,7 +227,7 @@ class LightPolicies:
 
     def __init__(self, saved: SavedOptions):
         config, weights = saved.config, below("online.", saved.weights)
-        kinds = views_in(config.get("policy_view", FULL), config.get("policy_pixels", "all"))
+        kinds = views_in(config.get("policy_view", FULL))
         self.views = create_views(kinds, saved.shape, saved.ensemble)
         self.actions = saved.actions("online.heads.weight", saved.count)
         shape, embedding = self.views[-1].shape if self.views else saved.shape, config.get("embedding", AUTO)

@@ -1,4 +1,4 @@
-"""What policies see that do not see all of a picture: the neighbourhood of the agent, or half the side (both ours)."""
+"""What policies see that do not see all of a picture: the neighbourhood of the agent (ours)."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ class PolicyView(Part, ABC):
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Raise a ``UserError`` where policies cannot see so; by default, where observations are no pictures."""
         if engine.observation_dtype != PICTURE:
-            setting = f"policy_view={config.policy_view}, policy_pixels={config.policy_pixels}"
-            raise UserError("policies have views of pictures only", setting, "Leave it out.")
+            raise UserError(
+                "policies have views of pictures only", f"policy_view={config.policy_view}", "Leave it out."
+            )
 
     @classmethod
     def create(cls, shape: tuple[int, ...], ensemble: Callable[[], Ensemble]) -> Self:
@@ -82,16 +83,6 @@ class AgentCrop(PolicyView):
         return self._centres[ids]
 
 
-class HalfPixels(PolicyView):
-    """Pictures of half the side, means of 2 x 2 pixels (policy_pixels=half)."""
-
-    def __init__(self, shape: tuple[int, ...]):
-        self.shape = (shape[0] // 2, shape[1] // 2, *shape[2:])
-
-    def see(self, pictures: Pictures, ids: NDArray[np.int64] | None = None) -> Pictures:
-        return halved(pictures)
-
-
 class Viewed(Resumable):
     """Pictures of an engine's states as policies see them, through one view after another."""
 
@@ -120,10 +111,9 @@ class Viewed(Resumable):
         raise NotImplementedError
 
 
-def views_in(policy_view: str, policy_pixels: str) -> list[type[PolicyView]]:
-    """The views that these settings name, in the order in which they are applied."""
-    chosen = [] if policy_view == FULL else [load_part(policy_view, "policy view", PolicyView, VIEWS)]  # type: ignore[type-abstract]
-    return [*chosen, HalfPixels] if policy_pixels == "half" else chosen
+def views_in(policy_view: str) -> list[type[PolicyView]]:
+    """The views that this setting names, in the order in which they are applied."""
+    return [] if policy_view == FULL else [load_part(policy_view, "policy view", PolicyView, VIEWS)]  # type: ignore[type-abstract]
 
 
 def create_views(
@@ -134,18 +124,3 @@ def create_views(
     for kind in kinds:
         views.append(kind.create(views[-1].shape if views else shape, ensemble))
     return views
-
-
-def halved(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Means of 2 x 2 pixels, rounded: uint8 (N, H // 2, W // 2, C) of observations uint8 (N, H, W, C)."""
-    _, height, width, channels = observations.shape
-    whole = observations[:, : height // 2 * 2, : width // 2 * 2]
-    pairs = np.add(whole[:, ::2], whole[:, 1::2], dtype=np.uint16)
-    if channels == 4:  # four sums of 16 bits added as one number of 64: NumPy is slow where so few lie side by side
-        pixels = np.ascontiguousarray(pairs).view(np.uint64)
-        sums = (pixels[:, :, ::2] + pixels[:, :, 1::2]).view(np.uint16)
-    else:
-        sums = pairs[:, :, ::2] + pairs[:, :, 1::2]
-    sums += 2
-    sums >>= 2
-    return sums.astype(np.uint8)

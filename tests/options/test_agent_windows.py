@@ -1,4 +1,4 @@
-"""Policies of windows and of half pictures, several starts, and options that are trained further (beyond the paper)."""
+"""Policies of windows, several starts, and options that are trained further (beyond the paper)."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.hypotheses.localisers import LearnedLocaliser
 from hypogoal.hypotheses.views import AgentView, cut_windows
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.options.policy_views import SIDE, AgentCrop, HalfPixels, Viewed, halved
+from hypogoal.options.policy_views import SIDE, AgentCrop, Viewed
 from hypogoal.stages.train_options import train_options
 
 SHAPE = DOMAIN.observation_shape
@@ -113,39 +113,3 @@ def test_windows_need_someone_who_finds_the_agent(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=line):
             train(ensemble, tmp_path / "out", policy_view="agent-crop", **changes)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("channels", [1, 3, 4])
-def test_half_a_picture_is_the_mean_of_four_pixels(channels: int) -> None:
-    """Rounded; an odd last row or column is left out."""
-    pictures = np.random.default_rng(0).integers(256, size=(3, 9, 12, channels), dtype=np.uint8)
-    pictures[0] = 255
-    means = pictures[:, :8].reshape(3, 4, 2, 6, 2, channels).astype(np.float64).mean((2, 4))
-    half = halved(pictures)
-    assert half.dtype == np.uint8
-    np.testing.assert_array_equal(half, np.floor(means + 0.5))
-    np.testing.assert_array_equal(halved(pictures[:, :, :11]), half[:, :, :5])
-
-
-@pytest.mark.atari
-def test_options_of_half_pictures(tmp_path: Path) -> None:
-    """They are trained, go on and play as saved; also of windows. Not beside those of whole pictures."""
-    engine = MontezumaEngine("1L", 2)
-    ids, out = np.array([3, 0, 5]), np.zeros((3, 42, 42, 4), np.uint8)
-    seen = Viewed(engine, [HalfPixels(engine.observation_shape)])
-    assert seen.observation_shape == (42, 42, 4)
-    np.testing.assert_array_equal(seen.images(ids), halved(engine.images(ids)))
-    assert seen.images(ids[:2], out[:2]) is not None and (out[:2] == halved(engine.images(ids[:2]))).all()
-    ensemble = ensemble_in(tmp_path / "ensemble")
-    for view in ("full", "agent-crop"):
-        half = {"policy_pixels": "half", "policy_view": view}
-        train(ensemble, tmp_path / view, **half)
-        train(ensemble, tmp_path / f"{view}-on", tmp_path / view, **half)
-        weights = load_tensors(tmp_path / f"{view}-on" / "options.safetensors")
-        assert weights["online.trunk.0.weight"].shape[1] == (32 * 9 if view == "full" else 32 * 4)
-        act = hypogoal.load_options(tmp_path / f"{view}-on").policies(1)
-        assert 0 <= act(engine.images(ids)[0]) < 18
-        with pytest.raises(UserError, match="trained with policy_pixels=half, not all"):
-            train(ensemble, tmp_path / "other", tmp_path / view, policy_view=view)
-    with pytest.raises(UserError, match="network=paper needs policy_pixels=all"):
-        train(ensemble, tmp_path / "other", policy_pixels="half", network="paper", n_step=1)
