@@ -25,8 +25,6 @@ from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, ensemble_at
 from hypogoal.inspection import describe_path, lines, numbers_in, outcome
 from hypogoal.options.env import OptionEnv, Options
-from hypogoal.options.initiation import NAME as INITIATION
-from hypogoal.options.initiation import Narrowed
 from hypogoal.options.learner import make_policies
 from hypogoal.options.termination import rule_of
 
@@ -171,17 +169,12 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     goals, members = tuple(config["sub_goals"]), config["members"]
     rule, length = rule_of(config["termination"])
     rule.set_thresholds(ensembles, weights)
-    initiation = None
-    if INITIATION in artefact.manifest["files"]:
-        learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
-        initiation = Narrowed(learned, shape, len(goals) * members)
     return Options(
         goals,
         members,
         ensembles,
         policies,
         config["option_timeout"],
-        initiation,
         config["mask_reached"],
         domain=config["domain"],
         domain_config=config["domain_config"],

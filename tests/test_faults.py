@@ -25,7 +25,6 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.initiation import Initiation
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
@@ -115,23 +114,6 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None
         list(member.online.parameters())[-1].fill_(torch.nan)
     with pytest.raises(NumericalError, match=r"the loss of option 1 is nan in the batch of its update \d+, its step"):
         learner._update(1, member)
-
-
-def test_a_loss_or_gradient_that_is_no_number_stops_the_initiation_sets() -> None:
-    """Spec G3."""
-    initiation = Initiation(Corridor(4), 2, seed=0)
-    weight = next(initiation.network.parameters())
-    reached = np.array([True, False])
-    initiation.record(np.array([1, 2]), np.array([0, 1]), reached)
-    hook = weight.register_hook(lambda gradient: gradient * torch.inf)
-    with pytest.raises(NumericalError, match=r"^a gradient of the initiation sets is (nan|inf) after 2 executions$"):
-        initiation._update(np.array([0, 1]))
-    hook.remove()
-    assert torch.isfinite(weight).all()
-    with torch.no_grad():
-        weight.fill_(torch.nan)
-    with pytest.raises(NumericalError, match=r"^the loss of the initiation sets is nan after 2 executions$"):
-        initiation._update(np.array([0, 1]))
 
 
 def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:

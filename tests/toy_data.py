@@ -36,7 +36,6 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
     """
     if kind in ("options", "meta", "audit"):
         played = {LOG, "episodes.csv", "layout.json", "options.safetensors", "choices.csv", "terminations.h5"}
-        played |= {"initiation.safetensors"} if config.get("initiation") == "learned" else set()
         played |= {"visited.h5"} if config.get("save_visited") else set()
         played |= {"audit.json", "exploits.csv"} if kind == "audit" else set()
         chooses = kind == "meta" and config.get("chooser") in ("ppo", "thompson")

@@ -93,7 +93,7 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> list[tuple[dict[str,
             episodes = play(loop, chooser, EPISODES)
             scores = episodes.scores(ways[:, -1:]) | {"length": episodes.length}
             players.append((fields, {quantity: values.mean(1) for quantity, values in scores.items()}))
-    loop.config, loop.initiation = replace(loop.config, mask_reached=False), None
+    loop.config = replace(loop.config, mask_reached=False)
     for option, (sub_goal, member) in enumerate(product(config["sub_goals"], range(config["members"]))):
         if sub_goal in sub_goals:  # else the user's own labels said it: its truth here is not known
             goal = sub_goals.index(sub_goal)

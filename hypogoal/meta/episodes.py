@@ -60,7 +60,6 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
         "decisions": 2,
         "save_visited": 0,
         "chooser": artefact.config["chooser"] if artefact.kind == "meta" else "random",
-        "initiation": "learned" if "initiation.safetensors" in files else "anywhere",
     }
     domain, others = load_domain(artefact.config["domain"]), None
     if layouts:

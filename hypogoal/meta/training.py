@@ -25,8 +25,6 @@ from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
 from hypogoal.options.choosers import load_chooser
 from hypogoal.options.config import STACK
-from hypogoal.options.initiation import NAME as INITIATION
-from hypogoal.options.initiation import Initiation
 from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.parts import Part
@@ -84,7 +82,6 @@ def assemble(
         Recorder(options, engine),
         config,
         config.gamma if isinstance(config, MetaConfig) else 1.0,
-        initiation=Initiation(engine, options, seed, device) if config.initiation == "learned" else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
     if near := nearness(domain, engine, ensemble_config, config):
@@ -292,8 +289,6 @@ def continue_with(loop: OptionLoop, trained: Artefact) -> None:
     weights = load_tensors(trained.path / "options.safetensors")
     loop.learner.load(weights)
     loop.terminations.load(weights)
-    if loop.initiation and INITIATION in trained.manifest["files"]:
-        loop.initiation.load(load_tensors(trained.path / INITIATION))
 
 
 def description(domain: Domain, ensemble_config: Mapping[str, Any], config: PlayConfig, **more: Any) -> dict[str, Any]:
@@ -318,8 +313,6 @@ def write_trained(
     if loop.visited:
         loop.visited.write(folder, domain, ensemble_config, seed)
     save_tensors(folder / loop.learner.FILE, loop.learner.state() | loop.terminations.state())
-    if loop.initiation:
-        save_tensors(folder / INITIATION, loop.initiation.state())
     if weights := loop.chooser.state():
         save_tensors(folder / loop.chooser.FILE, weights)
     places = {"start": config.start, "layouts": config.layouts.strip()}

@@ -72,12 +72,6 @@ class OptionConfig:
         False, "every option begins a new episode, at a start state", source="paper, policy learning"
     )
     mask_reached: bool = setting(True, "do not offer options where their sub-goal already holds", source="ours")
-    initiation: str = setting(
-        "anywhere",
-        "where options may start: anywhere, or where experience says that they reach their sub-goal in time",
-        source="ours; anywhere: paper",
-        choices=("anywhere", "learned"),
-    )
     bootstrap_timeout: bool = setting(
         True, "do not treat an option's timeout as a terminal state", source="paper, appendix; light: ours"
     )

@@ -17,7 +17,6 @@ from hypogoal.domains.base import load_domain
 from hypogoal.domains.gymnasium_engine import begun, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
-from hypogoal.options.initiation import Narrowing
 from hypogoal.options.learner import Policies
 from hypogoal.options.loop import offered_options
 
@@ -34,7 +33,6 @@ class Options:
         ensembles: the termination classifiers, one ensemble per sub-goal.
         policies: starts an option's greedy policy.
         timeout: steps after which an option ends.
-        initiation: holds options back where they rarely reach their sub-goals (D7); None: holds none back.
         dwell: states in a row in which a sub-goal must hold for its option to end.
         mask_reached: whether options are withheld where their sub-goals already hold, as in training (D6).
         domain, domain_config: where they were trained, see :meth:`make_env`.
@@ -47,7 +45,6 @@ class Options:
     ensembles: Sequence[Ensemble]
     policies: Policies
     timeout: int
-    initiation: Narrowing | None = None
     mask_reached: bool = True
     domain: str = ""
     domain_config: Mapping[str, Any] = field(default_factory=dict)
@@ -80,11 +77,10 @@ class Options:
         return np.concatenate([ensemble.predictions(observation[None])[0] for ensemble in self.ensembles])
 
     def offered(self, observation: Observations) -> NDArray[np.bool_]:
-        """Spec D6, D7: which options may start in an observation (*obs): bool (G*K,)."""
-        offered: NDArray[np.bool_] = np.ones(self.count, dtype=np.bool_)
-        if self.mask_reached:
-            offered = offered_options(self.predictions(observation)[None])[0]
-        return offered if self.initiation is None else self.initiation(observation, offered)
+        """Spec D6: which options may start in an observation (*obs): bool (G*K,)."""
+        if not self.mask_reached:
+            return np.ones(self.count, dtype=np.bool_)
+        return offered_options(self.predictions(observation)[None])[0]
 
     def holds(self, option: int, observation: Observations) -> bool:
         """Whether one option's own sub-goal holds in an observation (*obs)."""
@@ -145,7 +141,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Spec D6, D7: which options may start here, bool (G*K,)."""
+        """Spec D6: which options may start here, bool (G*K,)."""
         image = self._current()
         if self._masks is None:
             self._masks = self.options.offered(image)

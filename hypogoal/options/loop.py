@@ -17,7 +17,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Step, step_of
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.initiation import Initiation
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations
@@ -38,12 +37,11 @@ class OptionLoop(Resumable):
 
     Episodes and choices are told to ``recorder``; ``config`` has timeouts, masks and whether options begin at start
     states, a ``UserError`` where the engine cannot begin an episode when asked. ``gamma`` is the meta-level's discount
-    per environment step (E1). ``initiation`` holds options back where they do not reach their sub-goals (D7);
-    ``visited`` is shown every state (B7).
+    per environment step (E1). ``visited`` is shown every state (B7).
     """
 
     CHANGING = (
-        *("terminations", "learner", "chooser", "recorder", "initiation", "visited"),
+        *("terminations", "learner", "chooser", "recorder", "visited"),
         *("option", "began", "age", "inside", "returns"),
     )
 
@@ -56,10 +54,9 @@ class OptionLoop(Resumable):
         recorder: Recorder,
         config: OptionConfig,
         gamma: float,
-        initiation: Initiation | None = None,
         visited: Visited | None = None,
     ):
-        self.initiation, self.visited = initiation, visited
+        self.visited = visited
         self.engine, self.terminations, self.learner, self.chooser = engine, terminations, learner, chooser
         self.recorder, self.config, self.gamma = recorder, config, gamma
         if config.restart_options and not engine.restarts:
@@ -79,8 +76,7 @@ class OptionLoop(Resumable):
     def step(self) -> dict[str, float]:
         """One step of every environment, then the updates that are due; returns numbers to log."""
         self.advance()
-        numbers = self.learner.learn() | self.chooser.learn()
-        return numbers | self.initiation.learn() if self.initiation else numbers
+        return self.learner.learn() | self.chooser.learn()
 
     def advance(self, *, learning: bool = True) -> Transitions:
         """One step of every environment, before the updates that are due.
@@ -120,8 +116,6 @@ class OptionLoop(Resumable):
         offered = np.ones((len(free), self.terminations.options), dtype=np.bool_)
         if self.config.mask_reached:
             offered = offered_options(self.terminations.of(ids))
-        if self.initiation:
-            offered = self.initiation.narrow(ids, offered)
         chosen = self.chooser.choose(free, ids, offered)
         self.option[free], self.began[free] = chosen, ids
         self.inside[free] = self.terminations.of_running(ids, chosen)
@@ -149,10 +143,6 @@ class OptionLoop(Resumable):
             truncated=step.truncated[done],
             succeeded=None if step.succeeded is None else step.succeeded[done],
         )
-        if self.initiation and learning:
-            out_of_time = (outcome.durations >= self.config.option_timeout) & ~outcome.terminated
-            judged = done[outcome.reached | out_of_time]  # of those that the episode's end cut short nobody knows
-            self.initiation.record(self.began[judged], self.option[judged], reached[judged])
         if learning:
             self.terminations.finished(done, outcome.options, outcome.reached)
         self.recorder.finished(outcome)

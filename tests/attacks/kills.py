@@ -94,7 +94,7 @@ _ALL = (
         "meta",
         (
             *("train-meta", "{ensemble}", "--options", "{options}"),
-            *_set("steps=1000", "decisions=32", "environments=8", "initiation=learned", *QUICK),
+            *_set("steps=1000", "decisions=32", "environments=8", *QUICK),
         ),
         ("ensemble", "options"),
     ),

@@ -15,7 +15,6 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import Play, play
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.options.choosers import Chooser, Outcome, RandomChooser
-from hypogoal.options.initiation import FEWEST, Initiation
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
@@ -119,26 +118,22 @@ def test_decisions_are_those_of_the_episodes_that_count() -> None:
 
 
 def test_play_teaches_nothing() -> None:
-    """Thresholds, bandits' credit, initiation sets and replays are after it what they were before."""
+    """Thresholds, bandits' credit and replays are after it what they were before."""
     engine = harsh(220, 16)
     config = TrainMetaConfig(network="planned")
     truth = planted(engine)
     patience = Patience(truth.classify, 15, None, None, engine.count, 3)
     learner = PlannedLearner(engine, truth, config, seed=0)
-    initiation = Initiation(engine, 15, 0)
     chooser = ThompsonChooser(15, 16, np.random.default_rng(0))
     patience.thresholds = np.full(15, 0.5, np.float32)
-    loop = OptionLoop(
-        engine, patience, learner, chooser, Recorder(15, engine), config, config.gamma, initiation=initiation
-    )
+    loop = OptionLoop(engine, patience, learner, chooser, Recorder(15, engine), config, config.gamma)
 
     def kept() -> list[list[float]]:
-        counters = (patience.thresholds, patience._executions, chooser.credit, chooser._due, initiation.executions)
+        counters = (patience.thresholds, patience._executions, chooser.credit, chooser._due)
         return [values.tolist() for values in (*counters, learner.option_steps)]
 
     before = kept()
     play(loop, chooser, 3)
-    assert initiation.count == 0 and FEWEST > 0
     after = kept()
     assert after[0] == before[0] and after[2] == before[2] and after[4:] == before[4:]
 

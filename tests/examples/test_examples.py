@@ -145,8 +145,8 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     for words in (
         ["collect", "vector_goals:DOMAIN", "--out", data, *few],
         ["train-ensemble", data, "--out", ensemble, *settings("members=2", "workers=1")],
-        ["train-options", ensemble, "--out", options, *play, *settings("initiation=learned", "save_visited=50")],
-        ["train-meta", ensemble, "--out", meta, "--options", options, *play, *settings("initiation=learned")],
+        ["train-options", ensemble, "--out", options, *play, *settings("save_visited=50")],
+        ["train-meta", ensemble, "--out", meta, "--options", options, *play],
         ["train-baseline", "vector_goals:DOMAIN", "--out", str(run / "ppo"), "--data", data, *settings("steps=600")],
         ["evaluate", str(run)],
         ["report", str(run)],

@@ -15,7 +15,6 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.initiation import Initiation
 from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
@@ -45,7 +44,7 @@ def many(make: Any, count: int) -> Any:
 
 
 CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
-    "light, shared, ppo": (Corridor, "light", {"initiation": "learned"}, "ppo"),
+    "light, shared, ppo": (Corridor, "light", {}, "ppo"),
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
     "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
@@ -80,7 +79,4 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=16, meta_batch=8)
         chooser = MetaPolicy(engine, 2, meta, 2, device)
-    initiation = Initiation(engine, 2, seed=3, device=device) if config.initiation == "learned" else None
-    return OptionLoop(
-        engine, verdicts, learner, chooser, Recorder(2, engine, 100), config, gamma=0.9, initiation=initiation
-    )
+    return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, engine, 100), config, gamma=0.9)

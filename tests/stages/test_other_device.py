@@ -42,7 +42,7 @@ def options(made: Path, out: Path) -> None:
 
 
 def meta(made: Path, out: Path) -> None:
-    config = train_meta.TrainMetaConfig(**SHORT, decisions=32, meta_batch=16, initiation="learned")
+    config = train_meta.TrainMetaConfig(**SHORT, decisions=32, meta_batch=16)
     train_meta.train_meta(made / "ensemble", config, out, device=out.name, **QUIET)
 
 

@@ -7,24 +7,21 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from toy_data import files_of
 
-from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation import choosing
 from hypogoal.evaluation.curves import read_run
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
 from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.episodes import Frame, agent_of, play_episode
-from hypogoal.options.initiation import Initiation
+from hypogoal.meta.episodes import agent_of, play_episode
 from hypogoal.options.thompson import ThompsonChooser
 from hypogoal.stages.collect import collect
 from hypogoal.stages.report import agents_of, play_films
@@ -99,34 +96,6 @@ def test_videos_are_of_the_agents_that_choose(run):
         assert video.size[0] == 320
 
 
-def test_options_are_held_back_as_in_training(run, tmp_path, monkeypatch):
-    """Spec D7: the artefact keeps the initiation sets, further training and videos go by them."""
-    held = TrainMetaConfig(
-        steps=320,
-        max_episode_steps=CAP,
-        option_timeout=TIMEOUT,
-        random_episodes=1,
-        layout_seed=100,
-        initiation="learned",
-    )
-    train_meta(run / "ensemble", held, tmp_path / "meta", **QUIET)
-    artefact = open_artefact(tmp_path / "meta").whole()
-    kept = load_tensors(artefact.path / "initiation.safetensors")
-    assert kept["executions"].sum() > 0
-    asked = []
-    narrow = Initiation.narrow
-
-    def watched(self, ids, offered):
-        assert self.state().keys() == kept.keys()
-        assert all(torch.equal(tensor, kept[name]) for name, tensor in self.state().items() if "network" in name)
-        asked.append(len(ids))
-        return narrow(self, ids, offered)
-
-    monkeypatch.setattr(Initiation, "narrow", watched)
-    (film,) = play_films([artefact], tmp_path, 1)
-    assert asked and film.gif.startswith(b"GIF")
-
-
 def test_a_bandit_is_back_and_learns_no_more(run, tmp_path):
     """Spec E6, H4: its file is asked for, what it learned is in it, and playing changes nothing of that."""
     config = TrainMetaConfig(
@@ -148,58 +117,10 @@ def test_a_bandit_is_back_and_learns_no_more(run, tmp_path):
 
 
 def test_weights_of_another_policy_are_one_line(run, tmp_path):
-    """Spec G2: a meta-policy or initiation sets that do not fit."""
+    """Spec G2: weights of a meta-policy that do not fit."""
     artefact = open_artefact(run / "meta")
     meta = load_tensors(artefact.path / "meta.safetensors")
-    for name, wrong in (("meta", dict(list(meta.items())[1:])), ("initiation", {"executions": torch.zeros(2)})):
-        copied = shutil.copytree(artefact.path, tmp_path / name)
-        save_tensors(copied / f"{name}.safetensors", wrong)
-        files = {**artefact.manifest["files"], f"{name}.safetensors": ""}
-        with pytest.raises(UserError, match="do not fit"):
-            agent_of(replace(artefact, path=copied, manifest={**artefact.manifest, "files": files}), seed=0)
-
-
-def test_a_run_without_such_an_agent_is_one_line(tmp_path):
-    """Spec G2: what is missing is named."""
-    with create_artefact(
-        tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0
-    ):
-        pass
-    with pytest.raises(UserError, match="Videos need a meta artefact with learned terminations"):
-        agents_of(tmp_path)
-
-
-def test_the_film_of_a_page_is_one_in_which_members_differ(run, monkeypatch):
-    """Spec E1, F7: the first of a few that the right one of two members solves; where there is none, the first."""
-    from hypogoal.meta import episodes
-
-    frame = Frame(np.zeros((8, 8, 3), np.uint8), 0, 0, (True, True), 5, "solved")
-    differ = replace(frame, predictions=(True, False))
-    wrong = [replace(frame, ended="the episode, unsolved"), replace(frame, predictions=(False, True))]
-    plays = [[frame], *([differ, last] for last in wrong), [differ, frame], [frame]]
-    monkeypatch.setattr(episodes, "play_episode", lambda loop, members: plays.pop(0))
-    (film,) = play_films(agents_of(run), run, None)
-    assert film.name == "meta-episode-3.gif" and len(plays) == 1
-    monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
-    assert play_films(agents_of(run), run, None)[0].name == "meta-episode-0.gif"
-
-
-def test_what_is_drawn_of_a_frame():
-    """Spec F7: option, member, predictions and steps left in words; the bar is as long as the steps that are left."""
-    stack = np.zeros((84, 84, 4), np.uint8)
-    stack[..., 3] = 200
-    frame = Frame(stack, 12, 3, (True, False), 5, "")
-    assert frame_lines(frame, ["red", "door"], 2, 10) == ["option: door, member 1", "5 of 10 steps left", "step 12"]
-    ended = replace(frame, ended="its time is up")
-    assert frame_lines(ended, ["red", "door"], 2, 10)[2] == "step 12, ends: its time is up"
-    picture = draw_frame(frame, ["red", "door"], 2, timeout=10)
-    assert picture.shape[1] == 336 and (picture[:336] == 200).all()
-    bar = picture[336 + MARGIN + LINE + BAR, MARGIN : 336 // 2]
-    assert (bar[:80] == bar[0]).all() and (bar[82:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
-    boxes = picture[336 + MARGIN + 2 * LINE + BAR // 2 + BOX // 2]
-    framed = [(boxes[MARGIN + member * 164] == bar[0]).all() for member in (0, 1)]
-    assert framed == [False, True], "the box of the member that runs has the colour of the bar"
-    differ = draw_frame(replace(frame, predictions=(False, False)), ["red", "door"], 2, timeout=10) != picture
-    assert differ[:, :168].any() and not differ[:, 168:].any(), "the other member's box alone"
-    video = Image.open(io.BytesIO(episode_gif([frame, replace(frame, left=0, ended="x")], ["red", "door"], 2, 10)))
-    assert video.n_frames == 2
+    copied = shutil.copytree(artefact.path, tmp_path / "meta")
+    save_tensors(copied / "meta.safetensors", dict(list(meta.items())[1:]))
+    with pytest.raises(UserError, match="do not fit"):
+        agent_of(replace(artefact, path=copied), seed=0)
