@@ -167,7 +167,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     weights = load_tensors(artefact.path / "options.safetensors")
     policies = make_policies(config, weights, source.config, ensembles[0])
     goals, members = tuple(config["sub_goals"]), config["members"]
-    rule, length = rule_of(config["termination"])
+    rule, _ = rule_of(config["termination"])
     rule.set_thresholds(ensembles, weights)
     return Options(
         goals,
@@ -178,5 +178,4 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
         config["mask_reached"],
         domain=config["domain"],
         domain_config=config["domain_config"],
-        dwell=rule.dwell(length),
     )

@@ -48,8 +48,7 @@ class OptionConfig:
     termination: str = setting(
         "learned",
         "where options end: learned, at the first positive prediction; patience:N, with a threshold that falls after "
-        "N steps of an option that hardly ever gets there; dwell:N, at N positive predictions in a row; or oracle, at "
-        "true sub-goals (upper bound)",
+        "N steps of an option that hardly ever gets there; or oracle, at true sub-goals (upper bound)",
         source="paper: learned; the others ours",
     )
     embedding: str = setting(

@@ -33,7 +33,6 @@ class Options:
         ensembles: the termination classifiers, one ensemble per sub-goal.
         policies: starts an option's greedy policy.
         timeout: steps after which an option ends.
-        dwell: states in a row in which a sub-goal must hold for its option to end.
         mask_reached: whether options are withheld where their sub-goals already hold, as in training (D6).
         domain, domain_config: where they were trained, see :meth:`make_env`.
 
@@ -48,7 +47,6 @@ class Options:
     mask_reached: bool = True
     domain: str = ""
     domain_config: Mapping[str, Any] = field(default_factory=dict)
-    dwell: int = 1
 
     def __repr__(self) -> str:
         goals = ", ".join(self.sub_goals)
@@ -161,7 +159,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if masked and self.masked != "run":
             self._refuse(option)
         act = self.options.policies(option)
-        total, duration, held, reached, ended = 0.0, 0, 0, False, False
+        total, duration, reached, ended = 0.0, 0, False, False
         image, observation = self._current(), None
         terminated = truncated = False
         info: dict[str, Any] = {}
@@ -170,8 +168,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             image = self._look.read(self.env, observation)
             total += self.gamma**duration * reward
             duration += 1
-            held = held + 1 if self.options.holds(option, image) else 0
-            reached = held >= self.options.dwell
+            reached = self.options.holds(option, image)
             ended = reached or terminated or truncated or duration >= self.options.timeout
         self._image, self._masks = image, None
         info = info | {"duration": duration, "reached": reached, "option": self.options.name(option), "masked": masked}

@@ -50,7 +50,6 @@ class Lessons(Steps):
     option: NDArray[np.int16]  # that was running
     terminated: NDArray[np.bool_]  # the task is over
     timed_out: NDArray[np.bool_]  # the option's time was up
-    reached: NDArray[np.bool_]  # the option reached its sub-goal
 
 
 class LightLearner(Learner):
@@ -103,7 +102,7 @@ class LightLearner(Learner):
 
     def observe(self, moved: Transitions) -> None:
         actions, ones = self._index[moved.actions], np.ones(len(moved.ids), np.int64)
-        outcome = moved.options, moved.terminated, moved.timed_out, moved.reached
+        outcome = moved.options, moved.terminated, moved.timed_out
         rows = self.ahead.add(Lessons.cast(moved.ids, actions, moved.next_ids, ones, *outcome), moved.ended)
         self.replay.add(rows)
         inside, reached = self._judged(rows)
@@ -124,7 +123,8 @@ class LightLearner(Learner):
             return self.terminations.of(states), self.terminations.of(next_states)
         option = rows.option.astype(np.int64)
         owner = option[:, None] == np.arange(self.options)
-        inside, reached = self.terminations.judged(option, states, next_states, rows.reached)
+        inside = self.terminations.of_running(states, option)
+        reached = self.terminations.of_running(next_states, option)
         return owner & inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:

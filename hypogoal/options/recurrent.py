@@ -40,7 +40,6 @@ class Rows(Columns):
     next_state: NDArray[np.int32]  # ids
     terminated: NDArray[np.bool_]  # the task is over
     timed_out: NDArray[np.bool_]  # the option's time was up
-    reached: NDArray[np.bool_]  # the option reached its sub-goal
     place: NDArray[np.int16]  # steps since the option began
     execution: NDArray[np.int32]
 
@@ -122,12 +121,12 @@ class RecurrentLearner(Learner):
 
     def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool, bool]]) -> None:
         member = self.members[option]
-        columns = [np.array(column) for column in zip(*steps, strict=True)]
+        *columns, reached = (np.array(column) for column in zip(*steps, strict=True))
         rows = Rows.cast(*columns, np.arange(len(steps)), np.full(len(steps), member.executions))
         member.replay.add(rows)
         member.executions += 1
         member.due += len(rows)
-        self.positives[option] += rows.reached.sum()
+        self.positives[option] += reached.sum()
         self.count(np.full(len(rows), option))
 
     def learn(self) -> dict[str, float]:
@@ -173,8 +172,8 @@ class RecurrentLearner(Learner):
             next_target = member.target(member.target.embed(*images)[places])[0]
         now, later = self.tensor(place), self.tensor(place + 1)
         pick = torch.arange(len(indices), device=self.device)
-        options, next_states = np.full(len(indices), option), data.next_state[indices].astype(np.int64)
-        reached = self.terminations.judged(options, states[rows, place], next_states, data.reached[indices])[1]
+        next_states = data.next_state[indices].astype(np.int64)
+        reached = self.terminations.of_running(next_states, np.full(len(indices), option))
         terminal = reached | data.terminated[indices]
         if not config.bootstrap_timeout:
             terminal = terminal | data.timed_out[indices]

@@ -22,7 +22,6 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.thresholds import ENOUGH, fallen
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.parts import Part, load_part
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
@@ -41,29 +40,14 @@ class Terminations(Part):
         classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
         thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
         environments: E.
-        length: the number in the rule's name (``dwell:3``).
+        length: the number in the rule's name (``patience:10000``).
 
     Attributes:
-        SHARED: whether a state alone says if the sub-goal is reached, so that options can learn from what others visit.
         LENGTH: what the number in the rule's name counts; empty where it has none.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
-    SHARED: ClassVar[bool] = True
     LENGTH: ClassVar[str] = ""
-
-    @classmethod
-    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
-        """Raise a ``UserError`` where options cannot be learned that end so."""
-        if not cls.SHARED and config.experience != "own":
-            fault = "states that other options visit do not say whether an execution has reached its sub-goal"
-            setting = f"termination={config.termination}, experience={config.experience}"
-            raise UserError(fault, setting, "Give --set experience=own.")
-
-    @staticmethod
-    def dwell(length: int) -> int:
-        """In how many states in a row a prediction must be positive to end an execution, outside an engine."""
-        return 1
 
     @staticmethod
     def set_thresholds(ensembles: Sequence[Ensemble], weights: Mapping[str, torch.Tensor]) -> None:
@@ -95,7 +79,7 @@ class Terminations(Part):
         return positive
 
     def of_running(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether the sub-goals of the options that run hold: bool (n,) for states (n,) and options (n,)."""
+        """Whether the sub-goals of the options that run hold, by today's thresholds: bool (n,), of states (n,)."""
         positive: NDArray[np.bool_] = self.log_odds(ids, options) > self.thresholds[options]
         return positive
 
@@ -120,19 +104,6 @@ class Terminations(Part):
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
         """Executions (n,) that ended, and which of them reached their sub-goals."""
-
-    def judged(
-        self,
-        options: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        reached: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """By today's thresholds, whether past transitions (n,) begin, and end, in their option's sub-goal.
-
-        ``reached`` is whether the execution reached it then.
-        """
-        return self.of_running(ids, options), self.of_running(next_ids, options)
 
     def state(self) -> dict[str, torch.Tensor]:
         """What an artefact keeps."""
@@ -203,49 +174,18 @@ class Patience(Terminations):
         self._highest[due] = -np.inf
 
 
-class Dwell(Terminations):
-    """An execution ends where its sub-goal has held in ``length`` states in a row."""
-
-    CHANGING = (*Terminations.CHANGING, "_held")
-    SHARED = False
-    LENGTH = "STEPS"
-
-    def __init__(self, *arguments: Any, **more: Any):
-        super().__init__(*arguments, **more)
-        self._held = np.zeros(self.environments, dtype=np.int64)
-
-    @staticmethod
-    def dwell(length: int) -> int:
-        return length
-
-    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        self._held = np.where(self.of_running(ids, options), np.where(age == 0, 0, self._held) + 1, 0)
-        long: NDArray[np.bool_] = self._held >= self.length
-        return long
-
-    def judged(
-        self,
-        options: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        reached: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """A state alone does not say whether the execution had dwelt long enough: only what it reached then counts."""
-        return np.zeros_like(reached), reached
-
-
-RULES = {"learned": f"{__name__}:Terminations", "patience": f"{__name__}:Patience", "dwell": f"{__name__}:Dwell"}
+RULES = {"learned": f"{__name__}:Terminations", "patience": f"{__name__}:Patience"}
 
 
 def rule_of(termination: str) -> tuple[type[Terminations], int]:
-    """The rule and its number, of ``learned``, ``patience:10000``, ``dwell:3``, ``module:Class``, ``module:Class:3``.
+    """The rule and its number, of ``learned``, ``patience:10000``, ``module:Class``, ``module:Class:3``.
 
     Anything else is a ``UserError``.
     """
     name, _, number = termination.rpartition(":")
     if not number.isdecimal():
         name, number = termination, ""
-    do = "Give learned, patience:STEPS, dwell:STEPS or oracle."
+    do = "Give learned, patience:STEPS or oracle."
     if name not in RULES and (":" not in name or name.partition(":")[0] in RULES):
         raise UserError("unknown termination", f"termination={termination}", do)
     with vouched(*([name] if termination in allowed() else [])):  # who gave the rule with its number gave its name

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -179,14 +178,6 @@ def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
         np.testing.assert_array_equal(agent_of(open_artefact(meta), 0).terminations.thresholds, later)
     loaded = [ensemble.thresholds_as_log_odds() for ensemble in hypogoal.load_options(out).ensembles]
     np.testing.assert_allclose(np.concatenate(loaded), lowered, atol=1e-4)
-
-
-def test_options_dwell_as_they_were_trained(options: Options) -> None:
-    """Spec H4: an option that is to stay runs on where its sub-goal holds for the first time."""
-    env = hypogoal.OptionEnv(corridor(), replace(options, dwell=3))
-    env.reset(seed=0)
-    info = env.step(0)[4]  # to the left end in two steps, and on against the wall
-    assert (info["reached"], info["duration"]) == (True, 4)
 
 
 def test_options_are_masked_as_they_were_trained(run: Path, options: Options) -> None:

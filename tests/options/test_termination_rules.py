@@ -1,4 +1,4 @@
-"""Other rules than the first yes: patience and dwelling (Spec H4)."""
+"""Another rule than the first yes: patience (Spec H4)."""
 
 import sys
 from pathlib import Path
@@ -13,8 +13,7 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
-from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.termination import Dwell, Patience, Terminations, rule_of
+from hypogoal.options.termination import Patience, Terminations, rule_of
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from corridor import LENGTH, Corridor
@@ -103,17 +102,7 @@ def test_patience_goes_on_where_it_was() -> None:
     assert (whole.thresholds < [4, 5]).all()
 
 
-def test_dwelling_takes_so_many_positives_in_a_row() -> None:
-    rule = Dwell(by_table, 2, None, np.array([0.5, 2.5], dtype=np.float32), 1, 3)
-    assert execution(rule, 1, (4, 5, 3, 4, 5, 4)) == [False, False, False, False, False, True]
-    assert execution(rule, 1, (4, 4, 5)) == [False, False, True]  # what the last one held does not count
-    both = Dwell(by_table, 2, None, np.array([0.5, 2.5], dtype=np.float32), 2, 2)
-    for age, expected in enumerate(([False, False], [True, False])):
-        states = np.array([4, 4 - age])
-        assert both.reached(states, np.array([1, 1]), np.full(2, age)).tolist() == expected
-
-
-def loop_of(rule: Terminations, learner: type[LightLearner] | type[RecurrentLearner], environments: int) -> OptionLoop:
+def loop_of(rule: Terminations, environments: int) -> OptionLoop:
     engine = Corridor(environments)
     config = OptionConfig(
         experience="own",
@@ -124,13 +113,13 @@ def loop_of(rule: Terminations, learner: type[LightLearner] | type[RecurrentLear
         option_batch=32,
         epsilon_steps=300,
     )
-    policies = learner(engine, rule, config, seed=0)
+    policies = LightLearner(engine, rule, config, seed=0)
     return OptionLoop(engine, rule, policies, RandomChooser(np.random.default_rng(0)), Recorder(2, engine), config, 1.0)
 
 
 def test_options_are_learned_that_were_out_of_reach() -> None:
     """No state is sure enough; with patience the threshold falls, and what the replay holds is judged by it."""
-    loop = loop_of(patient((3.5, 5.0), 150, 4), LightLearner, 4)
+    loop = loop_of(patient((3.5, 5.0), 150, 4), 4)
     for _ in range(400):
         loop.step()
     last = [row for rows in loop.recorder.executions for row in list(rows)[-20:]]
@@ -143,26 +132,8 @@ def test_options_are_learned_that_were_out_of_reach() -> None:
     assert ends == {0: {0}, 1: {5}}
 
 
-@pytest.mark.parametrize("learner", [LightLearner, RecurrentLearner])
-def test_what_dwelling_teaches_is_the_last_positive(learner: type[LightLearner] | type[RecurrentLearner]) -> None:
-    """A replay keeps whether its execution had dwelt long enough, not what the state alone would say."""
-    rule = Dwell(by_table, 2, None, np.array([1.5, 5.0], dtype=np.float32), 2, 2)
-    loop = loop_of(rule, learner, 2)
-    for _ in range(200):
-        loop.advance()
-    replay = loop.learner.replay if isinstance(loop.learner, LightLearner) else loop.learner.members[0].replay
-    data = {name: values[: replay.size] for name, values in vars(replay.data).items()}
-    assert 0 < data["reached"].sum() < (LOG_ODDS[data["next_state"], 0] > 1.5).sum()
-    count = loop.learner.positives
-    assert count[0] == data["reached"].sum() and count[1] == 0
-
-
 def test_rules_are_read_from_their_names() -> None:
-    assert [rule_of(text) for text in ("learned", "patience:10000", "dwell:3")] == [
-        (Terminations, 0),
-        (Patience, 10000),
-        (Dwell, 3),
-    ]
-    for text in ("patience", "patience:", "patience:0", "dwell:-1", "dwell:1.5", "learned:3", "single", "", "dwell:²"):
-        with pytest.raises(UserError, match="learned, patience:STEPS, dwell:STEPS or oracle"):
+    assert [rule_of(text) for text in ("learned", "patience:10000")] == [(Terminations, 0), (Patience, 10000)]
+    for text in ("patience", "patience:", "patience:0", "patience:-1", "patience:1.5", "learned:3", "single", ""):
+        with pytest.raises(UserError, match="learned, patience:STEPS or oracle"):
             rule_of(text)
