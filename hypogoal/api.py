@@ -165,7 +165,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     source = open_artefact(folder, "ensemble").whole()
     ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
     weights = load_tensors(artefact.path / "options.safetensors")
-    policies = make_policies(config, weights, source.config, ensembles[0])
+    policies = make_policies(config, weights, source.config)
     goals, members = tuple(config["sub_goals"]), config["members"]
     rule, _ = rule_of(config["termination"])
     rule.set_thresholds(ensembles, weights)

@@ -10,7 +10,7 @@ from typing import ClassVar
 from hypogoal.core.config import MAX_RANGE, fixed, parse_integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.learners.config import WorldConfig
-from hypogoal.options.config import FULL, OptionConfig
+from hypogoal.options.config import OptionConfig
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,6 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
 class AuditConfig(TrainOptionsConfig):
     """How policies learn to fool a classifier, and what is tried against them."""
 
-    policy_view: str = fixed(FULL)  # a classifier has no localiser
     until: float = fixed(0.0)  # policies that fool a classifier do not bring the task to success
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")

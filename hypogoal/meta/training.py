@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from hypogoal.options.config import STACK
 from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.parts import Part
-from hypogoal.options.policy_views import Viewed, create_views, views_in
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import ORACLE, Terminations, learned_terminations, oracle_terminations, rule_of
 from hypogoal.options.visited import Visited
@@ -54,9 +52,7 @@ def assemble(
     there are several, layouts and start states. ``ends`` gives other terminations than the ensemble's, ``standard``
     goes with them; ``layouts`` replace those of ``config``. What does not go together is a ``UserError``.
     """
-    first = partial(read_ensemble, ensemble, dict(ensemble_config), ensemble_config["sub_goals"][0])
     learner, chooser = load_learner(config.network), load_chooser(config.chooser)
-    views = views_in(config.policy_view)
     if config.termination == ORACLE:
         columns_of(domain, ensemble_config["sub_goals"])
     world = domain.world(played_world(domain, ensemble_config["domain_config"], config.world))
@@ -65,19 +61,21 @@ def assemble(
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **world)
     cut(engine, config.cap)
     rules = [] if config.termination == ORACLE else [rule_of(config.termination)[0]]
-    parts: list[type[Part]] = [learner, chooser, *views, *rules]
+    parts: list[type[Part]] = [learner, chooser, *rules]
     require_one_kind(engine)
     for part in parts:
         part.refuse(config, engine)
     if engine.observation_dtype != PICTURE:
-        engine.standard = (standard if ends else first().view.standard) or standard_of(engine.observation_shape)
+        if not ends:
+            first = ensemble_config["sub_goals"][0]
+            standard = read_ensemble(ensemble, dict(ensemble_config), first).view.standard
+        engine.standard = standard or standard_of(engine.observation_shape)
     terminations = ends(engine) if ends else terminations_for(domain, engine, ensemble, ensemble_config, config, device)
-    view = Viewed(engine, create_views(views, engine.observation_shape, first)) if views else None
     options = terminations.options
     loop = OptionLoop(
         engine,
         terminations,
-        learner(engine, terminations, config, seed, device, view),
+        learner(engine, terminations, config, seed, device),
         chooser.create(engine, options, config, seed, device),
         Recorder(options, engine),
         config,

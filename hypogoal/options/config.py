@@ -7,7 +7,6 @@ from typing import ClassVar
 from hypogoal.core.config import setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
-FULL = "full"  # the policy view that shows the whole observation
 
 
 @dataclass(frozen=True)
@@ -97,14 +96,6 @@ class OptionConfig:
         source="paper: 1; Hessel et al. 2018",
         low=1,
         high=1_000,
-    )
-    policy_view: str = setting(
-        FULL,
-        "what the policies see: full, the whole observation; agent-crop, the window around the agent as found by the "
-        "ensemble's localiser (light)",
-        source="ours",
-        choices=(FULL, "agent-crop"),
-        own=True,
     )
     exploration: str = setting(
         "independent",

@@ -56,7 +56,7 @@ class DistilledLearner(LightLearner):
         self.exploration = Exploration(config, self.engine.count, len(self.actions), self.rng)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
-            shape, standard = self.pictures.observation_shape, self.engine.standard
+            shape, standard = self.engine.observation_shape, self.engine.standard
             network = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
         self.online = self.target = network.to(self.device)  # best actions are known: no target moves
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
@@ -129,7 +129,7 @@ class DistilledLearner(LightLearner):
         best = (self.best[states][:, :, None] >> np.arange(len(self.actions)) & 1).astype(np.bool_)
         leads = best.any(axis=2)
         best[~leads] = True  # where no way leads to a sub-goal nothing is wrong
-        scores = apply_to_states(self.online, self.pictures, states).log_softmax(2)
+        scores = apply_to_states(self.online, self.engine, states).log_softmax(2)
         wrong = scores.masked_fill(self.tensor(~best), -torch.inf).logsumexp(2).neg()
         loss = wrong.sum() / max(1, int(leads.sum()))
         fallen = min(1.0, self.steps / self.config.rate_steps) if self.config.rate_steps else 0.0

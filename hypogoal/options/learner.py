@@ -16,15 +16,12 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import FULL, OptionConfig
+from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, actions_of
-from hypogoal.options.networks import Pictures
 from hypogoal.options.parts import Part, load_part
-from hypogoal.options.policy_views import Viewed
 from hypogoal.options.termination import ORACLE, Terminations
 
 COUNTERS = ("option_steps", "steps_since_positive")
@@ -41,12 +38,11 @@ Policies = Callable[[int], Callable[[Observations], int]]
 
 @dataclass(frozen=True)
 class SavedOptions:
-    """An artefact's options, on observations of this ``shape``; ``ensemble`` reads the first of their ensembles."""
+    """An artefact's options, on observations of this ``shape``."""
 
     config: Mapping[str, Any]
     weights: Mapping[str, Tensor]
     shape: tuple[int, ...]
-    ensemble: Callable[[], Ensemble]
 
     @property
     def count(self) -> int:
@@ -81,7 +77,7 @@ class Transitions:
 
 
 class Learner(Part, ABC):
-    """The intra-option policies of all O options; ``view``: what they see of states, all of it where None.
+    """The intra-option policies of all O options.
 
     Attributes:
         FILE: what an artefact calls the file of its :meth:`state`.
@@ -97,9 +93,9 @@ class Learner(Part, ABC):
     """
 
     FILE: ClassVar[str] = "options.safetensors"
-    NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO, "policy_view": FULL}
+    NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO}
     ONCE: ClassVar[bool] = False
-    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "view", *COUNTERS)
+    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *COUNTERS)
 
     def __init__(
         self,
@@ -108,11 +104,9 @@ class Learner(Part, ABC):
         config: OptionConfig,
         seed: int,
         device: torch.device | str = "cpu",
-        view: Viewed | None = None,
     ):
         self.refuse(config, engine)
-        self.engine, self.terminations, self.config, self.view = engine, terminations, config, view
-        self.pictures: Pictures = view or engine
+        self.engine, self.terminations, self.config = engine, terminations, config
         self.options, self.device = terminations.options, torch.device(device)
         self.actions = action_set(engine, config.actions)
         self._index = np.zeros(engine.n_actions, dtype=np.int64)
@@ -224,22 +218,12 @@ def load_learner(name: str) -> type[Learner]:
 
 
 def make_policies(
-    config: Mapping[str, Any],
-    weights: Mapping[str, Tensor],
-    ensemble_config: Mapping[str, Any],
-    ensemble: Ensemble | None = None,
+    config: Mapping[str, Any], weights: Mapping[str, Tensor], ensemble_config: Mapping[str, Any]
 ) -> Policies:
-    """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration.
-
-    Policies that see the window around the agent also need the first ensemble.
-    """
+    """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration."""
     if config["termination"] == ORACLE:
         fault = "these options end at the true sub-goals, which only the domain's engine can see"
         raise UserError(fault, "termination=oracle", "Load options that were trained with learned members.")
 
-    def first_ensemble() -> Ensemble:
-        assert ensemble is not None
-        return ensemble
-
     shape = tuple(ensemble_config.get("observation_shape", ()))
-    return load_learner(config["network"]).policies(SavedOptions(config, weights, shape, first_ensemble))
+    return load_learner(config["network"]).policies(SavedOptions(config, weights, shape))

@@ -25,7 +25,7 @@ from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import FULL, STACK, OptionConfig
+from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
 from hypogoal.options.networks import (
     DEEP,
@@ -37,7 +37,6 @@ from hypogoal.options.networks import (
     apply_to_states,
     standard_in,
 )
-from hypogoal.options.policy_views import create_views, views_in
 
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
@@ -79,12 +78,12 @@ class LightLearner(Learner):
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
-            shape, standard = self.pictures.observation_shape, self.engine.standard
+            shape, standard = self.engine.observation_shape, self.engine.standard
             network = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
             self.online = network.to(self.device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
-        self.pixels = Pixels(self.pictures, 2 * config.option_batch, self.device) if pictures else None
+        self.pixels = Pixels(self.engine, 2 * config.option_batch, self.device) if pictures else None
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, Lessons)
         self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
@@ -97,7 +96,7 @@ class LightLearner(Learner):
 
     @torch.no_grad()
     def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
-        values = apply_to_states(self.online, self.pictures, ids).cpu().numpy()
+        values = apply_to_states(self.online, self.engine, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
@@ -197,7 +196,7 @@ class LightLearner(Learner):
         # A batch has few distinct states, late in training 40 of 256: the networks see each once.
         distinct, places = np.unique(np.concatenate([states, next_states]), return_inverse=True)
         now, later = self.tensor(places).split(len(states))
-        values, target = apply_all_to_states((self.online, self.target), self.pictures, distinct)
+        values, target = apply_all_to_states((self.online, self.target), self.engine, distinct)
         # index_select, not indexing, whose gradient takes several times as long.
         next_online, next_target = (outputs.detach().index_select(0, later) for outputs in (values, target))
         return values.index_select(0, now), next_online, next_target
@@ -227,12 +226,10 @@ class LightPolicies:
 
     def __init__(self, saved: SavedOptions):
         config, weights = saved.config, below("online.", saved.weights)
-        kinds = views_in(config.get("policy_view", FULL))
-        self.views = create_views(kinds, saved.shape, saved.ensemble)
         self.actions = saved.actions("online.heads.weight", saved.count)
-        shape, embedding = self.views[-1].shape if self.views else saved.shape, config.get("embedding", AUTO)
-        standard = standard_in(weights, shape)
-        make = partial(LightQNetwork, shape, saved.count, len(self.actions), standard, embedding)
+        embedding = config.get("embedding", AUTO)
+        standard = standard_in(weights, saved.shape)
+        make = partial(LightQNetwork, saved.shape, saved.count, len(self.actions), standard, embedding)
         custom = embedding not in (AUTO, GRID, DEEP, *NETWORKS)
         self.network = load_fitting(make, weights, "options.safetensors", custom=custom)
 
@@ -241,8 +238,6 @@ class LightPolicies:
         return partial(self._act, option)
 
     @torch.no_grad()
-    def _act(self, option: int, observation: Any) -> int:
-        for view in self.views:
-            observation = view.see(observation[None])[0]
+    def _act(self, option: int, observation: Observations) -> int:
         values = self.network(torch.from_numpy(np.ascontiguousarray(observation[None])))[0, option]
         return int(self.actions[int(values.argmax())])

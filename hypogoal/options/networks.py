@@ -14,7 +14,6 @@ from hypogoal.dataset import PICTURE, Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
-from hypogoal.options.policy_views import Viewed
 
 CELL = 8  # pixels
 GRID, DEEP = "grid", "deep"  # the embeddings of these names
@@ -245,15 +244,12 @@ class LightQNetwork(LightNetwork):
         return self.heads(features).view(-1, self.members, self.actions)
 
 
-Pictures = Engine | Viewed
-
-
-def apply_to_states(network: nn.Module, engine: Pictures, ids: NDArray[np.int64]) -> Tensor:
+def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
     """A network's output on states of an engine: by tile codes where both know them, else by images."""
     return apply_all_to_states((network,), engine, ids)[0]
 
 
-def apply_all_to_states(networks: Sequence[nn.Module], engine: Pictures, ids: NDArray[np.int64]) -> list[Tensor]:
+def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDArray[np.int64]) -> list[Tensor]:
     """As :func:`apply_to_states`, several networks' outputs on the same states."""
     device = next(networks[0].parameters()).device
     tiles = engine.tiles
@@ -272,7 +268,7 @@ class Pixels:
     To convert them once for several networks, into memory in use already, saves a third of an update's time.
     """
 
-    def __init__(self, engine: Pictures, most: int, device: torch.device):
+    def __init__(self, engine: Engine, most: int, device: torch.device):
         self.engine, self.device = engine, device
         self._images = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
         self._pixels = torch.zeros(self._images.shape) if device.type == "cpu" else None

@@ -1,4 +1,4 @@
-"""Parts of an agent that a setting names: choosers, learners, policy views, termination rules."""
+"""Parts of an agent that a setting names: choosers, learners, termination rules."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from hypogoal.options.learner import load_learner
 from hypogoal.options.tables import Episodes
 
 FIXED = (  # as of the options trained before
-    *("network", "recurrence", "embedding", "termination", "policy_view"),
+    *("network", "recurrence", "embedding", "termination"),
     *("layout_seed", "start", "option_timeout"),
 )
 WORLD = ("domain_config", "cap", "max_episode_steps")  # where these differ, the agent does not count practice episodes

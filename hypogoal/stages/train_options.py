@@ -24,7 +24,7 @@ from hypogoal.needs import play_needs
 from hypogoal.options.learner import load_learner
 
 # As of the options trained before.
-FIXED = ("network", "recurrence", "embedding", "termination", "policy_view")
+FIXED = ("network", "recurrence", "embedding", "termination")
 
 
 def train_options(

@@ -1,4 +1,4 @@
-"""A chooser, a learner, a policy view and a termination rule of one's own: one class each, and no other file."""
+"""A chooser, a learner and a termination rule of one's own: one class each, and no other file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from hypogoal.meta.episodes import agent_of, play_episode
 from hypogoal.options.choosers import Chooser, Ids, Offered
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.policy_views import Pictures, PolicyView
 from hypogoal.options.tables import Choices
 from hypogoal.options.termination import Terminations
 from hypogoal.stages import train_meta, train_options
@@ -66,16 +65,6 @@ class Straight(Learner):
         pass
 
 
-class UpperHalf(PolicyView):
-    """The upper half of the picture."""
-
-    def __init__(self, shape: tuple[int, ...]):
-        self.shape = (shape[0] // 2, *shape[1:])
-
-    def see(self, pictures: Pictures, ids: NDArray[np.int64] | None = None) -> Pictures:
-        return pictures[:, : self.shape[0]]
-
-
 class AtLeast(Terminations):
     """No execution reaches its sub-goal in its first ``length`` steps."""
 
@@ -91,7 +80,7 @@ def train(stage: str, source: Path, out: Path, *pairs: str) -> dict[str, Any]:
     return open_artefact(out).whole().config
 
 
-OWN = {"chooser": "FirstOffered", "network": "Straight", "policy_view": "UpperHalf", "termination": "AtLeast:3"}
+OWN = {"chooser": "FirstOffered", "network": "Straight", "termination": "AtLeast:3"}
 
 
 @pytest.mark.parametrize("stage", ["train-options", "train-meta"])
@@ -117,7 +106,7 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
         (["chooser={}:Straight"], "this is no chooser"),
         (["chooser={}:Missing"], "the chooser cannot be loaded"),
         (["termination={}:AtLeast"], "unknown termination"),
-        (["network={}:Straight", "policy_view={}:UpperHalf"], ":Straight needs policy_view=full"),
+        (["network={}:Straight", "embedding=mlp"], ":Straight needs embedding=auto"),
     ],
 )
 def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_run: Path, tmp_path: Path) -> None:
