@@ -77,7 +77,6 @@ class LongCorridor(Corridor):
     position_names = ("room", "x", "y")
     restarts = True
     observation_shape = (20, 84, 4)  # not made of cells
-    action_sets: ClassVar[dict[str, tuple[int, ...]]] = {"moves": (2, 3)}
     cells: ClassVar[dict[str, int]] = {"middle": 2, "left": 0}
 
     def __init__(

@@ -108,7 +108,6 @@ class Engine(ABC):
         elapsed: int64 (E,), steps since its episode began.
         memory: it can draw at least this many of the latest states, and forgets older frames. None: it can draw all.
         starts: its start states, with ids 0 .. S - 1, never forgotten; empty where all episodes begin alike.
-        action_sets: by name, sets of actions to which a policy may be restricted.
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
         restarts: whether it has :meth:`restart`; resumes: whether it has :meth:`snapshot` and :meth:`restore`.
@@ -124,7 +123,6 @@ class Engine(ABC):
     elapsed: NDArray[np.int64]
     memory: int | None = None
     starts: Sequence[Any] = ()
-    action_sets: Mapping[str, tuple[int, ...]] = MappingProxyType({})
     position_names: tuple[str, ...] = ()
     layouts: Layouts | None = None
     restarts = resumes = False

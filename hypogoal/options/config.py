@@ -17,11 +17,11 @@ class OptionConfig:
         "network=planned": (
             *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
             *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
-            *("exploration", "actions", "epsilon_steps", "epsilon_final", "epsilon_from", "rate_steps", "recurrence"),
+            *("exploration", "epsilon_steps", "epsilon_final", "epsilon_from", "rate_steps", "recurrence"),
         ),
         "network=distilled": (
             *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "positives", "experience"),
-            *("target_interval", "target_tau", "n_step", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
+            *("target_interval", "target_tau", "n_step", "epsilon_steps", "epsilon_final", "epsilon_from"),
             "recurrence",
         ),
         "network=light": ("rate_steps", "recurrence"),
@@ -102,11 +102,6 @@ class OptionConfig:
         "how long a random action lasts: one step, or several",
         source="persistent: Dabney et al. 2020",
         choices=("independent", "persistent"),
-    )
-    actions: str = setting(
-        "all",
-        "the primitive actions: all, or a set that the domain's engine names",
-        source="paper, Montezuma's Revenge",
     )
     epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
     epsilon_final: float = setting(0.05, "final epsilon", source="paper: 0.01", low=0.0, high=1.0)

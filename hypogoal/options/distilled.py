@@ -40,7 +40,8 @@ class DistilledLearner(LightLearner):
     While it learns, planned options play, with random actions in between. A layout is planned when it is first played.
 
     Attributes:
-        best: uint (N, O), each option's best actions in each state, as bits; 0 where no way leads to its sub-goal.
+        actions: those of the engine's actions that plans know, int64 (A,).
+        best: uint (N, O), each option's best actions in each state, bit a for action a; 0 where no way leads to its sub-goal.
         kind: uint8 (N,), what each state is.
 
     Raises:
@@ -57,10 +58,10 @@ class DistilledLearner(LightLearner):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
             shape, standard = self.engine.observation_shape, self.engine.standard
-            network = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
+            network = LightQNetwork(shape, self.options, self.engine.n_actions, standard, config.embedding)
         self.online = self.target = network.to(self.device)  # best actions are known: no target moves
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
-        self.best = np.zeros((0, self.options), np.min_scalar_type(2 ** len(self.actions) - 1))
+        self.best = np.zeros((0, self.options), np.min_scalar_type(2**self.engine.n_actions - 1))
         self.kind = np.zeros(0, np.uint8)
         self.steps = self.updates = self._due = 0
         self.loaded = False
@@ -72,11 +73,12 @@ class DistilledLearner(LightLearner):
     def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
         """While it learns, the plan's with random actions in between; afterwards the network's."""
         if self.loaded or not explore:
-            return self.actions[self.greedy(ids, options, age)]
+            return self.greedy(ids, options, age)
         self._plan(ids)
         best = self.best[ids, options]
         first = np.log2(np.maximum(best & -best.astype(np.int64), 1)).astype(np.int64)  # the lowest bit
-        return self.actions[self.exploration.mix(first, np.full(len(ids), EPSILON), age)]
+        chosen = self.exploration.mix(np.searchsorted(self.actions, first), np.full(len(ids), EPSILON), age)
+        return self.actions[chosen]
 
     def observe(self, moved: Transitions) -> None:
         """Remember that these states were visited."""
@@ -104,7 +106,7 @@ class DistilledLearner(LightLearner):
             after = places_of(plan, self.engine)[plan.following]
             ahead = distances(self.terminations.of(plan.ids), after, plan.final)[after]  # (n, A, O)
             nearest = ahead.min(axis=1, keepdims=True)
-            bits = 1 << np.arange(len(self.actions))[:, None]
+            bits = 1 << self.actions[:, None]
             self._grow()
             self.best[plan.ids] = np.where((ahead == nearest) & (nearest < FAR), bits, 0).sum(axis=1)
             fresh = self.kind[plan.ids] == UNKNOWN
@@ -126,7 +128,7 @@ class DistilledLearner(LightLearner):
                 planned[self.rng.integers(len(planned), size=some)],
             ]
         )
-        best = (self.best[states][:, :, None] >> np.arange(len(self.actions)) & 1).astype(np.bool_)
+        best = (self.best[states][:, :, None] >> np.arange(self.engine.n_actions) & 1).astype(np.bool_)
         leads = best.any(axis=2)
         best[~leads] = True  # where no way leads to a sub-goal nothing is wrong
         scores = apply_to_states(self.online, self.engine, states).log_softmax(2)

@@ -1,33 +1,12 @@
-"""How the intra-option policies explore: which primitive actions there are, and when a random one is played."""
-
-from collections.abc import Mapping
+"""How the intra-option policies explore: when a random action is played in place of their own."""
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
 
-ALL = "all"
 EXPONENT, LONGEST = 2.0, 10_000  # of how long a random action lasts, P(n) ~ n^-2, at most so many steps
-
-
-def action_set(engine: Engine, name: str) -> NDArray[np.int64]:
-    """The actions to choose among, int64 (A,): all, or ``engine.action_sets[name]``; else a ``UserError``."""
-    if name == ALL:
-        return np.arange(engine.n_actions)
-    if name not in engine.action_sets:
-        names = ", ".join((ALL, *engine.action_sets))
-        raise UserError("unknown set of actions", f"actions={name}", f"Choose one of {names}.")
-    return np.array(engine.action_sets[name], dtype=np.int64)
-
-
-def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:
-    """The engine's actions that a saved policy's ``outputs`` stand for, int64 (A,)."""
-    return state["actions"].numpy() if "actions" in state else np.arange(outputs)
 
 
 class Exploration(Resumable):

@@ -20,7 +20,7 @@ from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set, actions_of
+from hypogoal.options.exploration import Exploration
 from hypogoal.options.parts import Part, load_part
 from hypogoal.options.termination import ORACLE, Terminations
 
@@ -49,14 +49,13 @@ class SavedOptions:
         """How many options there are."""
         return len(self.config["sub_goals"]) * self.config["members"]
 
-    def actions(self, layer: str, heads: int) -> NDArray[np.int64]:
-        """The actions, int64 (A,), to choose among, if the weights' last ``layer`` has so many heads of A outputs.
+    def actions(self, layer: str, heads: int) -> int:
+        """How many actions there are, A, if the weights' last ``layer`` has so many heads of A outputs.
 
         A ``UserError`` where the weights are not those of so many options.
         """
-        outputs = len(self.weights[layer]) // heads if layer in self.weights else 0
-        actions = actions_of(self.weights, outputs)
-        if not outputs or actions.shape != (outputs,):
+        actions = len(self.weights[layer]) // heads if layer in self.weights else 0
+        if not actions:
             raise UserError("the weights do not fit the manifest", f"{self.count} options", AGAIN)
         return actions
 
@@ -83,7 +82,6 @@ class Learner(Part, ABC):
         FILE: what an artefact calls the file of its :meth:`state`.
         NEEDS: settings that must have this value.
         ONCE: whether it learns in one run of ``train-options`` alone, and is only played afterwards.
-        actions: the engine's actions that the policies choose among, int64 (A,).
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
         steps_since_positive: int64 (O,), those since the first one of these, also in a run that this one continues.
@@ -108,11 +106,8 @@ class Learner(Part, ABC):
         self.refuse(config, engine)
         self.engine, self.terminations, self.config = engine, terminations, config
         self.options, self.device = terminations.options, torch.device(device)
-        self.actions = action_set(engine, config.actions)
-        self._index = np.zeros(engine.n_actions, dtype=np.int64)
-        self._index[self.actions] = np.arange(len(self.actions))
         self.rng = rng_for(seed, "options")
-        self.exploration = Exploration(config, engine.count, len(self.actions), self.rng)
+        self.exploration = Exploration(config, engine.count, engine.n_actions, self.rng)
         self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), dtype=np.int64)
         self.build(config, seed)
         reach = self.reach(config, self.options)
@@ -150,7 +145,7 @@ class Learner(Part, ABC):
 
     @abstractmethod
     def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
-        """Which of its actions each option's policy prefers, int64 (E,); arguments as of :meth:`act`."""
+        """Which action each option's policy prefers, int64 (E,); arguments as of :meth:`act`."""
 
     @abstractmethod
     def observe(self, moved: Transitions) -> None:
@@ -178,7 +173,7 @@ class Learner(Part, ABC):
         chosen = self.greedy(ids, options, age)
         if explore:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
-        return self.actions[chosen]
+        return chosen
 
     def count(self, options: NDArray[np.int64]) -> None:
         """Steps of these options (n,) were learned from, after those that reached their sub-goals are counted."""
@@ -192,18 +187,13 @@ class Learner(Part, ABC):
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""
-        state = dict(self.weights())
-        if len(self.actions) < self.engine.n_actions:
-            state["actions"] = torch.from_numpy(self.actions.copy())
-        return state | {name: torch.from_numpy(getattr(self, name).copy()) for name in COUNTERS}
+        counters = {name: torch.from_numpy(getattr(self, name).copy()) for name in COUNTERS}
+        return self.weights() | counters
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Continue from the weights and counters of an artefact; replays start empty. What does not fit is a
         ``UserError``.
         """
-        if not np.array_equal(actions_of(state, len(self.actions)), self.actions):
-            where = f"actions={self.config.actions}"
-            raise UserError("these options were trained with other actions", where, "Give the same --set.")
         self.load_weights(state)
         for name in COUNTERS:
             saved = state.get(name)

@@ -79,7 +79,7 @@ class LightLearner(Learner):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
             shape, standard = self.engine.observation_shape, self.engine.standard
-            network = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
+            network = LightQNetwork(shape, self.options, self.engine.n_actions, standard, config.embedding)
             self.online = network.to(self.device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
@@ -100,9 +100,9 @@ class LightLearner(Learner):
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        actions, ones = self._index[moved.actions], np.ones(len(moved.ids), np.int64)
+        ones = np.ones(len(moved.ids), np.int64)
         outcome = moved.options, moved.terminated, moved.timed_out
-        rows = self.ahead.add(Lessons.cast(moved.ids, actions, moved.next_ids, ones, *outcome), moved.ended)
+        rows = self.ahead.add(Lessons.cast(moved.ids, moved.actions, moved.next_ids, ones, *outcome), moved.ended)
         self.replay.add(rows)
         inside, reached = self._judged(rows)
         for row, option in zip(*np.nonzero(reached & ~inside), strict=True):
@@ -226,10 +226,10 @@ class LightPolicies:
 
     def __init__(self, saved: SavedOptions):
         config, weights = saved.config, below("online.", saved.weights)
-        self.actions = saved.actions("online.heads.weight", saved.count)
+        actions = saved.actions("online.heads.weight", saved.count)
         embedding = config.get("embedding", AUTO)
         standard = standard_in(weights, saved.shape)
-        make = partial(LightQNetwork, saved.shape, saved.count, len(self.actions), standard, embedding)
+        make = partial(LightQNetwork, saved.shape, saved.count, actions, standard, embedding)
         custom = embedding not in (AUTO, GRID, DEEP, *NETWORKS)
         self.network = load_fitting(make, weights, "options.safetensors", custom=custom)
 
@@ -240,4 +240,4 @@ class LightPolicies:
     @torch.no_grad()
     def _act(self, option: int, observation: Observations) -> int:
         values = self.network(torch.from_numpy(np.ascontiguousarray(observation[None])))[0, option]
-        return int(self.actions[int(values.argmax())])
+        return int(values.argmax())

@@ -26,6 +26,7 @@ class PlannedLearner(Learner):
     Arguments as of :class:`Learner`. Where no way leads to its sub-goal it plays the first action.
 
     Attributes:
+        actions: the engine's actions that the plan knows, int64 (A,).
         steps: int32 (N, O), how many steps each option's sub-goal is away from each state of the plan.
 
     Raises:
@@ -44,6 +45,7 @@ class PlannedLearner(Learner):
         return 0
 
     def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+        """Which of the plan's actions each option prefers."""
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
         nearest: NDArray[np.int64] = ahead.argmin(axis=1)
         return nearest

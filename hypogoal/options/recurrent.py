@@ -80,7 +80,7 @@ class RecurrentLearner(Learner):
         return PaperPolicies(saved)
 
     def build(self, config: OptionConfig, seed: int) -> None:
-        count = len(self.actions)
+        count = self.engine.n_actions
         self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
         self.running: list[list[tuple[int, int, int, bool, bool, bool]]] = [[] for _ in range(self.engine.count)]
@@ -111,8 +111,7 @@ class RecurrentLearner(Learner):
 
     def observe(self, moved: Transitions) -> None:
         """Collect each execution; store it in its member's replay when it ends."""
-        chosen = self._index[moved.actions]
-        columns = (moved.ids, chosen, moved.next_ids, moved.terminated, moved.timed_out, moved.reached)
+        columns = (moved.ids, moved.actions, moved.next_ids, moved.terminated, moved.timed_out, moved.reached)
         for e, row in enumerate(zip(*(values.tolist() for values in columns), strict=True)):
             self.running[e].append(row)
             if moved.ended[e]:
@@ -223,13 +222,13 @@ class PaperPolicies:
     def network(self, option: int) -> PaperQNetwork:
         """An option's network."""
         if option not in self._networks:
-            make = partial(PaperQNetwork, self.shape, len(self.actions), self.remembers)
+            make = partial(PaperQNetwork, self.shape, self.actions, self.remembers)
             self._networks[option] = load_fitting(make, below(f"{option}.", self.weights), "options.safetensors").eval()
         return self._networks[option]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
-        return _Execution(self.network(option), self.actions)
+        return _Execution(self.network(option))
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the networks, which are the weights again."""
@@ -239,12 +238,12 @@ class PaperPolicies:
 class _Execution:
     """One execution of an option, which its network remembers from its first step on."""
 
-    def __init__(self, network: PaperQNetwork, actions: NDArray[np.int64]):
-        self.network, self.actions = network, actions
+    def __init__(self, network: PaperQNetwork):
+        self.network = network
         self.hidden: Tensor | None = None
 
     @torch.no_grad()
     def __call__(self, observation: Observations) -> int:
         image = torch.from_numpy(np.ascontiguousarray(observation[None]))
         values, self.hidden = self.network(self.network.embed(image)[:, None], self.hidden)
-        return int(self.actions[int(values[0, 0].argmax())])
+        return int(values[0, 0].argmax())

@@ -46,7 +46,7 @@ def many(make: Any, count: int) -> Any:
 CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, ppo": (Corridor, "light", {}, "ppo"),
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
-    "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
+    "light, own, n steps, even": (LongCorridor, "light", FAR, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
     "light, thompson": (Corridor, "light", {}, "thompson"),
     "DoorKey, many layouts, random": (partial(many, doorkey.DOMAIN.make_engine), "light", {}, "random"),

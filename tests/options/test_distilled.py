@@ -62,7 +62,7 @@ def test_what_it_learns_are_the_plans_best_actions() -> None:
         ahead = planned.steps[planned._after[same]]  # (n, A, O)
         nearest = ahead.min(1)
         wanted = (ahead == nearest[:, None]) & (nearest < FAR)[:, None]
-        bits = learner.best[ours.ids].astype(np.int64)[:, None] >> np.arange(len(learner.actions))[:, None] & 1
+        bits = learner.best[ours.ids].astype(np.int64)[:, None] >> learner.actions[:, None] & 1
         assert np.array_equal(bits.astype(bool), wanted)
         assert np.array_equal(learner.kind[ours.ids] == FINAL, ours.final)
         assert (learner.kind[ours.ids[~ours.final]] >= PLANNED).all()
@@ -77,8 +77,7 @@ def test_while_it_learns_its_plan_plays_and_afterwards_its_network() -> None:
         loop._choose()
         ids, options = loop.engine.ids.copy(), loop.option.copy()
         moved = loop.advance()
-        action = np.searchsorted(learner.actions, moved.actions)
-        chosen = learner.best[ids, options] >> action & 1
+        chosen = learner.best[ids, options] >> moved.actions & 1
         best += chosen[learner.best[ids, options] > 0].tolist()
     assert 0.7 < np.mean(best) < 0.85
     fresh = loop_of(DoorKeyEngine(layouts(11), 8))

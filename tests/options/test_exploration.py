@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from corridor import Corridor, LongCorridor
 
-from hypogoal.core.errors import UserError
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set
+from hypogoal.options.exploration import Exploration
 
 GREEDY = 99  # no random action
 
@@ -64,13 +62,3 @@ def test_a_kept_action_ends_with_its_execution() -> None:
     assert going_on.mean() == pytest.approx(1 - 0.608, abs=0.04)
     np.testing.assert_array_equal(kept[going_on], first[going_on])
     assert (exploration.mix(policy, none, np.zeros(2000)) == GREEDY).all()
-
-
-def test_action_sets() -> None:
-    """Spec B4: all, or what the engine names."""
-    np.testing.assert_array_equal(action_set(Corridor(1), "all"), [0, 1])
-    np.testing.assert_array_equal(action_set(LongCorridor(1), "moves"), [2, 3])
-    with pytest.raises(UserError, match=r"actions=jumps\. Choose one of all, moves"):
-        action_set(LongCorridor(1), "jumps")
-    with pytest.raises(UserError, match="Choose one of all"):
-        action_set(Corridor(1), "moves")

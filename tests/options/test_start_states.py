@@ -14,7 +14,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.options import recurrent
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.learner import make_policies
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels
@@ -163,8 +162,8 @@ def learned(learner_class: type, steps: int, seed: int = 0, memory: int = 200_00
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"n_step": 3}, {"n_step": 3, "exploration": "persistent", "actions": "moves"}],
-    ids=["one-step", "three-step", "three-step persistent moves"],
+    [{}, {"n_step": 3}, {"n_step": 3, "exploration": "persistent"}],
+    ids=["one-step", "three-step", "three-step persistent"],
 )
 def test_the_light_learner_learns_from_pictures(changes: dict) -> None:
     """Spec D2, D4: own experience, one step and several: both options go straight to their ends."""
@@ -242,7 +241,7 @@ def test_the_paper_network_learns_from_pictures() -> None:
     learner, _ = learned(RecurrentLearner, 240, memory=256, **paper)
     assert all(member.updates >= 2 for member in learner.members)
     state = learner.state()
-    assert state["0.values.2.bias"].shape == (4,) and "actions" not in state
+    assert state["0.values.2.bias"].shape == (4,)
 
 
 @pytest.mark.usefixtures("small_gru")
@@ -298,7 +297,7 @@ def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatc
 
 def test_same_seed_same_bytes_with_every_switch() -> None:
     """The project's rule: randomness is passed in."""
-    every = {"n_step": 4, "exploration": "persistent", "actions": "moves"}
+    every = {"n_step": 4, "exploration": "persistent"}
     one, two, other = (learned(LightLearner, 240, seed=seed, **every)[0] for seed in (1, 1, 2))
     for name, value in one.state().items():
         assert torch.equal(value, two.state()[name]), name
@@ -320,24 +319,6 @@ def test_pixels_are_the_images() -> None:
     scaled = torch.from_numpy(engine.images(ids)).permute(0, 3, 1, 2).float() / 255.0
     plain = torch.relu(cells.second(torch.relu(cells.first(scaled)))).flatten(1)
     torch.testing.assert_close(cells(torch.from_numpy(engine.images(ids))), plain)
-
-
-def test_saved_policies_play_the_actions_they_chose_among() -> None:
-    """Spec D2: a policy over a set of actions is saved with it, plays those, and is not continued with others."""
-    learner, _ = learned(LightLearner, 200, actions="moves")
-    played = {int(a) for _ in range(50) for a in learner.act(np.zeros(4, np.int64), np.zeros(4, np.int64), np.ones(4))}
-    assert played <= {LEFT, RIGHT}
-    state = learner.state()
-    assert state["actions"].tolist() == [LEFT, RIGHT]
-    config = {"termination": "learned", "network": "light", "sub_goals": ["a", "b"], "members": 1}
-    act = make_policies(config, state, {"observation_shape": LongCorridor.observation_shape})(1)
-    image = learner.engine.images(np.array([0]))[0]
-    greedy = learner.act(np.zeros(1, np.int64), np.ones(1, np.int64), np.ones(1), explore=False)
-    assert act(image) == greedy[0] and act(image) in (LEFT, RIGHT)
-    learner.load(state)
-    other, _ = learned(LightLearner, 4)
-    with pytest.raises(UserError, match="other actions"):
-        other.load(state)
 
 
 def test_even_choice_gives_every_option_as_many_steps() -> None:

@@ -43,7 +43,7 @@ class Straight(Learner):
             raise UserError("straight options have no experience", f"experience={config.experience}", "Leave it out.")
 
     def build(self, config: OptionConfig, seed: int) -> None:
-        self.preferred = np.arange(self.options) % len(self.actions)
+        self.preferred = np.arange(self.options) % self.engine.n_actions
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
