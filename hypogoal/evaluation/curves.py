@@ -39,13 +39,12 @@ SOLVED = 0.95  # share of the window's episodes
 NEAR = 1.5  # times the shortest path
 WITHIN = {"near": NEAR, "within_2": 2.0}  # times the shortest path
 LEARNED = "options (learned members)"
-THOMPSON = "Thompson sampling"  # over learned members
 RANDOM = "random choice"
 ORACLE = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
 PRETRAINING = "random choice while options learn"
 BASELINES = ("PPO tuned", "PPO paper", "DQN tuned", "DQN paper")
-ORDER = (LEARNED, THOMPSON, RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
+ORDER = (LEARNED, RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
 UNITS = {
     "success": "share of episodes",
     "reward": "undiscounted, per episode",
@@ -198,8 +197,6 @@ def base_name(kind: str, config: Mapping[str, Any]) -> str:
     chooser, oracle = config["chooser"], config["termination"] == "oracle"
     if chooser == "random":
         return ORACLE_RANDOM if oracle else RANDOM
-    if chooser == "thompson":
-        return f"{THOMPSON}, {ORACLE}" if oracle else THOMPSON
     return (ORACLE if oracle else LEARNED) + ("" if chooser == "ppo" else f", chooser={chooser}")
 
 

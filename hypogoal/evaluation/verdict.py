@@ -17,7 +17,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM, UNIFORM_CHOICE
-from hypogoal.evaluation.curves import LEARNED, RANDOM, THOMPSON, Run, base_name, titled
+from hypogoal.evaluation.curves import LEARNED, RANDOM, Run, base_name, titled
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
 from hypogoal.evaluation.page import Block, Material, Question, listed, percent, picture, section
@@ -92,7 +92,7 @@ def paired(rows: Iterable[Row], others: Iterable[Row], *fields: str) -> list[tup
 def findings(work: Work) -> Iterator[Finding]:
     """Of every agent that chooses among several members: choosing, and hypotheses against one classifier."""
     kinds = {name: base_name(runs[0].kind, runs[0].config) for name, runs in work.agents.items()}
-    agents = {name: runs for name, runs in work.agents.items() if kinds[name] in (LEARNED, THOMPSON)}
+    agents = {name: runs for name, runs in work.agents.items() if kinds[name] == LEARNED}
     several = [name for name, runs in agents.items() if runs[0].config["members"] > 1]
     single = [name for name, runs in agents.items() if runs[0].config["members"] == 1]
     played_on = partial(select, work.rows, quantity="success", sub_goal="")
@@ -101,7 +101,7 @@ def findings(work: Work) -> Iterator[Finding]:
     uniform = select(frozen, method=UNIFORM)
     learning = [row for name, kind in kinds.items() if kind == RANDOM for row in select(trained, method=name)]
     for name in several:
-        played, title = select(frozen, method=name), called(agents[name][0])
+        played, title = select(frozen, method=name), ensemble_title(agents[name][0].config["ensemble"])
         if pairs := paired(played, uniform, "artefact", "layout"):
             second = UNIFORM_CHOICE
         else:
@@ -130,12 +130,6 @@ def _stopping(entry: Mapping[str, Any]) -> float:
     """The share of executions that stop at the base, of the option that validation picks."""
     share: float = entry["options"][entry["validated"] or 0]["reached_base"]
     return share
-
-
-def called(run: Run) -> str:
-    """An agent by its ensemble: 'D-BAT, 3 members'."""
-    name = ensemble_title(run.config["ensemble"])
-    return f"{name}, Thompson sampling" if run.config["chooser"] == "thompson" else name
 
 
 def tasks(work: Work) -> list[str]:

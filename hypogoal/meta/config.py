@@ -17,13 +17,12 @@ from hypogoal.options.config import OptionConfig
 class MetaConfig:
     """PPO over options, with SMDP returns."""
 
-    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(
-        ("chooser=random", "chooser=thompson"),
-        (
+    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "chooser=random": (
             *("meta_network", "head", "gae_lambda", "decisions", "epochs", "meta_batch"),
             *("meta_learning_rate", "clip", "entropy", "advantage_floor"),
         ),
-    )
+    }
 
     meta_network: str = setting(
         "light",
@@ -122,9 +121,9 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
     )
     chooser: str = setting(
         "ppo",
-        "the meta-policy, uniform choice among the options offered, or a bandit that sees no state",
-        source="ours: controls; Thompson 1933",
-        choices=("ppo", "random", "thompson"),
+        "the meta-policy, or uniform choice among the options offered",
+        source="ours: a control",
+        choices=("ppo", "random"),
         own=True,
     )
 

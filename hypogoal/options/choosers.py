@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 CHOOSERS = {
     "random": f"{__name__}:RandomChooser",
     "even": f"{__name__}:EvenChooser",
-    "thompson": "hypogoal.options.thompson:ThompsonChooser",
     "ppo": "hypogoal.meta.ppo:MetaPolicy",
 }
 
@@ -45,7 +44,6 @@ class Outcome:
     next_ids: NDArray[np.int64]  # the states reached
     terminated: NDArray[np.bool_]  # the task is over, nothing follows
     truncated: NDArray[np.bool_]  # the episode was cut, at its limit or because the next option begins at a start
-    succeeded: NDArray[np.bool_] | None = None  # the episode did, where the domain says what that is, see ``Step``
 
 
 class Chooser(Part, ABC):

@@ -41,7 +41,8 @@ class DistilledLearner(LightLearner):
 
     Attributes:
         actions: those of the engine's actions that plans know, int64 (A,).
-        best: uint (N, O), each option's best actions in each state, bit a for action a; 0 where no way leads to its sub-goal.
+        best: uint (N, O), each option's best actions in each state, bit a for action a; 0 where no way leads to its
+            sub-goal.
         kind: uint8 (N,), what each state is.
 
     Raises:

@@ -141,7 +141,6 @@ class OptionLoop(Resumable):
             next_ids=step.next_ids[done],
             terminated=step.terminated[done],
             truncated=step.truncated[done],
-            succeeded=None if step.succeeded is None else step.succeeded[done],
         )
         if learning:
             self.terminations.finished(done, outcome.options, outcome.reached)

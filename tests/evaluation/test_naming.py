@@ -38,16 +38,13 @@ def test_agents_are_named_after_how_they_choose():
     runs = [
         made(kind="baseline", agent="dqn", setting="paper"),
         made(termination="oracle"),
-        made(chooser="thompson", termination="oracle"),
         made(chooser="random"),
-        made(chooser="thompson"),
         made(),
         made(layout_seed=101, seed=1),
         made(kind="baseline", agent="ppo", setting="tuned"),
     ]
     groups = group_runs(runs)
-    bandit, control = "Thompson sampling", "Thompson sampling, oracle terminations"
-    assert list(groups) == [LEARNED, bandit, RANDOM, ORACLE, "PPO tuned", "DQN paper", control]
+    assert list(groups) == [LEARNED, RANDOM, ORACLE, "PPO tuned", "DQN paper"]
     assert len(groups[LEARNED]) == 2
     assert base_name("options", {}) == "random choice while options learn"
     assert missing(work_of(agents=named(*groups))) == [], "what nobody asked for is not missed"

@@ -19,7 +19,6 @@ from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
-from hypogoal.options.thompson import ThompsonChooser
 
 QUICK = {
     "environments": 3,
@@ -48,7 +47,6 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
     "light, own, n steps, even": (LongCorridor, "light", FAR, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
-    "light, thompson": (Corridor, "light", {}, "thompson"),
     "DoorKey, many layouts, random": (partial(many, doorkey.DOMAIN.make_engine), "light", {}, "random"),
     "Gymnasium, many layouts, random": (partial(many, corridor_env.SWIFT.make_engine), "light", {}, "random"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
@@ -73,8 +71,6 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     chooser: Chooser = RandomChooser(rng_for(0, "choice"))
     if chooser_name == "even":
         chooser = EvenChooser(2, rng_for(0, "choice"))
-    elif chooser_name == "thompson":
-        chooser = ThompsonChooser(2, 3, rng_for(0, "choice"))
     elif chooser_name != "random":
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=16, meta_batch=8)

@@ -8,21 +8,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from PIL import Image
-from toy_data import files_of
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from hypogoal.evaluation import choosing
-from hypogoal.evaluation.curves import read_run
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.episodes import agent_of, play_episode
-from hypogoal.options.thompson import ThompsonChooser
 from hypogoal.stages.collect import collect
 from hypogoal.stages.report import agents_of, play_films
 from hypogoal.stages.train_ensemble import train_ensemble
@@ -94,26 +88,6 @@ def test_videos_are_of_the_agents_that_choose(run):
         assert video.format == "GIF"
         assert 2 < video.n_frames <= 2 * CAP + 1
         assert video.size[0] == 320
-
-
-def test_a_bandit_is_back_and_learns_no_more(run, tmp_path):
-    """Spec E6, H4: its file is asked for, what it learned is in it, and playing changes nothing of that."""
-    config = TrainMetaConfig(
-        steps=320, chooser="thompson", max_episode_steps=CAP, environments=4, random_episodes=1, warm_up=400
-    )
-    train_meta(run / "ensemble", config, tmp_path / "meta", **QUIET)
-    (artefact,) = agents_of(tmp_path)
-    assert "meta.safetensors" in files_of("meta", artefact.config)
-    kept = load_tensors(artefact.path / "meta.safetensors")["credit"].numpy()
-    loops = [agent_of(artefact, seed=1) for _ in range(2)]
-    first, second = ([frame.option for frame in play_episode(loop, MEMBERS)] for loop in loops)
-    assert type(loops[0].chooser) is ThompsonChooser and kept.any() and first == second
-    np.testing.assert_array_equal(loops[0].chooser.credit, kept)
-    contents = Contents(tmp_path, [], [artefact], [], [], [])
-    work = Work(contents, None, None, agents={"a bandit": [read_run(artefact, contents.name(artefact))]})
-    work.rows += list(choosing.rows(work))
-    (judged,) = choosing.view(work)["choosing"]
-    assert [len(goal["members"]) for goal in judged["runs"][0]["sub_goals"]] == [MEMBERS] * 5
 
 
 def test_weights_of_another_policy_are_one_line(run, tmp_path):
