@@ -33,7 +33,6 @@ LONGEST = (
     "test_strange_texts",
     "test_verification",
     "test_exploits",
-    "test_many_layouts_example",
     "test_rooms_domain",
     "test_explorer",
     "test_videos",

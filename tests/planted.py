@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.termination import Terminations
 
 
@@ -36,13 +35,3 @@ def harsh(layout_seed: int, count: int) -> DoorKeyEngine:
     assert shortest is not None
     engine.max_steps = 3 * shortest
     return engine
-
-
-class NearPlanner(PlannedLearner):
-    """Plans no further than an option's time: each sub-goal has its turn."""
-
-    def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
-    ) -> NDArray[np.int64]:
-        near = self.steps[self._place[ids], options] + age <= 10
-        return np.where(near, super().act(ids, options, age), self.actions[0])

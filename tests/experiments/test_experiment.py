@@ -127,10 +127,10 @@ def test_settings_and_presets_of_a_domain() -> None:
         for seed in seeds:
             yield Command(f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}")
 
-    given = {"preset": "many-layouts", "device": "cpu"}
+    given = {"preset": "choosing", "device": "cpu"}
     cells = make_plan(two, OUT, ["seeds=3", "train-ensemble.steps=7"], **given).cells  # type: ignore[arg-type]
     assert cells[1].text == (
-        "hypogoal train-ensemble somewhere/data.h5 --preset many-layouts --set steps=7 --device cpu --seed 3 "
+        "hypogoal train-ensemble somewhere/data.h5 --preset choosing --set steps=7 --device cpu --seed 3 "
         "--out somewhere/ensemble/seed-3"
     )
     assert cells[0].cost.seconds == 10
