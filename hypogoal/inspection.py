@@ -27,14 +27,14 @@ from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV, SCORES, UNSEALED
+from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
 from hypogoal.dataset import PICTURE, SPLITS, open_dataset, type_text
 from hypogoal.domains.base import installed_domain
 
 # The numbers of logs and their titles, in the order in which they are shown.
-RESULTS = {"balanced_accuracy": "best member's balanced accuracy", "labelled": "labelled loss"}
+RESULTS = {"labelled": "labelled loss"}
 RESULTS |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
@@ -58,18 +58,20 @@ def _describe_part(path: Path) -> dict[str, Any]:
 
 
 def result_of(path: Path) -> dict[str, float]:
-    """The last numbers of an artefact's logs, if any: means over sub-goals; for scores the best member's."""
-    last: dict[tuple[str, str], dict[str, Any]] = {}
-    for line in json_lines(text for log in (LOG, SCORES) for text in read_end(path / log)):
-        if line.get("scope", "all") == "all":
-            last[str(line.get("sub_goal")), str(line.get("member"))] = line
-    values: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
-    for (goal, _), line in last.items():
-        for name in RESULTS:
-            value: Any = line.get(name)
-            if type(value) in (int, float) and abs(value) < 1e300:
-                values[name][goal] = max(value, values[name].get(goal, value))
-    return {title: sum(values[name].values()) / len(values[name]) for name, title in RESULTS.items() if values[name]}
+    """The last numbers of an artefact's log, if any: means over sub-goals."""
+    last: dict[str, dict[str, Any]] = {}
+    for line in json_lines(read_end(path / LOG)):
+        last[str(line.get("sub_goal"))] = line
+    results = {}
+    for name, title in RESULTS.items():
+        values = [value for value in (line.get(name) for line in last.values()) if _is_number(value)]
+        if values:
+            results[title] = sum(values) / len(values)
+    return results
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and abs(value) < 1e300
 
 
 def numbers_in(kind: str, path: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.manifests import LOG, MANIFEST, NUMBERS_CSV, SCORES, sealed
+from hypogoal.core.manifests import LOG, MANIFEST, NUMBERS_CSV, sealed
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import Collected, States, write_dataset
 
@@ -40,9 +40,8 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
         played |= {"audit.json", "exploits.csv"} if kind == "audit" else set()
         chooses = kind == "meta" and config.get("chooser") == "ppo"
         return played | ({"meta.safetensors"} if chooses else set())
-    scored = {SCORES} if config.get("score_every") else set()
     return {
-        "ensemble": {LOG, *scored, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
+        "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
         "baseline": {LOG, "episodes.csv", "layout.json", "policy.safetensors"},
         "evaluation": {"metrics.json", NUMBERS_CSV, "arrays.h5"},
         "report": {"index.html"},

@@ -15,7 +15,7 @@ CHECKSUM = "sha256"
 MANIFEST = "manifest.json"
 MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
-LOG, SCORES = "metrics.jsonl", "scores.jsonl"
+LOG = "metrics.jsonl"
 INPUT = ("path", "relative", "kind", "sha256")
 NUMBERS_CSV = "numbers.csv"  # not in evaluations of format 1
 

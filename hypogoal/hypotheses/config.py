@@ -129,12 +129,4 @@ class TrainEnsembleConfig(EnsembleConfig):
     """The settings of ``train-ensemble``: ensembles of some sub-goals."""
 
     sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
-    # Scores after many training lengths cost about a fifth of one training; one training per length, thirteen of them,
-    # would cost four.
-    score_every: int = setting(
-        0,
-        "gradient steps between scores of the members on held-out states, in scores.jsonl; 0 for none",
-        unit="batches",
-        low=0,
-    )
     workers: int = setting(0, "processes; 0 for one per core", low=0, high=1024)

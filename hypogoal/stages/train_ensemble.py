@@ -1,7 +1,7 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,27 +16,25 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_end
-from hypogoal.core.manifests import LOG, SCORES
+from hypogoal.core.manifests import LOG
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.training import training
 from hypogoal.core.workers import allowed, in_processes
-from hypogoal.dataset import Dataset, Observations, States, open_dataset, type_text
+from hypogoal.dataset import Dataset, Observations, open_dataset, type_text
 from hypogoal.diversity import load_objective
 from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
-from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
+from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, names_in, network_for
 from hypogoal.hypotheses.proposals import agreements, search_steps
-from hypogoal.hypotheses.scores import best_mean_worst, best_threshold, halves, member_scores, ranking
-from hypogoal.hypotheses.thresholds import thresholds
-from hypogoal.hypotheses.training import Look, Watcher, fit
+from hypogoal.hypotheses.scores import best_mean_worst, member_scores
+from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.hypotheses.views import StateOrigins, positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
 HELDOUT, LOOKED_AT = "heldout", 100  # in what the stage returns; states of each class, cheap beside training
-SUFFIXES = {LOG: ".jsonl", SCORES: ".scores"}  # of one sub-goal's part of these, beside its checkpoint
 
 
 def train_ensemble(
@@ -90,14 +88,18 @@ def train_ensemble(
             jobs.append(partial(_train_one, data, others, sub_goal, config, seed, folder, device, board))
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
         parts.mkdir(exist_ok=True)
-        logs = [parts / f"{sub_goal}{SUFFIXES[LOG]}" for sub_goal in sub_goals]
+        logs = [log_of(parts, sub_goal) for sub_goal in sub_goals]
         work.progress.resume(steps_in(logs))
         with work.progress.following(partial(steps_in, logs)):
             in_processes(jobs, workers, summaries.__setitem__)
-        for name in (LOG, SCORES) if config.score_every else (LOG,):
-            texts = [(parts / f"{sub_goal}{SUFFIXES[name]}").read_text(encoding="utf-8") for sub_goal in sub_goals]
-            (folder / name).write_text("".join(texts), encoding="utf-8")
+        texts = [log.read_text(encoding="utf-8") for log in logs]
+        (folder / LOG).write_text("".join(texts), encoding="utf-8")
     return summaries
+
+
+def log_of(parts: Path, sub_goal: str) -> Path:
+    """The log of one sub-goal's training, beside its checkpoint."""
+    return parts / f"{sub_goal}.jsonl"
 
 
 def steps_of(config: TrainEnsembleConfig) -> int:
@@ -139,45 +141,12 @@ def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, ND
     return states[0] if len(states) == 1 else np.concatenate(states), joined
 
 
-def score_rows(
-    ensemble: Ensemble, split: States, unlabelled: Observations, positions: NDArray[np.int64] | None
-) -> Iterator[dict[str, Any]]:
-    """Scores of members on held-out states, one row for each member and scope.
-
-    Scopes: ``all`` states, and those of the ``first`` and of the ``second`` half of their contexts (layouts or rooms:
-    see :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one half and scored on the other.
-    Balanced accuracy is at 0.5, above the 95th percentile of unlabelled states (``at_q95``) and at the best threshold
-    that there is (``at_best``).
-    """
-    probabilities = ensemble.predict(split.observations, positions_of(split.origins))
-    elsewhere = ensemble.predict(unlabelled, positions)
-    quantiles = thresholds("unlabelled-q95", elsewhere[:0], np.zeros(0, dtype=np.bool_), elsewhere)  # needs no label
-    contexts = next((split.origins[name] for name in ("layout_seed", "room") if name in split.origins), None)
-    first = None if contexts is None else halves(contexts)
-    scopes = {"all": np.ones(len(split.labels), dtype=np.bool_)}
-    scopes |= {} if first is None else {"first": first, "second": ~first}
-    for scope, inside in scopes.items():
-        seen, labels = probabilities[inside], split.labels[inside]
-        scores = member_scores(seen > THRESHOLD, labels)
-        columns = {
-            "ranking": ranking(seen, labels),
-            **{name: scores[name] for name in ("balanced_accuracy", "precision", "recall")},
-            "at_q95": member_scores(seen > quantiles, labels)["balanced_accuracy"],
-            "at_best": best_threshold(seen, labels)[1],
-        }
-        for member in range(len(ensemble)):
-            row = {name: float(values[member]) for name, values in columns.items()}
-            numbers = {name: None if np.isnan(value) else round(value, 6) for name, value in row.items()}
-            counts = {"states": len(labels), "positives": int(labels.sum())}
-            yield {"scope": scope, "member": member, **counts, **numbers}
-
-
 class _Report(Watcher):
-    """Logs the losses of a sub-goal's ensemble, and remembers the last ones; its scores too."""
+    """Logs the losses of a sub-goal's ensemble, and remembers the last ones."""
 
-    def __init__(self, sub_goal: str, log: MetricsLog, scores: MetricsLog, look: Look, look_at: set[int]):
-        super().__init__(look=look, look_at=look_at)
-        self.sub_goal, self.log, self.scores = sub_goal, log, scores
+    def __init__(self, sub_goal: str, log: MetricsLog):
+        super().__init__()
+        self.sub_goal, self.log = sub_goal, log
         self.numbers: dict[str, float] = {}
 
     def report(self, step: int, losses: dict[str, float]) -> None:
@@ -185,11 +154,10 @@ class _Report(Watcher):
         self.log.write(sub_goal=self.sub_goal, step=step, **losses)
 
     def snapshot(self) -> dict[str, Any]:
-        return {"log": self.log.snapshot(), "scores": self.scores.snapshot(), "numbers": self.numbers}
+        return {"log": self.log.snapshot(), "numbers": self.numbers}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         self.log.restore(snapshot["log"])
-        self.scores.restore(snapshot["scores"])
         self.numbers = snapshot["numbers"]
 
 
@@ -209,20 +177,10 @@ def _train_one(
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
-    parts = folder.parent / FOLDER
-    log = MetricsLog(parts / f"{sub_goal}{SUFFIXES[LOG]}", tensorboard)
-    scores = MetricsLog(parts / f"{sub_goal}{SUFFIXES[SCORES]}")
+    log = MetricsLog(log_of(folder.parent / FOLDER, sub_goal), tensorboard)
     if not checkpoints.saved:
         log.restore(0)
-        scores.restore(0)
-    steps = steps_of(config)
-    heldout = dataset.heldout(sub_goal) if config.score_every else None
-
-    def look(step: int, ensemble: Ensemble) -> None:
-        for row in score_rows(ensemble, heldout, unlabelled, positions_of(origins)) if heldout else ():
-            scores.write(sub_goal=sub_goal, step=step, **row)
-
-    report = _Report(sub_goal, log, scores, look, {*range(0, steps, config.score_every or steps), steps})
+    report = _Report(sub_goal, log)
     domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
     with contextlib.closing(log):
         ensemble = fit(

@@ -10,14 +10,16 @@ import pytest
 import torch
 from test_views import CROP, montezuma_states
 
-from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.checkpoints import Checkpoints, State, checkpoints_of
 from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma_emulator import observed_pixel
 from hypogoal.hypotheses import views
-from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
 from hypogoal.hypotheses.localisers import fit_localiser
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.hypotheses.views import ACTIONS, StateOrigins
+from hypogoal.stages import train_ensemble as stage
+from hypogoal.stages.train_ensemble import train_ensemble
 
 SHORT = dataclasses.replace(CROP, localiser="learned", steps=12, batch_size=16, diversity="dbat", diversity_weight=1e-2)
 
@@ -99,3 +101,21 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
     for state in (resumed, again):
         assert state.keys() == unbroken.keys()
         assert all(torch.equal(state[name], value) for name, value in unbroken.items())
+
+
+def test_a_broken_stage_ends_with_the_same_log(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1: what was logged after the last checkpoint is logged once."""
+    config = TrainEnsembleConfig(steps=32, members=2, workers=1, sub_goals=("open-red-door",))
+
+    def train(name: str, *, resume: bool = False) -> None:
+        train_ensemble(tiny_run / "data.h5", config, tmp_path / name, seed=3, resume=resume, quiet=True)
+
+    train("unbroken")
+    for last in (22, 8):
+        with monkeypatch.context() as patch:
+            patch.setattr(stage, "checkpoints_of", lambda *of, last=last: Breaking(checkpoints_of(*of).path, last))
+            with pytest.raises(Broken):
+                train("out", resume=last == 8)
+    train("out", resume=True)
+    for name in ("metrics.jsonl", "open-red-door.safetensors"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "unbroken" / name).read_bytes()
