@@ -74,8 +74,7 @@ def time_room(room: int, states: int, seed: int) -> Timing:
     make(room, states, seed)
     made = time.process_time() - begin
     begin = time.process_time()
-    how: dict[str, Any] = {"play": "expert", "held_out": False, "unclear": False}
-    found = gather(room, states, seed, ("benchmark",), sub_goals=[CLIMB_DOWN], **how)
+    found = gather(room, states, seed, ("benchmark",), sub_goals=[CLIMB_DOWN], held_out=False, unclear=False)
     kept = time.process_time() - begin
     after = time_ceiling(emulator_of_process(), LADDERS[0].top, actions)
     return Timing(
