@@ -33,11 +33,10 @@ if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # it promotes integers differ
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 ATTRIBUTES = (
-    "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "inputs", "versions",
-    "complete",
+    "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "versions", "complete",
 )  # fmt: skip
 RECOLLECT = "Collect it again."
-GET_MORE = "Collect more steps or other layouts, or bring recorded play (--play FILE) or a policy that gets there."
+GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
 BLOCK = 8  # states of a sample that are read together
@@ -232,7 +231,6 @@ def write_dataset(
     domain: str,
     config: Mapping[str, Any],
     seed: int,
-    inputs: Sequence[Mapping[str, str]] = (),
     force: bool = False,
 ) -> None:
     """Write collected states; the file appears under its name only once it is complete.
@@ -254,7 +252,6 @@ def write_dataset(
         hdf5.set_attribute(file, "observation_dtype", type_text(collected.unlabelled.observations.dtype))
         hdf5.set_attribute(file, "config", json.dumps(dict(config)))
         hdf5.set_attribute(file, "seed", seed)
-        hdf5.set_attribute(file, "inputs", json.dumps(list(inputs)))
         hdf5.set_attribute(file, "versions", json.dumps(versions()))
         hdf5.set_attribute(file, "complete", False)  # written first, so that a truncated file still has it
         for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
@@ -331,7 +328,6 @@ class Dataset:
         except ValueError:
             raise foreign from None
         self.config: dict[str, Any] = self._json("config", dict)
-        self.inputs: list[Any] = self._json("inputs", list) if self.attributes["inputs"] else []
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
         names = plain_names(self.sub_goals)

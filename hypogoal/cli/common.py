@@ -110,8 +110,6 @@ DOMAINS = "doorkey, montezuma, which-feature, or module:object."
 DomainName = Annotated[str, Argument(help=DOMAINS, autocompletion=offer("domain"))]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET, autocompletion=offer("setting"))]
-PLAYED = "Also take states from recorded play, a JSON file or a Minari dataset; your domains only. Repeatable."
-Play = Annotated[list[str] | None, Option("--play", metavar="FILE", help=PLAYED)]
 Seed = Annotated[int, Option("--seed", min=0, max=MOST_INTEGER, help="Seed of all randomness.")]
 Force = Annotated[bool, Option("--force", help="Replace what is at --out.")]
 Resume = Annotated[bool, Option("--resume", help="Continue an unfinished output; keep a complete one.")]

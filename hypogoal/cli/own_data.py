@@ -124,15 +124,14 @@ def check(
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
     set_: cli.Set = None,
-    play: cli.Play = None,
     seed: cli.Seed = 0,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play.")] = 0,
     minutes: Annotated[float, Option(min=0.01, help="About how long it may take: a slow domain plays less.")] = 2.0,
 ) -> None:
     """Check that your domain, objective or network keeps its contract.
 
-    Exit code 2 if not. It collects a few states of the domain twice; --set and
-    --play change how, as for 'collect'.
+    Exit code 2 if not. It collects a few states of the domain twice; --set
+    changes how, as for 'collect'.
     """
     from hypogoal.core import own_code
 
@@ -140,7 +139,7 @@ def check(
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
     passed = True
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
-        config = configuration("collect", domain, None, set_, {"play": play}, by_user=True) if domain else None
+        config = configuration("collect", domain, None, set_, {}, by_user=True) if domain else None
         with Progress("check", total=1, quiet=domain is None) as progress:
             options = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
             for verdict in _verdicts(domain, diversity, network, config, options):

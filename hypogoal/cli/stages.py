@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -20,9 +19,8 @@ FILMS = "RUN/report/videos/*.gif; the page shows the first. Default: one, if pos
 
 
 @cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
-def collect(call: cli.StageCall, domain: cli.DomainName, play: cli.Play = None) -> None:
+def collect(call: cli.StageCall, domain: cli.DomainName) -> None:
     """Collect labelled, unlabelled and held-out states."""
-    call = replace(call, settings={"play": play, **call.settings}) if play else call
     cli.print_counts(call.make(domain), call.how["quiet"])
     call.end({}, "train-ensemble", call.out, "--out", cli.run_of(call.out) / "ensemble")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from math import prod
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -419,10 +418,6 @@ class Domain(ABC):
     def collected_steps(self, config: Any) -> int:
         """The environment steps that ``collect`` will play; 0 if unknown."""
         return 0
-
-    def inputs(self, config: Any) -> Sequence[Path]:
-        """The files that ``collect`` reads."""
-        return ()
 
     def collected_bytes(self, config: Any) -> int:
         """An upper bound on the bytes of observations that ``collect`` makes; 0 if unknown."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -19,7 +18,6 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import GET_MORE, Collected, Observations, States, Unmet, digest, require_classes
 from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
-from hypogoal.domains.recorded_play import MINARI, Recorded, read_play
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 """How to play when collecting states: (environment, observation, random numbers) -> action."""
@@ -49,9 +47,6 @@ class GymnasiumConfig:
     )
     explore: float = setting(0.25, "share of random actions, where the domain has a policy", low=0.0, high=1.0)
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)
-    play: tuple[str, ...] = setting(
-        (), "files of recorded play, or folders of Minari datasets: half of the steps begin somewhere along it"
-    )
 
 
 class GymnasiumDomain(Domain):
@@ -165,20 +160,15 @@ class GymnasiumDomain(Domain):
         return replace(config, states=min(config.states, 200))
 
     def shortened(self, config: GymnasiumConfig, steps: int) -> GymnasiumConfig:
-        """Fewer steps on each layout; if that leaves few, one layout per set, unless recorded play needs the others."""
+        """Fewer steps on each layout; if that leaves few, one layout per set."""
         seeds = {name: getattr(config, name) for name in SEEDS}
-        if not config.play and steps < FEW_STEPS * sum(map(len, seeds.values())):
+        if steps < FEW_STEPS * sum(map(len, seeds.values())):
             seeds = {name: values[:1] for name, values in seeds.items()}
-        replayed = self.collected_steps(replace(config, steps=0))
-        share = max(1, (steps - replayed) // max(1, sum(map(len, seeds.values()))))
+        share = max(1, steps // max(1, sum(map(len, seeds.values()))))
         return replace(config, **seeds, steps=min(config.steps, share))
 
     def collected_steps(self, config: GymnasiumConfig) -> int:
-        recorded = (episode for path in config.play for episode in read_play(Path(path)))
-        return self._layouts(config) * config.steps + sum(len(episode.actions) for episode in recorded)
-
-    def inputs(self, config: GymnasiumConfig) -> list[Path]:
-        return [path / MINARI if path.is_dir() else path for path in map(Path, config.play)]
+        return self._layouts(config) * config.steps
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         return self._layouts(config) * min(config.states, config.steps) * self.observation_bytes
@@ -195,17 +185,10 @@ class GymnasiumDomain(Domain):
 
         Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
         and ``step``, counted from 0. Raises ``Unmet`` if the labelled states have one class only, or if there are no
-        unlabelled or no held-out states; ``UserError`` if recorded play cannot be replayed.
+        unlabelled or no held-out states.
         """
         seeds_of_sets = [getattr(config, name) for name in SEEDS]
         env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
-        recorded = [episode for path in config.play for episode in read_play(Path(path))]
-        for episode in recorded:
-            last = int(env.action_space.n) - 1  # type: ignore[attr-defined]
-            if max(episode.actions) > last or not any(episode.layout_seed in seeds for seeds in seeds_of_sets):
-                fault = f"recorded play has layout seed {episode.layout_seed} and actions up to {max(episode.actions)}"
-                do = f"The seed must be in labelled_seeds, unlabelled_seeds or heldout_seeds, actions in 0 to {last}."
-                raise UserError(fault, episode.where, do)
         progress.expect(self.collected_steps(config))
         training: set[bytes] = set()  # digests of labelled and unlabelled states
         sets: list[States] = []
@@ -216,7 +199,7 @@ class GymnasiumDomain(Domain):
                 rng = rng_for(seed, "play", layout_seed)
                 starts = engines.Starts(self.reader)
                 play = _LayoutPlay(self, env, config, layout_seed, rng, progress, starts, set(avoid))
-                states += play.collect([episode for episode in recorded if episode.layout_seed == layout_seed])
+                states += play.collect()
             sets.append(_states(states, self.reader, len(self.sub_goals)))
             training.update(map(digest, sets[-1].observations))
         env.close()
@@ -259,52 +242,26 @@ class _LayoutPlay:
     episode: int = -1
     elapsed: int = 0
 
-    def collect(self, recorded: Sequence[Recorded]) -> list[_State]:
-        """An even sample of all combinations of sub-goals: ``recorded`` play is replayed whole, then ``steps`` follow.
-
-        The policies share the steps. With recorded play, half of the steps begin somewhere along it.
-        """
-        for episode in recorded:
-            self.replay(episode)
-        policies: list[tuple[Policy | None, Sequence[Recorded]]] = [(policy, ()) for policy in self.domain.policies]
-        policies += [(policy, recorded) for policy in self.domain.policies if recorded]
-        for number, (policy, start) in enumerate(policies):
+    def collect(self) -> list[_State]:
+        """An even sample of all combinations of sub-goals; the policies share the steps."""
+        policies = self.domain.policies
+        for number, policy in enumerate(policies):
             first, end = (self.config.steps * turn // len(policies) for turn in (number, number + 1))
-            self.explore(policy, start, end - first)
+            self.explore(policy, end - first)
         return _even_sample(list(self.groups.values()), self.config.states, self.rng)
 
-    def replay(self, recorded: Recorded) -> None:
-        """Play a recorded episode; a ``UserError`` if it ends early."""
-        self.begin()
-        count = len(recorded.actions)
-        for action in recorded.actions:
-            _observation, over = self.step(action)
-            if over and self.elapsed < count:
-                do = "Leave out the others, or give a larger max_episode_steps."
-                raise UserError(f"the episode ends after {self.elapsed} of {count} actions", recorded.where, do)
-
-    def explore(self, policy: Policy | None, recorded: Sequence[Recorded], steps: int) -> None:
-        """Play ``steps`` by a policy, or at random; episodes begin somewhere along a ``recorded`` one, if any.
-
-        After such a beginning, an episode goes on for as many steps as the recorded one has.
-        """
+    def explore(self, policy: Policy | None, steps: int) -> None:
+        """Play ``steps`` by a policy, or at random."""
         count = int(self.env.action_space.n)
-        over, prefix, end = True, 0, 0
+        over = True
         for _ in range(steps):
-            if over or self.elapsed == end:
+            if over:
                 observation = self.begin()
-                actions = recorded[int(self.rng.integers(len(recorded)))].actions if recorded else ()
-                prefix = int(self.rng.integers(len(actions) + 1))
-                end = prefix + (len(actions) or self.config.max_episode_steps)
-            if self.elapsed < prefix:
-                action = actions[self.elapsed]
-            elif policy is None or self.rng.random() < self.config.explore:
+            if policy is None or self.rng.random() < self.config.explore:
                 action = int(self.rng.integers(count))
             else:
                 with UsersCode("the domain's policy", policy) as code:
-                    action = code.choice(
-                        policy(self.env, observation, self.rng), "the action", int(self.env.action_space.n)
-                    )
+                    action = code.choice(policy(self.env, observation, self.rng), "the action", count)
             observation, over = self.step(action)
 
     def begin(self) -> Any:

@@ -14,11 +14,11 @@ from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import checked, create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import PICTURE, write_observations
-from hypogoal.domains.recorded_play import MINARI
 from hypogoal.meta.episodes import Episode
 from hypogoal.own_data.parts import Parts, Source, require_memory
 from hypogoal.own_data.recordings import split_episodes
 
+MINARI = Path("data") / "main_data.hdf5"  # in a dataset's folder
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
 MINARI_VERSION = "0.5.4"  # its layout is written

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.artefacts import DATA, claim, sha256_of, versions
+from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
@@ -39,11 +39,10 @@ def collect(
     require_names(domain.sub_goals)  # before play, not when the file is written
     requested, out = out, claim(out, kind=DATA, force=force, resume=resume)
     identity: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
-    identity["inputs"] = [{"path": str(path), "sha256": sha256_of(path)} for path in domain.inputs(config)]
     if resume and out.exists() and not unfinished(out):
         existing = open_dataset(out)
         before = {"domain": existing.domain, "config": existing.config, "seed": existing.attributes["seed"]}
-        raise check_complete({**before, "inputs": existing.inputs}, identity, requested)
+        raise check_complete(before, identity, requested)
     if domain.doubt:
         say(f"hypogoal: {domain.doubt}", err=True)
     size = domain.collected_bytes(config)

@@ -20,6 +20,7 @@ from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium_engine import GymnasiumEngine
 from hypogoal.domains.observations import channels_first
 from hypogoal.stages.collect import collect
+from hypogoal.testing import check_domain
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 
@@ -132,7 +133,7 @@ def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.Ca
     assert capsys.readouterr().err == ""
     collect(DOMAIN, SMALL, tmp_path / "corridor.h5", quiet=True)
     told = "has 1 positive among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
-    ends = "hypogoal: {} " + told + "bring recorded play (--play FILE) or a policy that gets there."
+    ends = "hypogoal: {} " + told + "bring a policy that gets there."
     assert capsys.readouterr().err.splitlines() == [ends.format("left-end"), ends.format("right-end")]
     one = replace(SMALL, heldout_seeds=(4,), steps=60, max_episode_steps=2)  # the right end is three steps away
     seldom = GymnasiumDomain(CorridorEnv, {"first": lambda env: env.unwrapped.cell < 3})
@@ -146,6 +147,103 @@ def test_a_policy_collects() -> None:
     with pytest.raises(UserError, match=r"left-end has no positives among .* labelled states"):
         collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=80, explore=0.0))
     assert collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=800, explore=0.6)).labelled.labels[:, 0].any()
+
+
+class Stairs(gymnasium.Env[np.ndarray, int]):
+    """Action 0 climbs, 1 falls to the ground, 2 stays; the task is to be on step 12, which ends the episode.
+
+    The seed is the colour of the ground: what is seen says both.
+    """
+
+    observation_space = gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8)
+    action_space = gymnasium.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.height, self.colour = 0, seed or 0
+        return self._picture(), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.height = (self.height + 1, 0, self.height)[action]
+        return self._picture(), float(self.height == 12), self.height == 12, False, {}
+
+    def _picture(self) -> np.ndarray:
+        picture = np.zeros((32, 32, 3), np.uint8)
+        picture[2 * self.height, :, 0] = 255
+        picture[..., 1] = self.colour % 256
+        return picture
+
+
+STEPS_UP = {"half-way": lambda env: env.unwrapped.height >= 6, "top": lambda env: env.unwrapped.height == 12}
+FEW = GymnasiumConfig(unlabelled_seeds=(1,), heldout_seeds=(2,), steps=60, explore=0.0)
+
+
+def climb(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
+    return 0
+
+
+def test_policies_share_the_steps() -> None:
+    """Spec B7: one policy a sub-goal, as many steps each; None is random play."""
+    counts = {"climb": 0, "stay": 0}
+
+    def counted(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
+        counts["climb"] += 1
+        return 0
+
+    def stay(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
+        counts["stay"] += 1
+        return 2
+
+    both = GymnasiumDomain(Stairs, STEPS_UP, policy={"top": counted, "half-way": stay})
+    assert collected(both, FEW).labelled.labels.sum(0).tolist() == [7, 1]
+    assert counts == {"climb": 3 * 30, "stay": 3 * 30}
+    counts["climb"] = 0
+    collected(GymnasiumDomain(Stairs, STEPS_UP, policy={"top": counted, "half-way": None}), FEW)
+    assert counts["climb"] == 3 * 30
+    with pytest.raises(UserError, match=r"policies are given by sub-goal: half-way, moon\. These are half-way, top\."):
+        GymnasiumDomain(Stairs, STEPS_UP, policy={"half-way": climb, "moon": stay})
+
+
+def test_how_long_options_need_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: where play took longer from one sub-goal to the next than options have by default."""
+    collect(GymnasiumDomain(Stairs, STEPS_UP, policy=climb), FEW, tmp_path / "data.h5")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "play took up to 6 steps from one sub-goal to the next" in told
+    assert "train-options --option-timeout 12 gives options time" in told
+
+
+def test_check_takes_few_states_and_says_what_all_need() -> None:
+    """Spec B6: 2,000 pictures of each layout would be kept; of big ones that is more than a machine may have."""
+
+    class Tall(CorridorEnv):
+        def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+            self.count = 0
+            return super().reset(**kwargs)
+
+        def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+            image, reward, _over, cut, info = super().step(action)
+            return image, reward, False, cut, info  # it goes on, and no two pictures are alike
+
+        def image(self) -> np.ndarray:
+            self.count += 1
+            picture = super().image()
+            picture[0, :3, 0] = self.count >> 16, self.count >> 8 & 255, self.count & 255
+            return picture
+
+    domain = GymnasiumDomain(Tall, corridor_env.SUB_GOALS)
+    config = GymnasiumConfig(states=2_000, steps=2_000, heldout_seeds=(4,), max_episode_steps=2_000)
+    kept: list[int] = []
+    collect_all = domain.collect
+
+    def counted(config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
+        found = collect_all(config, seed, progress)
+        kept.append(len(found.labelled.labels))
+        return found
+
+    domain.collect = counted  # type: ignore[method-assign]
+    verdicts = {verdict.name: verdict for verdict in check_domain(domain, config)}
+    assert kept == [200, 200]
+    assert verdicts["collection"].text.endswith("'collect' keeps up to 55.3 MB, twice that in memory")
 
 
 @pytest.mark.parametrize(

@@ -184,30 +184,6 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     assert open_dataset(tmp_path / "again.h5").features() == open_dataset(run / "data.h5").features()
 
 
-def test_key_corridor_goes_through_all_stages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Spec B7: the example's own commands; without its recorded play there is nothing to learn of the ball."""
-    text = (EXAMPLES / "key_corridor.py").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 40
-    for name in ("key_corridor.py", "key_corridor.json"):
-        (tmp_path / name).write_bytes((EXAMPLES / name).read_bytes())
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HYPOGOAL_TRUST", "key_corridor:DOMAIN")
-    short = {**SHORT, "collect": settings("steps=60")}
-    short["train-ensemble"] = settings("steps=20", "members=2", "workers=1")
-    for words in (line.split() for line in text.splitlines() if line.startswith("    hypogoal")):
-        assert main([*words[1:], *short.get(words[1], ()), *(["-q"] if words[1] != "report" else [])]) == 0, words
-    data = open_dataset(tmp_path / "runs" / "corridor" / "data.h5")
-    for split in ("labelled", "heldout"):
-        assert all(row["positives"] >= 3 for row in data.counts()[split].values())
-    assert [entry["path"] for entry in data.inputs] == ["key_corridor.json"]
-    assert (tmp_path / "runs" / "corridor" / "report" / "index.html").is_file()
-    agrees(tmp_path / "runs" / "corridor", OWN_TASK, UNKNOWN)
-    assert main(["collect", "key_corridor:DOMAIN", "--out", "plain.h5", "-q", *LAYOUTS]) == 2
-    assert "hold-ball has no positives" in capsys.readouterr().err
-
-
 def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec A1-A8, B6, C5, F2: the example's own commands; torch and safetensors alone rebuild a member."""
     example = EXAMPLES / "frozen_backbone.py"
