@@ -3,7 +3,7 @@ PYTHON ?= python3
 JOBS ?= 2
 DEMO ?= runs/demo
 ROOMS ?= runs/rooms
-ONLY ?= doorkey montezuma training options verdicts loop startup
+ONLY ?= doorkey training options loop
 
 VENV := .venv
 BIN := $(VENV)/bin

@@ -1,6 +1,6 @@
 """DoorKey steps per second: MiniGrid's RGB wrapper against the engine that training uses, in one run.
 
-    python -m benchmarks.doorkey [--short] [--json PATH]
+    python -m benchmarks doorkey [--short] [--json PATH]
 
 All play uniformly random actions, drawn beforehand, on the same layouts, and deliver the full image as uint8
 (64, 64, 3) at every step: MiniGrid as ``RGBImgObsWrapper(tile_size=8)`` around the same three-key env; the engine, of
@@ -11,19 +11,15 @@ Engines start cold in every repeat: what they remember of a layout, they work ou
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
 import statistics
 import time
-from importlib import metadata
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from minigrid.envs import DoorKeyEnv as DoorKeyOfMiniGrid
 from minigrid.wrappers import RGBImgObsWrapper
 
+from benchmarks import timing
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.domains.doorkey_env import DoorKeyGrid
 
@@ -73,19 +69,19 @@ def measure(repeats: int, minigrid_steps: int, engine_steps: int) -> dict[str, l
         rows = rng.integers(N_ACTIONS, size=(engine_steps // MANY, MANY))
         stock = RGBImgObsWrapper(DoorKeyOfMiniGrid(size=8, max_steps=500), tile_size=8)
         three_keys = RGBImgObsWrapper(DoorKeyGrid(layout_seed=layout_seed), tile_size=8)
-        for name, timing in (
+        for name, timed in (
             ("MiniGrid, stock DoorKey-8x8", time_minigrid(stock, actions[:minigrid_steps])),
             ("MiniGrid, three keys", time_minigrid(three_keys, actions[:minigrid_steps])),
             (f"engine, {MANY} environments, images", time_many(DoorKeyEngine(layout_seed, MANY), rows, True)),
             (f"engine, {MANY} environments, codes", time_many(DoorKeyEngine(layout_seed, MANY), rows, False)),
         ):
-            timings.setdefault(name, []).append(timing)
+            timings.setdefault(name, []).append(timed)
     return timings
 
 
 def summary(name: str, repeated: list[Timing], yardstick: list[float]) -> dict[str, Any]:
     """Median, lowest and highest steps/s; median ratio to MiniGrid in the same repeat; median hit rate."""
-    rates = [timing.rate for timing in repeated]
+    rates = [timed.rate for timed in repeated]
     ratios = [rate / reference for rate, reference in zip(rates, yardstick, strict=True)]
     return {
         "name": name,
@@ -93,32 +89,18 @@ def summary(name: str, repeated: list[Timing], yardstick: list[float]) -> dict[s
         "lowest": min(rates),
         "highest": max(rates),
         "ratio": statistics.median(ratios),
-        "hit_rate": statistics.median(timing.hits for timing in repeated),
+        "hit_rate": statistics.median(timed.hits for timed in repeated),
     }
-
-
-def machine() -> dict[str, str]:
-    """Where it was measured."""
-    model = platform.processor() or "unknown"
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        model = f"{names[0]}, {len(names)} cores" if names else model
-    packages = {name: metadata.version(name) for name in ("minigrid", "gymnasium", "numpy")}
-    return {"processor": model, "python": platform.python_version(), **packages}
 
 
 def main() -> None:
     """Measure, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.doorkey", description=__doc__.split("\n")[0])
-    parser.add_argument("--short", action="store_true", help="a few seconds, for continuous integration")
-    parser.add_argument("--json", type=Path, help="also write the figures here")
-    arguments = parser.parse_args()
-    repeats, minigrid_steps, engine_steps = (3, 300, 32_000) if arguments.short else (7, 3000, 320_000)
+    given = timing.arguments(__doc__, "doorkey")
+    repeats, minigrid_steps, engine_steps = (3, 300, 32_000) if given.short else (7, 3000, 320_000)
     timings = measure(repeats, minigrid_steps, engine_steps)
-    yardstick = [timing.rate for timing in timings["MiniGrid, three keys"]]
+    yardstick = [timed.rate for timed in timings["MiniGrid, three keys"]]
     results = [summary(name, repeated, yardstick) for name, repeated in timings.items()]
-    about = machine()
+    about = timing.machine("minigrid", "gymnasium", "numpy")
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     print(f"image uint8 (64, 64, 3) at each of {minigrid_steps:,} MiniGrid and {engine_steps:,} engine steps,")
     print(f"CPU time of one thread, {repeats} repeats (layout seeds 0-{repeats - 1}), engines from cold")
@@ -130,9 +112,7 @@ def main() -> None:
         )
     print(f"ratio: median over repeats, to MiniGrid in the same repeat; wanted: {WANTED_RATIO}x")
     print("hits: steps that met no state, and no change of keys or door, for the first time")
-    if arguments.json:
-        record = {"machine": about, "repeats": repeats, "engine_steps": engine_steps, "results": results}
-        arguments.json.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    timing.write(given.json, about, {"repeats": repeats, "engine_steps": engine_steps, "results": results})
 
 
 if __name__ == "__main__":

@@ -165,7 +165,7 @@ def test_import_is_light() -> None:
 
 
 def test_help_is_light() -> None:
-    """``hypogoal --help`` answers without any of them; ``python -m benchmarks startup`` takes its time."""
+    """``hypogoal --help`` answers without any of them."""
     code = "import contextlib, io\nfrom hypogoal.cli import main\nwith contextlib.redirect_stdout(io.StringIO()):\n    "
     loaded = loaded_by(code + 'assert main(["--help"]) == 0')
     assert "typer" in loaded
