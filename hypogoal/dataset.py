@@ -316,15 +316,13 @@ class Dataset:
                 raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
             if version < DATA_FORMAT:
                 raise UserError(f"format {version} comes from an earlier hypogoal", path, RECOLLECT)
-            if hdf5.attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal rescued a truncated file
-                raise UserError("a part of the data file was cut off", path, RECOLLECT)
             self.attributes = {name: hdf5.attribute(file, name) for name in ATTRIBUTES}
         if not self.attributes["complete"]:
             raise UserError("the data file is not complete", path, RECOLLECT)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
         self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
         try:
-            self.observation_dtype = type_of(self.attributes["observation_dtype"] or str(PICTURE))  # early files: none
+            self.observation_dtype = type_of(self.attributes["observation_dtype"])
         except ValueError:
             raise foreign from None
         self.config: dict[str, Any] = self._json("config", dict)

@@ -27,7 +27,7 @@ from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV, UNSEALED
+from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
 from hypogoal.dataset import PICTURE, SPLITS, open_dataset, type_text
@@ -233,8 +233,6 @@ def _parts(path: Path) -> list[Path]:
 
 def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:
     path = artefact.path
-    if artefact.manifest["format"] == UNSEALED:
-        yield f"{path}: written by an earlier hypogoal, its manifest has no checksum"
     yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
     for entry in artefact.manifest["inputs"]:
         if not lies_in(folder, artefact.path / entry["relative"]):

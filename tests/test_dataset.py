@@ -50,7 +50,6 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         ("format", "x", "not a hypogoal data file"),
         ("format", 1, "earlier"),
         ("complete", False, "not complete"),
-        ("lost", '["unlabelled"]', r"a part of the data file was cut off: .*data\.h5\. Collect it again"),
         ("domain", None, "not a hypogoal data file"),
         ("sub_goals", "{", "not a hypogoal data file"),
         ("observation_shape", '"x"', "not a hypogoal data file"),

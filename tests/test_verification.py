@@ -110,13 +110,13 @@ def test_every_changed_bit_of_a_manifest_is_found(corridor_copy: Path) -> None:
 
 
 def test_messages_about_manifests_stay_helpful(corridor_copy: Path) -> None:
-    """Spec G2: what is newer is not called damaged, nor is what an earlier hypogoal wrote."""
+    """Spec G2: what is newer or older is not called damaged."""
     path = corridor_copy / "meta" / MANIFEST
     manifest = json.loads(path.read_text())
     for change, words in (
         ({"format": 3}, "newer"),
+        ({"format": 1}, "of an earlier hypogoal.*Make the artefact again"),
         ({"seed": -1}, "checksum does not match"),
-        ({"format": 1}, "checksum"),
     ):
         path.write_text(json.dumps(manifest | change, indent=1) + "\n")
         with pytest.raises(UserError, match=words):
@@ -124,22 +124,6 @@ def test_messages_about_manifests_stay_helpful(corridor_copy: Path) -> None:
     reseal(path.parent, seed=-1)
     with pytest.raises(UserError, match="'seed' is missing or malformed"):
         read_manifest(path)
-    del manifest["sha256"]
-    path.write_text(json.dumps(manifest | {"format": 1}))  # as they were before
-    assert faults_of(path.parent) == []
-    assert notes_of(path.parent)[0].endswith("written by an earlier hypogoal, its manifest has no checksum")
-
-
-def test_an_evaluation_of_before_is_whole(corridor_copy: Path) -> None:
-    """Spec A8: an earlier hypogoal wrote no numbers.csv; its report can still be drawn."""
-    path = corridor_copy / "evaluation" / MANIFEST
-    manifest = json.loads(path.read_text())
-    (path.parent / "numbers.csv").unlink()
-    files = {name: digest for name, digest in manifest.pop("files").items() if name != "numbers.csv"}
-    del manifest["sha256"]
-    path.write_text(json.dumps(manifest | {"format": 1, "files": files}))
-    assert faults_of(path.parent) == []
-    run("report", corridor_copy, "--force")
 
 
 def test_verify_looks_inside_the_folder_only(corridor_run: Path, corridor_copy: Path) -> None:

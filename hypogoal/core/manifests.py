@@ -10,20 +10,20 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, plain_name, plain_names, read_bytes
 from hypogoal.core.schemas import Schema, is_count, is_list, is_object, is_table, is_text, misfit
 
-FORMAT_VERSION, UNSEALED = 2, 1  # format 1 had no checksum
+FORMAT_VERSION = 2
 CHECKSUM = "sha256"
 MANIFEST = "manifest.json"
 MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
 LOG = "metrics.jsonl"
 INPUT = ("path", "relative", "kind", "sha256")
-NUMBERS_CSV = "numbers.csv"  # not in evaluations of format 1
+NUMBERS_CSV = "numbers.csv"
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
     """The manifest in a file, with all common keys and the settings that other stages read checked.
 
-    One that is not JSON, malformed, of a newer format or changed since it was written is a ``UserError``.
+    One that is not JSON, malformed, of another format or changed since it was written is a ``UserError``.
     """
     data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
     manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
@@ -33,7 +33,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if type(version) is int and version > FORMAT_VERSION:
         do = "Upgrade hypogoal."
         raise UserError(f"format {version} is newer than this hypogoal reads ({FORMAT_VERSION})", path, do)
-    if (version != UNSEALED or CHECKSUM in manifest) and data != sealed(manifest):
+    if type(version) is int and version < FORMAT_VERSION:
+        raise UserError(f"format {version} is of an earlier hypogoal, which this one does not read", path, AGAIN)
+    if data != sealed(manifest):
         raise UserError("the manifest was changed since it was written, its checksum does not match", path, AGAIN)
     manifest.pop(CHECKSUM, None)
     return _checked(manifest, path)

@@ -19,7 +19,7 @@ from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
-FORMAT = 4  # of ``metrics.json``: 1 until 0.15, 2 until 0.16, 3 until 0.21
+FORMAT = 4  # of ``metrics.json``
 
 
 @dataclass(frozen=True)
@@ -82,15 +82,15 @@ def takes(artefact: Artefact) -> bool:
 def thresholds_of(artefact: Artefact) -> NDArray[np.float64]:
     """The probabilities (G*K,) above which an artefact's options end; they may have fallen while it learned.
 
-    NaN where options end at true sub-goals, and of files from before 0.7.
+    NaN where options end at true sub-goals.
     """
     from hypogoal.core.tensors import load_tensors  # with PyTorch, which a report needs not
     from hypogoal.options.termination import THRESHOLDS, thresholds_in
 
     options = len(artefact.config["sub_goals"]) * artefact.config["members"]
-    saved = load_tensors(artefact.path / "options.safetensors", THRESHOLDS) if takes(artefact) else {}
-    if not saved:
+    if not takes(artefact):
         return np.full(options, np.nan)
+    saved = load_tensors(artefact.path / "options.safetensors", THRESHOLDS)
     return 1 / (1 + np.exp(-thresholds_in(saved, options).astype(np.float64)))
 
 

@@ -227,16 +227,12 @@ class Ensemble(nn.Module):
         state: Mapping[str, Tensor],
         view: FullView | AgentView | None = None,
     ) -> Ensemble:
-        """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit.
-
-        A state without thresholds, from an early version, gets 0.5.
-        """
+        """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit."""
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
         numbers = {name.split(".")[1] for name in state if name.startswith("members.")}
         if len(numbers) != members:
             fault = f"the weights do not fit the ensemble (of {len(numbers)} members)"
             raise UserError(fault, where, "Train it again.")
-        state = {"thresholds": torch.full((members,), THRESHOLD), **state}
 
         def make() -> Ensemble:
             return cls(network, observation_shape, members, torch.Generator(), view)
@@ -271,8 +267,8 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
 def _view(
     observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
 ) -> FullView | AgentView:
-    """The view that the settings ask for, without its weights; early ensembles have no such settings and see all."""
-    dtype = type_of(config.get("observation_dtype", str(PICTURE)))
+    """The view that the settings ask for, without its weights."""
+    dtype = type_of(config["observation_dtype"])
     if dtype != PICTURE:
         size = standard_shape(observation_shape, dtype)
         if not prod(size):
@@ -281,7 +277,7 @@ def _view(
         if mean.shape != size:  # a damaged manifest may ask for terabytes
             raise ValueError(observation_shape)
         return FullView(observation_shape, (mean, deviation), dtype)
-    if config.get("view", "full") == "full":
+    if config["view"] == "full":
         return FullView(observation_shape)
     localiser: Localiser = LearnedLocaliser(observation_shape)
     if config["localiser"] == "ram":

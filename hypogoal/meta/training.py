@@ -268,7 +268,7 @@ def check_fit(
     if sha256_of(source.path / "manifest.json") not in made_from:
         fault = "these options were trained with another ensemble"
         raise UserError(fault, trained.path, f"Train them from {source.path}.")
-    before = as_dict(type(config)()) | trained.config  # older artefacts lack some settings
+    before = trained.config
     for key in fixed:
         if key == "layout_seed" and before["layouts"]:  # options of many layouts may be played in any
             continue

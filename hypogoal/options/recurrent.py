@@ -215,7 +215,7 @@ class PaperPolicies:
 
     def __init__(self, saved: SavedOptions):
         self.weights, self.shape = dict(saved.weights), saved.shape
-        self.remembers = saved.config.get("recurrence", "execution") == "execution"
+        self.remembers = saved.config["recurrence"] == "execution"
         self.actions = saved.actions("0.values.2.bias", 1)
         self._networks: dict[int, PaperQNetwork] = {}
 

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -27,7 +27,7 @@ BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
 
 @dataclass(frozen=True)
 class Table(Columns):
-    """Columns (n,) of a file; it may lack one that has a default."""
+    """Columns (n,) of a file."""
 
     FILE: ClassVar[str]
 
@@ -41,9 +41,7 @@ class Table(Columns):
     @classmethod
     def read(cls, path: Path) -> Self:
         """The table in a file; a ``UserError`` where it is missing or damaged, see :func:`read_table`."""
-        optional = [field.name for field in fields(cls) if field.default is not MISSING]
-        required = [name for name in cls.names() if name not in optional]
-        columns, types = read_table(path, required, optional), cls.types()
+        columns, types = read_table(path, cls.names()), cls.types()
         return cls(**{name: values.astype(types[name]) for name, values in columns.items()})
 
     def write(self, folder: Path) -> None:
@@ -68,13 +66,8 @@ class Episodes(Table):
     length: NDArray[np.int64]  # steps
     reward: NDArray[np.float64]  # undiscounted
     terminated: NDArray[np.bool_]  # it reached a terminal state; else it was cut at the cap
-    # Spec F5: as its domain says; else, and in older tables without this column, terminated with a reward: an agent
-    # that dies reaches a terminal state too.
-    succeeded: NDArray[np.bool_] = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.succeeded is None:
-            object.__setattr__(self, "succeeded", self.terminated & (self.reward > 0))  # type: ignore[unreachable]
+    # Spec F5: as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
+    succeeded: NDArray[np.bool_]
 
     def last(self, count: int = LAST) -> Episodes:
         """The last ``count`` episodes, or all where there are fewer."""
@@ -140,20 +133,17 @@ class Exploits(Table):
     best_far: NDArray[np.float64]  # highest log-odds far from it; NaN where it always was near
 
 
-def read_table(
-    path: Path, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
-) -> dict[str, NDArray[np.float64]]:
+def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, NDArray[np.float64]]:
     """Columns of a table of numbers, a CSV file with a header; float (n,) each.
 
-    ``columns`` are required, None for all that the file has; ``optional`` ones are read where the file has them. A file
-    that is missing, too large, no table, or has other cells than finite numbers of at most 2^53 (or, in a ``BLANK``
-    column, nothing) is a ``UserError``.
+    ``columns`` are required, None for all that the file has. A file that is missing, too large, no table, or has other
+    cells than finite numbers of at most 2^53 (or, in a ``BLANK`` column, nothing) is a ``UserError``.
     """
     text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
     try:
         reader = csv.DictReader(io.StringIO(text, newline=""))
         header = list(reader.fieldnames or ())
-        columns = header if columns is None else [*columns, *(name for name in optional if name in header)]
+        columns = header if columns is None else columns
         if not set(columns) <= set(header):
             raise KeyError(path)
         rows = [[_number(row[name], name) for name in columns] for row in reader]

@@ -112,7 +112,7 @@ def test_what_other_versions_completed_is_complete(tmp_path: Path) -> None:
     """Spec G1: nothing is gone on with; settings that only one version has do not make it another one's."""
     out = tmp_path / "meta"
     finish(out)
-    reseal(out, format=1, versions={"torch": "0.1"}, config={"steps": 3, "gone": 1})
+    reseal(out, versions={"torch": "0.1"}, config={"steps": 3, "gone": 1})
     with pytest.raises(Complete, match=r"complete already"):
         finish(out, resume=True)
     with pytest.raises(UserError, match="was made with steps=3, not 4"):

@@ -27,7 +27,7 @@ def made(seed=0, *, chooser="ppo", episodes=120, reward=1.0, length=20, shortest
     """A run whose episodes are all alike: the last of them came to its end where there is a reward."""
     end = np.arange(1, episodes + 1) * length
     rewards = np.full(episodes, reward, dtype=np.float64)
-    found = Episodes(end, np.full(episodes, length), rewards, rewards > 0)
+    found = Episodes(end, np.full(episodes, length), rewards, rewards > 0, rewards > 0)
     layout = {"layout_seed": 200, "shortest_path": shortest, "random_success": 0.25, "random_episodes": 10}
     about = {"termination": "learned", "chooser": chooser, "steps": episodes * length, **config}
     return Run("meta", f"meta-{chooser}-{config.get('ensemble', '')}-{seed}", seed, about, found, layout)

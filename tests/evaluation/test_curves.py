@@ -24,7 +24,7 @@ from hypogoal.options.tables import Episodes
 def episodes(terminated, length=10):
     count = len(terminated)
     done = np.array(terminated, dtype=bool)
-    return Episodes(np.arange(1, count + 1) * length, np.full(count, length), done.astype(float), done)
+    return Episodes(np.arange(1, count + 1) * length, np.full(count, length), done.astype(float), done, done)
 
 
 def test_trailing_mean_by_hand():
@@ -57,7 +57,8 @@ def test_near_counts_successes_within_one_and_a_half_shortest_paths():
     """Spec F5: of a shortest path of 10, 15 steps are near and 16 are not; nor is a death, nor a cut at the cap."""
     length = np.array([10, 15, 16, 15, 15, 12, 400, 11])
     reward = np.array([1.0, 1, 1, 0, 1, -1, 1, 1])
-    run = Episodes(np.cumsum(length), length, reward, np.array([1, 1, 1, 1, 0, 1, 1, 1], dtype=bool))
+    terminated = np.array([1, 1, 1, 1, 0, 1, 1, 1], dtype=bool)
+    run = Episodes(np.cumsum(length), length, reward, terminated, terminated & (reward > 0))
     assert run_numbers(run, 10)["near"] == 3 / 8
     assert run_numbers(run, 11)["near"] == 4 / 8
     assert run_numbers(run, 10, window=2)["near"] == 1 / 2  # of the last ones
@@ -79,14 +80,13 @@ def test_numbers_of_a_run():
     assert nothing["steps_to_95"] is None
 
 
-def test_to_die_is_no_success():
-    """Spec F5: of four that terminated one had a reward, another a loss; a reward before the cap is none either."""
-    run = Episodes(
-        np.arange(1, 6), np.full(5, 10), np.array([0.0, 0, 1, -1, 1]), np.array([True, True, True, True, False])
-    )
-    assert run.succeeded.tolist() == [False, False, True, False, False]
+def test_what_does_not_succeed_is_no_success():
+    """Spec F5: whatever its reward, and whether it terminated; a hundred without success solve nothing."""
+    terminated, succeeded = np.array([1, 1, 1, 1, 0], dtype=bool), np.array([0, 0, 1, 0, 0], dtype=bool)
+    run = Episodes(np.arange(1, 6), np.full(5, 10), np.array([0.0, 0, 1, -1, 1]), terminated, succeeded)
     assert run_numbers(run, None)["success"] == 0.2
-    hundred = Episodes(np.arange(1, 101), np.full(100, 10), np.zeros(100), np.ones(100, dtype=bool))
+    none = np.zeros(100, dtype=bool)
+    hundred = Episodes(np.arange(1, 101), np.full(100, 10), np.zeros(100), ~none, none)
     assert steps_to_solve(hundred) is None
     assert curves(hundred, np.array([100]))["success"][0] == 0
 

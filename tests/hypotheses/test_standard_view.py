@@ -44,7 +44,7 @@ def test_members_learn_numbers_of_any_size_and_shape(shape: tuple[int, ...], tmp
     again = read_ensemble(tmp_path, {**about, "observation_dtype": "float32"}, "up")
     np.testing.assert_array_equal(again.predict(seen), ensemble.predict(seen))
     with pytest.raises(UserError, match="the weights do not fit"):
-        read_ensemble(tmp_path, about, "up")
+        read_ensemble(tmp_path, {**about, "observation_dtype": "uint8", "view": "full"}, "up")
     with pytest.raises(UserError, match=r"Give float32 \(N, "):
         ensemble.predict(seen.astype(np.uint8))
 

@@ -24,8 +24,8 @@ def write_baseline(run, agent, layout, seed, length, steps=STEPS, **more):
     with create_artefact(
         run / f"{agent}/layout-{layout}-seed-{seed}", kind="baseline", config=config, seed=seed
     ) as out:
-        rows = [(end, length, 1, 1) for end in range(length, steps + 1, length)]
-        write_table(out / "episodes.csv", ("step", "length", "reward", "terminated"), rows)
+        rows = [(end, length, 1, 1, 1) for end in range(length, steps + 1, length)]
+        write_table(out / "episodes.csv", ("step", "length", "reward", "terminated", "succeeded"), rows)
         facts = {"layout_seed": layout, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
         (out / "layout.json").write_text(json.dumps(facts), encoding="utf-8")
         fill(out, "baseline", config)
