@@ -52,7 +52,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
         details |= {"observation_dtype": type_text(dataset.observation_dtype)}
         return {"kind": "data", "path": str(path), "counts": dataset.counts(), **details, "config": dataset.config}
     artefact = open_artefact(path)
-    keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
+    keys = ("kind", "result", "inputs", "seed", "config", "command", "took", "versions", "format", "files")
     details = {"path": str(path), **artefact.manifest, "result": result_of(path)}
     return {key: details.get(key) for key in ("path", *keys)}
 

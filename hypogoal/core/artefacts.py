@@ -1,13 +1,14 @@
 """Artefacts: folders with a ``manifest.json``, written beside their final name and renamed at the end.
 
 A folder with a manifest is complete (Spec A8). The manifest records kind, format version, the full resolved
-configuration, the seed, the sha256 of every file and of every input's manifest, and package versions.
+configuration, the seed, the sha256 of every file and of every input's manifest, package versions, time and memory.
 """
 
 import contextlib
 import hashlib
 import os
 import platform
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -23,7 +24,9 @@ from hypogoal.core.manifests import (
     FORMAT_VERSION,
     MANIFEST,
     MAX_MANIFEST_BYTES,
+    TOOK,
     check_writable,
+    digest_of,
     read_manifest,
     sealed,
 )
@@ -206,6 +209,7 @@ def create_artefact(
         UserError: see :func:`claim`, or the unfinished output has another configuration, seed or inputs.
         Complete: with ``resume``, the output is complete and was made with the same ones.
     """
+    started = time.monotonic()
     inputs = [Path(path) for path in inputs]
     requested, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
     config = config if isinstance(config, dict) else as_dict(config)
@@ -222,17 +226,29 @@ def create_artefact(
         written = sorted(file for file in work.files.rglob("*") if file.is_file() and file.name != TO_FILL_IN)
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
         manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
+        manifest[TOOK] = {"seconds": round(time.monotonic() - started, 1), "memory": peak_memory()}
         (work.files / MANIFEST).write_bytes(sealed(manifest))
         drafts.put_in_place(work.files, out)
 
 
+def peak_memory() -> int:
+    """The most bytes of memory that this process or one of its children has held; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    kilobytes = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return 1024 * max(kilobytes)
+
+
 def _input_entry(path: Path, out: Path) -> dict[str, str]:
-    kind, target = (open_artefact(path).kind, path / MANIFEST) if path.is_dir() else ("data", path)
+    kind = open_artefact(path).kind if path.is_dir() else DATA
+    digest = digest_of(path / MANIFEST) if path.is_dir() else sha256_of(path)
     try:
         relative = os.path.relpath(path.absolute(), out.absolute())
     except ValueError:  # Windows: on another drive
         relative = str(path.absolute())
-    return {"path": str(path), "relative": relative, "kind": kind, "sha256": sha256_of(target)}
+    return {"path": str(path), "relative": relative, "kind": kind, "sha256": digest}
 
 
 def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefact:
@@ -305,11 +321,13 @@ def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> 
     """
     fault = "gone"
     for candidate in (folder / entry["relative"], *(() if beside else (Path(entry["path"]),))):
-        target = candidate / MANIFEST if entry["kind"] != "data" else candidate
+        is_data = entry["kind"] == DATA
+        target = candidate if is_data else candidate / MANIFEST
         try:
             if not target.is_file():
                 continue
-            if sha256_of(target) == entry["sha256"]:
+            digest = sha256_of(target) if is_data else digest_of(target)
+            if digest == entry["sha256"]:
                 return candidate.resolve(), ""
             fault = "changed since"
         except UserError as error:

@@ -12,6 +12,7 @@ from hypogoal.core.schemas import Schema, is_count, is_list, is_object, is_table
 
 FORMAT_VERSION = 2
 CHECKSUM = "sha256"
+TOOK = "took"  # seconds and memory, the one key in which two runs of a command differ
 MANIFEST = "manifest.json"
 MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
@@ -48,6 +49,15 @@ def sealed(manifest: Mapping[str, Any]) -> bytes:
     """
     bare = {key: value for key, value in manifest.items() if key != CHECKSUM}
     return _text({**bare, CHECKSUM: hashlib.sha256(_text(bare)).hexdigest()})
+
+
+def digest_of(path: Path) -> str:
+    """The sha256 of a manifest's text without ``took``, by which artefacts know their inputs."""
+    data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
+    manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
+    if isinstance(manifest, dict) and TOOK in manifest:
+        data = sealed({key: value for key, value in manifest.items() if key != TOOK})
+    return hashlib.sha256(data).hexdigest()
 
 
 def _text(manifest: Mapping[str, Any]) -> bytes:

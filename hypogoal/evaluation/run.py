@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts, sha256_of
+from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
+from hypogoal.core.manifests import digest_of
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
 FORMAT = 4  # of ``metrics.json``
@@ -187,7 +188,7 @@ def _since(run: Path, source: Artefact) -> list[str]:
     names = [
         contents.name(artefact)
         for artefact in contents.everything()
-        if sha256_of(artefact.path / MANIFEST) not in evaluated
+        if digest_of(artefact.path / MANIFEST) not in evaluated
     ]
     elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
     do = advice("evaluate it again", "evaluate", run, *elsewhere, "--force") if names else ""

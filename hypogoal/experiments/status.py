@@ -11,9 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import MANIFEST, check_files, find_input, open_artefact, sha256_of
+from hypogoal.core.artefacts import MANIFEST, check_files, find_input, open_artefact
 from hypogoal.core.drafts import drafts_in
 from hypogoal.core.errors import UserError
+from hypogoal.core.manifests import digest_of
 from hypogoal.core.progress import duration
 from hypogoal.core.terminal import amount
 from hypogoal.dataset import open_dataset
@@ -199,6 +200,6 @@ def is_current(cell: Cell) -> bool:
         read = {entry["sha256"] for entry in open_artefact(cell.out).manifest["inputs"]}
         run = Path(cell.arguments[1])
         sources = [part.path for part in find(run).everything()] if cell.stage == "evaluate" else cell.needs
-        return read.issuperset(sha256_of(path / MANIFEST) for path in sources)
+        return read.issuperset(digest_of(path / MANIFEST) for path in sources)
     except (UserError, OSError):
         return False

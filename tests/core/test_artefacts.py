@@ -1,6 +1,7 @@
 """Artefacts: complete or absent, and refused when they are not what is needed (Spec A8, G2)."""
 
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -214,3 +215,17 @@ def test_claim_makes_nothing_and_finds_a_file_in_the_way(tmp_path: Path) -> None
     for name, words in (("file/out", "in the way"), (f"{'x' * 240}.h5", "longer than 200 bytes")):
         with pytest.raises(UserError, match=words):
             claim(tmp_path / name, kind="data")
+
+
+def test_what_a_stage_took_is_in_its_manifest_and_changes_nothing_else(tmp_path: Path) -> None:
+    """Spec A8: seconds and bytes of memory, of which inputs know nothing: an input made again is the same input."""
+    source, made = make(tmp_path / "ensemble", "ensemble"), tmp_path / "meta"
+    with create_artefact(made, kind="meta", config={}, seed=0, inputs=[source]):
+        time.sleep(0.11)
+    took = open_artefact(made).manifest["took"]
+    assert 0.1 <= took["seconds"] < 60 and 1e7 < took["memory"] < 1e12
+    reseal(source, took={"seconds": 9.9, "memory": 9})
+    assert open_artefact(made).input("ensemble") == source.resolve()
+    reseal(source, seed=9)
+    with pytest.raises(UserError, match="changed since"):
+        open_artefact(made).input("ensemble")

@@ -28,7 +28,7 @@ from hypogoal.core.artefacts import MANIFEST, create_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5, fixed, set_attribute
-from hypogoal.core.manifests import sealed
+from hypogoal.core.manifests import digest_of, sealed
 from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
@@ -289,7 +289,7 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
         "manifests": {name: json.loads((changed / name / MANIFEST).read_text(encoding="utf-8")) for name in folders},
         "attributes": {name: json.loads(text) if text[0] in "[{" else text for name, text in attributes.items()},
     }
-    before = {name: sha256_of(changed / name / MANIFEST) for name in folders} | {data: sha256_of(data)}
+    before = {name: digest_of(changed / name / MANIFEST) for name in folders} | {data: sha256_of(data)}
 
     def draw(value):
         with h5py.File(data, "a") as file:
@@ -299,7 +299,7 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
         for name, manifest in value["manifests"].items():
             inputs = [{**entry, "sha256": now.get(entry["sha256"], entry["sha256"])} for entry in manifest["inputs"]]
             (changed / name / MANIFEST).write_bytes(sealed({**manifest, "inputs": inputs}))
-            now[before[name]] = sha256_of(changed / name / MANIFEST)
+            now[before[name]] = digest_of(changed / name / MANIFEST)
         evaluate(changed, changed / "evaluation", quiet=True, force=True)
         return drawn(changed)
 
