@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
-from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has them in this order
+from hypogoal.cli import stages, sweep, inspect, own_data  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core import stopping
 from hypogoal.core.errors import Complete, NumericalError, UserError, one_line
@@ -27,7 +27,7 @@ NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller setting
 # Texts of errors that torch and the loader of libraries raise in place of a MemoryError.
 MEMORY_TEXTS = ("can't allocate memory", "Cannot allocate memory", "failed to map segment")
 
-__all__ = ["app", "benchmark", "inspect", "main", "own_data", "stages", "sweep"]
+__all__ = ["app", "inspect", "main", "own_data", "stages", "sweep"]
 
 
 def _version(value: bool) -> None:

@@ -76,9 +76,9 @@ app = typer.Typer(
 )
 
 
-def command(panel: str, example: str, name: str | None = None, parent: typer.Typer = app) -> Any:
+def command(panel: str, example: str, name: str | None = None) -> Any:
     """Make a function a command of a group; its ``--help`` ends with an example."""
-    return parent.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
+    return app.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
 
 
 def offer(kind: str) -> Any:

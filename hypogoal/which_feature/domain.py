@@ -17,7 +17,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.base import Domain, Engine, Plan, Scene, Step
 from hypogoal.which_feature import states
-from hypogoal.which_feature.states import FACTORS, KNOWN, MOVED, SIDE, crossed_states, drawn
+from hypogoal.which_feature.states import FACTORS, SIDE, crossed_states, drawn
 
 DECKS = 64  # sets of rooms of a layout; episodes cycle through them
 SUB_GOALS = ("right-room",)
@@ -40,8 +40,10 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 class RoomsConfig:
     """Settings of ``hypogoal collect which-feature``."""
 
-    factors: tuple[str, ...] = setting(("shape", "place"), "planted features: equal in labelled states", choices=KNOWN)
-    truth: str = setting("shape", "the feature that rooms are rewarded for", choices=KNOWN)
+    factors: tuple[str, ...] = setting(
+        ("shape", "place"), "planted features: equal in labelled states", choices=FACTORS
+    )
+    truth: str = setting("shape", "the feature that rooms are rewarded for", choices=FACTORS)
     rooms: int = setting(5, "rooms to choose among; one is right", low=2, high=32)
     mix: float = setting(1.0, "share of unlabelled states with crossed features", low=0.0, high=1.0)
     labelled: int = setting(256, "labelled states", low=4, high=100_000)
@@ -166,8 +168,8 @@ class RoomsDomain(Domain):
 
 
 def _column(factors: tuple[str, ...], truth: str) -> int:
-    if truth not in factors or len(set(factors)) < len(factors) or MOVED in factors:
-        rule = "each feature is planted once, the true one among them, and all are seen in one frame"
+    if truth not in factors or len(set(factors)) < len(factors):
+        rule = "each feature is planted once, the true one among them"
         raise UserError(rule, f"factors={','.join(factors)}, truth={truth}", f"Choose from {', '.join(FACTORS)}.")
     return factors.index(truth)
 

@@ -24,7 +24,6 @@ def test_members_that_know_a_factor_each_cover_all() -> None:
     assert (ranked == np.where(np.eye(4) == 1, 1.0, 0.5)).all()
     assert (scores.owned(ranked) == np.eye(4, dtype=bool)).all()
     assert scores.owned(ranked).any(axis=0).mean() == 1.0
-    assert scores.redundancy(ranked) == 0.0
 
 
 @pytest.mark.parametrize("factor", range(4))
@@ -32,7 +31,6 @@ def test_copies_of_one_member_cover_one_factor(factor: int) -> None:
     """However many there are."""
     ranked = scores.rankings(np.repeat(SURE[:, [factor]], 6, axis=1), FACTORS)
     assert scores.owned(ranked).any(axis=0).mean() == 0.25
-    assert scores.redundancy(ranked) == 1.0
 
 
 def test_members_that_guess_cover_nothing() -> None:
@@ -74,60 +72,3 @@ def test_bounds_of_owning_are_met_exactly(low: float) -> None:
     for other, owns in ((low, True), (1 - low, True), (low + 0.001, False), (1 - low - 0.001, False)):
         assert scores.owned(np.array([[0.95, other]]), low=low).any() == owns
     assert not scores.owned(np.array([[0.949, 0.5]]), low=low).any()
-
-
-def test_redundancy_asks_by_what_members_rank_not_which_way_round() -> None:
-    """Members that rank by the first factor, one of them against it."""
-    assert scores.redundancy(np.array([[0.9, 0.6], [0.1, 0.6]])) == 1.0
-    assert scores.redundancy(np.array([[0.9, 0.6], [0.3, 0.8]])) == 0.0
-
-
-def test_redundancy_counts_pairs() -> None:
-    """Best factors 0, 0, 1: one pair of three. One member has no pairs."""
-    ranked = scores.rankings(SURE[:, [0, 0, 1]], FACTORS)
-    assert scores.redundancy(ranked) == pytest.approx(1 / 3)
-    assert np.isnan(scores.redundancy(ranked[:1]))
-
-
-def test_the_gap_is_what_the_threshold_costs() -> None:
-    """A member that ranks perfectly and never says yes loses a half; one at the right threshold nothing."""
-    shy = SURE[:, :2] * np.array([1.0, 0.5], np.float32)
-    ranked = scores.rankings(shy, FACTORS)
-    at_half, at_best = scores.balanced_accuracies(shy, FACTORS)
-    assert at_half[[0, 1], [0, 1]].tolist() == [1.0, 0.5]
-    assert at_best[[0, 1], [0, 1]].tolist() == [1.0, 1.0]
-    assert scores.calibration_gap(ranked, at_half, at_best) == 0.25
-
-
-def test_labels_until_the_right_member_is_known() -> None:
-    """Two members, each perfect on a factor of its own: the wrong one is right half of the time, by chance.
-
-    After n labels it is level with a probability of .5^n, and then taken every other time: the pick is right with
-    1 - .5^(n + 1), .875 at 2 labels and .9375 at 3, up to the chance of 200 orders.
-    """
-    ranked = scores.rankings(SURE[:, :2], FACTORS)
-    needed = scores.labels_needed(SURE[:, :2], FACTORS, ranked, rng())
-    assert needed[:2].tolist() == [3, 3]
-    assert needed[2:].tolist() == [0, 0]  # of which both know nothing: neither is wrong
-    assert (scores.labels_needed(np.repeat(SURE[:, :1], 3, 1), FACTORS, ranked[[0, 0, 0]], rng()) == 0).all()
-
-
-def test_labels_do_not_tell_members_that_say_the_same() -> None:
-    """One ranks perfectly but never says yes, as another does: all labels there are do not suffice."""
-    members = np.concatenate([0.5 * SURE[:, :1], np.full((320, 1), 0.2, np.float32)], axis=1)
-    needed = scores.labels_needed(members, FACTORS, scores.rankings(members, FACTORS), rng())
-    assert needed[0] == scores.MOST_LABELS + 1
-
-
-def test_a_member_is_right_that_ranks_a_hundredth_below_the_best() -> None:
-    """``NEAR`` exactly; two hundredths below it is wrong, and no label tells members apart that say the same."""
-    members = np.repeat(SURE[:, :1], 2, axis=1)
-    for less, needed in ((1, 0), (2, scores.MOST_LABELS + 1)):
-        ranked = np.array([[0.57, 0.83, 0.97, 1.0], [0.57, 0.83, 0.97, 1.0]]) - [[0], [less / 100]]
-        assert (scores.labels_needed(members, FACTORS, ranked, rng()) == needed).all()
-
-
-def test_a_probability_of_nine_tenths_is_sure() -> None:
-    """Nine of ten members that say the same are right: .9 after any number of labels, however means are rounded."""
-    ranked = np.array([[1.0] * 4] * 9 + [[0.5] * 4])
-    assert (scores.labels_needed(np.repeat(SURE[:, :1], 10, axis=1), FACTORS, ranked, rng()) == 0).all()

@@ -63,7 +63,7 @@ def test_layouts_differ_and_the_reward_alone_tells_truths_apart() -> None:
     assert (first != other).any()
 
 
-@pytest.mark.parametrize("factors", [("shape", "shape"), ("place",), ("shape", "moved")])
+@pytest.mark.parametrize("factors", [("shape", "shape"), ("place",)])
 def test_a_truth_that_is_not_planted_is_refused(factors: tuple[str, ...]) -> None:
     """Where states are collected and where agents play."""
     with pytest.raises(UserError, match="each feature is planted once"):
