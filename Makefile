@@ -37,7 +37,7 @@ $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 
 # An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(ROOMS) and $(DEMO).
 demo: $(USER) ## where an ensemble is needed, in runs/rooms, then three-key DoorKey, in runs/demo: from nothing to a report
-	$(BIN)/hypogoal run which-feature --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
+	$(BIN)/hypogoal run rooms --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
 	@echo "open $(ROOMS)/report/index.html and $(DEMO)/report/index.html in a browser; for the command hypogoal type: source $(BIN)/activate"
 

@@ -68,7 +68,7 @@ def _short_types(options: Any) -> Any:
 app = typer.Typer(
     cls=Commands,
     help="Transferable sub-goals by hypothesising which features generalise.\n\nStart here: "
-    "[bold]hypogoal run which-feature --preset demo[/bold], two minutes from nothing to a report.",
+    "[bold]hypogoal run rooms --preset demo[/bold], two minutes from nothing to a report.",
     epilog="Each command's --help ends with an example. Settings: hypogoal config.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -106,7 +106,7 @@ def offer(kind: str) -> Any:
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
 OWN_PRESET = "demo, paper, or your .toml file."
 Preset = Annotated[str | None, Option("--preset", help=OWN_PRESET, autocompletion=offer("preset"))]
-DOMAINS = "doorkey, montezuma, which-feature, or module:object."
+DOMAINS = "doorkey, montezuma, rooms, or module:object."
 DomainName = Annotated[str, Argument(help=DOMAINS, autocompletion=offer("domain"))]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET, autocompletion=offer("setting"))]

@@ -13,7 +13,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.terminal import amount, draw, give, say
 
 KNOWN = (
-    "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or one of your own: "
+    "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: "
     "a .toml file or module:function."
 )
 From = Annotated[

@@ -7,10 +7,10 @@ from hypogoal.experiments.choosing import choosing
 from hypogoal.experiments.doorkey import doorkey
 from hypogoal.experiments.experiment import Experiment
 from hypogoal.experiments.montezuma_ladders import montezuma_ladders
-from hypogoal.experiments.which_feature import which_feature
+from hypogoal.experiments.rooms import rooms
 
 EXPERIMENTS: Mapping[str, Experiment] = {
-    experiment.name: experiment for experiment in (choosing, doorkey, montezuma_ladders, which_feature)
+    experiment.name: experiment for experiment in (choosing, doorkey, montezuma_ladders, rooms)
 }
 
 

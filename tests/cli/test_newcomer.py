@@ -133,7 +133,7 @@ def test_config_fits_a_terminal(
 ) -> None:
     """80 columns; no mark-up; no range, setting or command is broken at a hyphen."""
     monkeypatch.setenv("COLUMNS", "80")
-    for domain in ("doorkey", "montezuma", "which-feature"):
+    for domain in ("doorkey", "montezuma", "rooms"):
         assert main(["config", stage, "--domain", domain]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80 and not any("`" in line for line in lines)
@@ -153,7 +153,7 @@ def test_config_says_where_a_value_is_from(capsys: pytest.CaptureFixture[str]) -
         5e-4,
         "paper, appendix (Table 1)",
     )
-    assert rows("train-meta", "--domain", "which-feature")["steps"]["source"] == "which-feature's own"
+    assert rows("train-meta", "--domain", "rooms")["steps"]["source"] == "rooms's own"
     demo = rows("train-meta", "--preset", "demo")["steps"]
     assert (demo["default"], demo["source"]) == (50_000, "preset demo")
 
@@ -244,7 +244,7 @@ def test_winners_by_hand() -> None:
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [
-        ("collect ", {"doorkey", "montezuma", "which-feature"}),
+        ("collect ", {"doorkey", "montezuma", "rooms"}),
         ("run mont", {"montezuma-ladders"}),
         ("run doorkey --preset pa", {"paper"}),
         ("config train-m", {"train-meta"}),

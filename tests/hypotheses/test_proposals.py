@@ -14,12 +14,12 @@ from test_training import TOY, follows, toy
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
+from hypogoal.domains.rooms.states import FACTORS, labelled_states, unlabelled_states
 from hypogoal.hypotheses import proposals
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.patterns import Patterns
 from hypogoal.hypotheses.proposals import Search, agreements, components, table
 from hypogoal.hypotheses.training import Round, Watcher, fit
-from hypogoal.which_feature.states import FACTORS, labelled_states, unlabelled_states
 
 NAMES = ("colour", "place")
 CONFIG = EnsembleConfig(

@@ -1,6 +1,6 @@
 """Spec H1: which planted features the members of an ensemble have found, for studies of objectives.
 
-Pure functions of probabilities on states in which all features are crossed, see ``states.crossed_states``.
+Pure functions of probabilities on states in which all features are crossed, see ``domains.rooms.states``.
 """
 
 import numpy as np

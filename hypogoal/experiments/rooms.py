@@ -1,7 +1,7 @@
-"""Is an ensemble needed? Rooms of WhichFeature: labels cannot tell shape from place, the reward asks for one of them.
+"""Is an ensemble needed? In rooms labels cannot tell shape from place, the reward asks for one of them.
 
-``hypogoal run which-feature --out runs/which-feature``. The evaluation's 'What choosing is worth' compares the agent
-with uniform-random choice among its own options.
+``hypogoal run rooms --out runs/rooms``. The evaluation's 'What choosing is worth' compares the agent with
+uniform-random choice among its own options.
 """
 
 from collections.abc import Iterator
@@ -27,8 +27,8 @@ Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles,
 Truths = Annotated[tuple[str, ...], explained("what the reward asks for", choices=("shape", "place"))]
 
 
-@experiment("which-feature", stages=("collect", "train-ensemble", "train-meta"), rates=RATES)
-def which_feature(
+@experiment("rooms", stages=("collect", "train-ensemble", "train-meta"), rates=RATES)
+def rooms(
     *,
     seeds: Rooms = tuple(range(990, 1000)),
     methods: Annotated[tuple[str, ...], explained("ensembles", choices=METHODS)] = ("dbat", "none", "one"),
@@ -36,7 +36,7 @@ def which_feature(
 ) -> Iterator[Command]:
     """The states of each seed, its ensembles, then an agent for each of them and each truth."""
     for seed in seeds:
-        yield Command(f"data/seed-{seed}", f"collect which-feature --seed {seed}", {"group": "data", "seed": seed})
+        yield Command(f"data/seed-{seed}", f"collect rooms --seed {seed}", {"group": "data", "seed": seed})
     for method, seed in product(methods, seeds):
         words = f"train-ensemble @data/seed-{seed} {METHODS[method]} --seed {seed}"
         yield Command(f"ensemble/method-{method}-seed-{seed}", words, {"method": method, "seed": seed})

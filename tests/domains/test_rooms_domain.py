@@ -1,4 +1,4 @@
-"""Rooms of WhichFeature: one is right, and only the world's setting says by which feature."""
+"""Rooms: one is right, and only the world's setting says by which feature."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from openings import agrees
 
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import load_domain
+from hypogoal.domains.rooms.domain import DECKS, DOMAIN
+from hypogoal.domains.rooms.states import INNER, OBJECT, TILE, tiles
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM
-from hypogoal.which_feature.domain import DECKS, DOMAIN
-from hypogoal.which_feature.states import INNER, OBJECT, TILE, tiles
 
 
 def seen(images: np.ndarray) -> dict[str, np.ndarray]:
@@ -70,10 +71,17 @@ def test_a_truth_that_is_not_planted_is_refused(factors: tuple[str, ...]) -> Non
         DOMAIN.make_engine(0, 1, factors=factors)
 
 
+def test_files_of_0_23_name_them_otherwise() -> None:
+    """In data and artefacts; nobody types that name any more."""
+    assert load_domain("which-feature") is DOMAIN
+    with pytest.raises(UserError, match="unknown domain: which-feature"):
+        load_domain("which-feature", by_user=True)
+
+
 def test_an_agent_finds_the_member_that_the_reward_asks_for(tmp_path: Path) -> None:
     """From the command line: one ensemble, two worlds; chance among the same members does worse."""
     data, ensemble, numbers = tmp_path / "data", tmp_path / "ensemble", {}
-    assert main(["collect", "which-feature", "--out", str(data), "--quiet"]) == 0
+    assert main(["collect", "rooms", "--out", str(data), "--quiet"]) == 0
     assert main(["train-ensemble", str(data), "--out", str(ensemble), "--seed", "100", "--quiet"]) == 0
     for truth in ("shape", "place"):
         out = tmp_path / truth
@@ -89,7 +97,7 @@ def test_an_agent_finds_the_member_that_the_reward_asks_for(tmp_path: Path) -> N
 def test_the_page_says_and_shows_what_competes(tmp_path: Path) -> None:
     """Spec I1: what the rooms are, which features compete, which one is rewarded; scenes of both; a verdict."""
     run, data = tmp_path / "run", tmp_path / "run" / "data.h5"
-    assert main(["collect", "which-feature", "--out", str(data), "--quiet"]) == 0
+    assert main(["collect", "rooms", "--out", str(data), "--quiet"]) == 0
     for name, words in {"dbat": ["--members", "2"], "one": ["--members", "1", "--diversity", "none"]}.items():
         ensemble, agent = (str(run / kind / name) for kind in ("ensemble", "agent"))
         few = ["--set", "steps=20", "--set", "workers=1", "--quiet"]

@@ -8,7 +8,7 @@ from minigrid.core.grid import Grid
 from minigrid.core.world_object import Ball, Key, Wall
 from scipy.stats import binomtest
 
-from hypogoal.which_feature.states import (
+from hypogoal.domains.rooms.states import (
     AGENT,
     CELLS,
     FACTORS,

@@ -1,4 +1,4 @@
-"""WhichFeature as a domain: rooms, one of which has the feature that is rewarded (Spec H1).
+"""Rooms, one of which has the feature that is rewarded (Spec H1).
 
 An agent stands before some rooms and enters one. In the labelled states several features agree, so only the reward can
 tell which of them counts: ``truth`` of the world that an agent is trained in.
@@ -16,8 +16,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.base import Domain, Engine, Plan, Scene, Step
-from hypogoal.which_feature import states
-from hypogoal.which_feature.states import FACTORS, SIDE, crossed_states, drawn
+from hypogoal.domains.rooms import states
+from hypogoal.domains.rooms.states import FACTORS, SIDE, crossed_states, drawn
 
 DECKS = 64  # sets of rooms of a layout; episodes cycle through them
 SUB_GOALS = ("right-room",)
@@ -38,7 +38,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class RoomsConfig:
-    """Settings of ``hypogoal collect which-feature``."""
+    """Settings of ``hypogoal collect rooms``."""
 
     factors: tuple[str, ...] = setting(
         ("shape", "place"), "planted features: equal in labelled states", choices=FACTORS
@@ -118,7 +118,7 @@ class RoomsEngine(Engine):
 class RoomsDomain(Domain):
     """Spec H1: a domain in which one labelled context cannot say what the sub-goal is."""
 
-    name = "which-feature"
+    name = "rooms"
     sub_goals = SUB_GOALS
     config_class = RoomsConfig
     engine_settings = ("factors", "truth", "rooms")
