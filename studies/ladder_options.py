@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import parse_integers
-from hypogoal.core.rounding import above
 from hypogoal.core.workers import in_processes
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
 from hypogoal.domains.montezuma_ladders import GROUPS
@@ -31,42 +30,21 @@ from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
-from studies.cells import Jobs, Row, collect_once, difference, interval, parser_of, read_rows, run_cells, table
+from studies.cells import Jobs, Row, collect_once, difference, interval, parser_of, printed, read_rows, run_cells, table
 from studies.ladders import read as read_lengths
 
 Settings = dict[str, Any]
-# What looks at the window around the agent, taught in room 1, and is made to hold in rooms nobody labelled.
-WINDOW: Settings = {
-    "network": "montezuma-crop",
-    "view": "agent-crop",
-    "batch_kind": "per-ladder",
-    "augment": "grey-context",
-    "jitter": 3,
-    "threshold": "positives-median",
-    "steps": 600,
-}
-HOLDS: Settings = {"termination": "patience:10000"}
-CARRIED, HOME, MORE = "carried", "1L,1M,1R", 5_000  # learned at home, then as they are elsewhere, then so much further
 METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of the ensemble and of its options
     "dbat": ("D-BAT", {"diversity": "dbat"}, {}),
     "none": ("no diversity", {"diversity": "none"}, {}),
     "cnn": ("single CNN", {"members": 1, "diversity": "none"}, {}),
-    "holds-dbat": ("D-BAT", WINDOW, HOLDS),
-    "holds-none": ("no diversity", WINDOW | {"diversity": "none"}, HOLDS),
-    "holds-ram": ("true position", WINDOW | {"localiser": "ram"}, HOLDS),
-    "no-context": ("without other surroundings", WINDOW | {"augment": "grey"}, HOLDS),
-    "no-median": ("threshold .5", WINDOW | {"threshold": "0.5"}, HOLDS),
-    "no-patience": ("without patience", WINDOW, {}),
-    CARRIED: ("carried over", WINDOW, HOLDS | {"policy_view": "agent-crop"}),
-    "oracle": ("true sub-goal", {}, {"termination": "oracle"}),  # whatever the ensemble
+    "oracle": ("true sub-goal", {"diversity": "dbat"}, {"termination": "oracle"}),  # whatever the ensemble
 }
-# Whose ensemble is another method's.
-ENSEMBLES = {CARRIED: "holds-dbat", "no-patience": "holds-dbat", "oracle": "dbat"}
+ENSEMBLES = {"oracle": "dbat"}  # whose ensemble is another method's
 MEMBERS, STEPS = 3, 40_000
 FEWEST = 8  # ladders of which a mean is shown
-# The paper's Figure 4 has twelve; the tops of the last three are bases themselves.
-LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13", "4-10", "11-19", "13-21")
-RUN_ON = ("0-4", "5-11", "7-13")  # their bases are tops of the next ladder
+# The paper's Figure 4 has three more, whose tops are bases themselves.
+LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13")
 KEYS = ("groups", "method", "seed", "ladder", "step", "member")
 NUMBERS = ("distance", "reached_base", "inside_at_start", "timed_out", "died", "duration")
 # Last: the same executions without the rule of 300; rows of 0.13 and before have none.
@@ -87,9 +65,9 @@ def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
     """Where the ensemble is; trained if it is not there."""
     out = work / f"{method}-{groups}-{seed}"
     if not (out / "manifest.json").exists():
-        changes = METHODS[method][1]
-        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1, **changes}
-        config = TrainEnsembleConfig(**{"steps": changes.get("steps") or length(groups, method), **settings})
+        usual = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1}
+        settings = usual | {"steps": length(groups, method)} | METHODS[method][1]
+        config = TrainEnsembleConfig(**settings)
         train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
     return out
 
@@ -98,33 +76,17 @@ def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> li
     """Learn the options of one ensemble on one ladder; of each member the last executions' numbers."""
     ensemble = ensemble_of(work, groups, ENSEMBLES.get(method, method), seed)
     out = work / f"options-{groups}-{method}-{seed}-{ladder}"
-    if method != CARRIED:
-        return _learned(ensemble, out, (groups, method, seed, ladder, STEPS))
-    home = work / f"carried-{groups}-{seed}"
-    if not (home / "manifest.json").exists():
-        _train(ensemble, home, seed, METHODS[method][2] | {"start": HOME, "steps": STEPS})
-    # First as they are (a warm-up so long that nothing is learned), then with learning.
-    rows = _learned(ensemble, out, (groups, method, seed, ladder, 0), home, {"steps": MORE, "warm_up": 10**9})
-    return rows + _learned(ensemble, out, (groups, method, seed, ladder, MORE), home, {"steps": MORE})
-
-
-def _train(ensemble: Path, out: Path, seed: int, changes: Settings, options: Path | None = None) -> None:
-    config = TrainOptionsConfig(**{**DOMAIN.defaults["train-options"], **changes})
-    train_options(ensemble, config, out, options=options, seed=seed, force=True, quiet=True)
-
-
-def _learned(
-    ensemble: Path, out: Path, cell: tuple[Any, ...], options: Path | None = None, changes: Settings | None = None
-) -> list[Row]:
-    _, method, seed, ladder, _ = cell
-    _train(ensemble, out, seed, {"start": ladder, "steps": STEPS, **METHODS[method][2], **(changes or {})}, options)
-    executions, members = Executions.read(out / "executions.csv"), open_artefact(out, "options").config["members"]
+    usual = {**DOMAIN.defaults["train-options"], "start": ladder, "steps": STEPS}
+    config = TrainOptionsConfig(**(usual | METHODS[method][2]))
+    train_options(ensemble, config, out, seed=seed, force=True, quiet=True)
+    executions = Executions.read(out / "executions.csv")
+    members = open_artefact(out, "options").config["members"]
     trained = open_artefact(ensemble, "ensemble").config["steps"]
     rows = []
     for member in range(members):
         of_member = executions.of(member)
         numbers = option_numbers(of_member)
-        place = dict(zip(KEYS, (*cell, member), strict=True))
+        place = dict(zip(KEYS, (groups, method, seed, ladder, STEPS, member), strict=True))
         rows.append(
             place
             | {"ensemble_steps": trained}
@@ -133,7 +95,7 @@ def _learned(
         )
     kept = out.parent / "executions"  # for Figure 5
     kept.mkdir(exist_ok=True)
-    shutil.copyfile(out / "executions.csv", kept / f"{out.name}-{cell[-1]}.csv")
+    shutil.copyfile(out / "executions.csv", kept / f"{out.name}-{STEPS}.csv")
     shutil.rmtree(out)
     return rows
 
@@ -146,8 +108,7 @@ def read(path: Path, groups: int, name: str = "distance") -> Distances:
     numbers: Distances = {}
     for row in read_rows(path):
         if int(row["groups"]) == groups:
-            method = row["method"] if row["method"] != CARRIED else f"{CARRIED}-{row['step']}"
-            seeds = numbers.setdefault((method, row["ladder"]), {})
+            seeds = numbers.setdefault((row["method"], row["ladder"]), {})
             seed = int(row["seed"])
             seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name] or "nan"))
     return numbers
@@ -166,7 +127,7 @@ def tables(path: Path) -> Iterator[str]:
 def _leads(groups: int, measures: dict[str, Distances]) -> Iterator[str]:
     """How much nearer D-BAT stops than the others on ladders without labels: mean over seeds, then over ladders."""
     rooms = {str(room) for group in GROUPS[:groups] for room in group}
-    new = [ladder for ladder in LADDERS[:9] if not rooms & {*ladder.rstrip("LMR").split("-")}]
+    new = [ladder for ladder in LADDERS if not rooms & {*ladder.rstrip("LMR").split("-")}]
     for (rule, distances), other in product(measures.items(), ("none", "cnn")):
         for of_members in (np.min, np.mean):
             gaps = []
@@ -217,116 +178,18 @@ def _tables(groups: int, distances: Distances, reached: Distances, inside: Dista
     )
 
 
-def tables_that_hold(path: Path) -> Iterator[str]:
-    """What the cells of options that hold say, as lines of Markdown."""
-    distances, reached = read(path, 1), read(path, 1, "reached_base")
-    methods = [method for method in ("holds-dbat", "holds-none", "holds-ram", "oracle") if _ladders(distances, method)]
-    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds (how many)."
-    yield ""
-    yield from table(
-        ["ladder", *(METHODS[method][0] for method in methods)],
-        (
-            [ladder, *(_bold(distances.get((method, ladder), {})) for method in methods)]
-            for ladder in _ladders(distances, "holds-dbat")
-        ),
-    )
-    inside = read(path, 1, "inside_at_start")
-    # Where the true sub-goal itself is counted as missed: most of its executions begin inside.
-    shares = {ladder: np.mean([*inside.get(("oracle", ladder), {}).values()] or 0) for ladder in LADDERS}
-    missed = [ladder for ladder, share in shares.items() if above(share, 0.5)]
-    groups = {
-        "nine whose base does not run on": [ladder for ladder in LADDERS if ladder not in RUN_ON],
-        f"of these without {', '.join(missed)}": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *missed)],
-        "three whose base runs on": list(RUN_ON),
-    }
-    yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders."
-    yield ""
-    yield from table(
-        ["", *groups],
-        (
-            *(
-                [METHODS[method][0], *(_of_group(distances, [method], ladders) for ladders in groups.values())]
-                for method in methods
-            ),
-            [
-                "no diversity minus D-BAT, same seeds",
-                *(_of_group(distances, ["holds-none", "holds-dbat"], ladders) for ladders in groups.values()),
-            ],
-        ),
-    )
-    parts = [
-        method for method in ("holds-dbat", "no-context", "no-median", "no-patience") if _ladders(distances, method)
-    ]
-    if len(parts) > 1:
-        yield "Each part left out: best / **mean** / worst member, mean over the same seeds."
-        yield ""
-        ladders = ("3-9", "2-6")
-        seeds = set.intersection(*(set(distances.get((method, ladder), {})) for method in parts for ladder in ladders))
-        shared = {
-            key: {seed: members[seed] for seed in seeds}
-            for key, members in distances.items()
-            if key[0] in parts and key[1] in ladders
-        }
-        rows = ([METHODS[method][0], *(_bold(shared[method, ladder]) for ladder in ladders)] for method in parts)
-        yield from table(["", *ladders], rows)
-    if shaped := distances.get(("shaped", "14-22")):  # by a setting that is gone: it gained nothing
-        plain = {seed: distances["holds-dbat", "14-22"][seed] for seed in shaped}
-        yield "14-22 with and without `shaping=0.5`: best / **mean** / worst member, mean over the same seeds."
-        yield ""
-        yield from table(["", "14-22"], [["without", _bold(plain)], ["with shaping", _bold(shaped)]])
-    if _ladders(distances, f"{CARRIED}-0"):
-        yield "Carried over from 1L, 1M and 1R: share of executions that end at a base, mean member (distance)."
-        yield ""
-        yield from table(
-            ["ladder", "as they are", f"after {MORE:,} steps more"],
-            (
-                [ladder, *(_share(reached, distances, f"{CARRIED}-{step}", ladder) for step in (0, MORE))]
-                for ladder in _ladders(distances, f"{CARRIED}-0")
-            ),
-        )
-
-
-def _ladders(distances: Distances, method: str) -> list[str]:
-    return [ladder for ladder in LADDERS if (method, ladder) in distances]
-
-
-def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
-    if not seeds:
-        return "-"
-    best, mean, worst = _best_mean_worst(seeds)
-    text = f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
-    return f"{text} ({len(seeds)})"
-
-
-def _best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:
+def best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:
+    """The best, the mean and the worst member's number, mean over seeds."""
     best, mean, worst = (
         float(np.mean([reduce(members) for members in seeds.values()])) for reduce in (np.min, np.mean, np.max)
     )
     return best, mean, worst
 
 
-def _of_group(distances: Distances, methods: list[str], ladders: list[str]) -> str:
-    """The mean member's mean over ladders, of two methods the first's minus the second's; seeds that have all."""
-    seeds = set.intersection(*(set(distances.get((method, ladder), {})) for method in methods for ladder in ladders))
-    means = [
-        [np.mean([distances[method, ladder][seed].mean() for ladder in ladders]) for method in methods]
-        for seed in seeds
-    ]
-    shown = interval if len(methods) == 1 else difference
-    return shown(np.array([each[0] - sum(each[1:]) for each in means]), 1) if means else "-"
-
-
-def _share(reached: Distances, stops: Distances, method: str, ladder: str) -> str:
-    shares, distances = (
-        np.mean([members.mean() for members in numbers[method, ladder].values()]) for numbers in (reached, stops)
-    )
-    return f"{shares:.2f} ({distances:.0f})"
-
-
 def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
     if not seeds:
         return "-"
-    numbers = [f"{number:.0f}" for number in _best_mean_worst(seeds)]
+    numbers = [f"{number:.0f}" for number in best_mean_worst(seeds)]
     return " / ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
 
 
@@ -348,10 +211,6 @@ def _against(distances: Distances, method: str, ladders: list[str], seeds: list[
     return difference(apart[0] - apart[1], 1)
 
 
-def _steps(cell: tuple[str, ...]) -> tuple[int, ...]:
-    return (0, MORE) if cell[1] == CARRIED else (STEPS,)
-
-
 def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "10")
@@ -359,11 +218,10 @@ def main() -> None:
         "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
     )
     parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
-    parser.add_argument("--methods", default="dbat,none,cnn,oracle", help=f"of {', '.join(METHODS)}")
-    parser.add_argument("--ladders", default=",".join(LADDERS[:9]), help=f"of {', '.join(LADDERS)}")
+    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--ladders", default=",".join(LADDERS), help=f"of {', '.join(LADDERS)}")
     arguments = parser.parse_args()
-    if arguments.tables:
-        print("\n".join((tables_that_hold if "hold" in arguments.csv.stem else tables)(arguments.csv)))
+    if printed(arguments, tables):
         return
     work, methods = arguments.work, arguments.methods.split(",")
     for groups in arguments.groups:
@@ -385,7 +243,7 @@ def main() -> None:
         for ladder in arguments.ladders.split(",")
         for method in methods
     }
-    run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, _steps, arguments.workers)
+    run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, lambda _: (STEPS,), arguments.workers)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import pytest
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders
+from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders, one_room
 from studies.cells import collect_once, difference, interval, run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -25,7 +25,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "figure5-ladders": ladder_stops.tables,
     "figure6-doorkey": figure6.tables,
     "hypotheses-doorkey": hypotheses.tables,
-    "options-that-hold": ladder_options.tables_that_hold,
+    "options-that-hold": one_room.tables,
     "preference-doorkey": choosing.tables,
     "rooms": choosing.rooms,
 }

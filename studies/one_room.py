@@ -1,0 +1,98 @@
+"""Options that hold in rooms nobody labelled, from the labels of one: the tables of the cells.
+
+    python -m studies.one_room docs/results/options-that-hold.csv
+
+The cells are of the commits that the page names; ``examples/one_room.py`` trains such members and options.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from studies.cells import difference, interval, table
+from studies.ladder_options import LADDERS, Distances, best_mean_worst, read
+
+METHODS = {"holds-dbat": "D-BAT", "holds-none": "no diversity", "oracle": "true sub-goal"}
+PARTS = {
+    "holds-dbat": "D-BAT",
+    "no-context": "without other surroundings",
+    "no-median": "threshold .5",
+    "no-patience": "without patience",
+}
+OF_PARTS = ("3-9", "2-6")  # ladders on which a part was left out
+ON_BASES = ("4-10", "11-19", "13-21")  # their tops are bases themselves
+RUN_ON = ("0-4", "5-11", "7-13")  # their bases are tops of the next ladder
+END_AT_BASE = tuple(ladder for ladder in (*LADDERS, *ON_BASES) if ladder not in RUN_ON)
+GROUPS = {
+    "nine whose base does not run on": END_AT_BASE,
+    f"of these without {', '.join(ON_BASES)}": END_AT_BASE[: -len(ON_BASES)],
+    "three whose base runs on": RUN_ON,
+}
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    distances = read(path, 1)
+    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds (how many)."
+    yield ""
+    rows = []
+    for ladder in (*LADDERS, *ON_BASES):
+        rows.append([ladder, *(_bold(distances.get((method, ladder), {})) for method in METHODS)])
+    yield from table(["ladder", *METHODS.values()], rows)
+    yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders."
+    yield ""
+    rows = []
+    for method, title in METHODS.items():
+        rows.append([title, *(interval(_values(_of_group(distances, method, each)), 1) for each in GROUPS.values())])
+    rows.append(["no diversity minus D-BAT, same seeds", *(_gap(distances, each) for each in GROUPS.values())])
+    yield from table(["", *GROUPS], rows)
+    yield "Each part left out: best / **mean** / worst member, mean over the same seeds."
+    yield ""
+    cells = {(method, ladder): distances[method, ladder] for method in PARTS for ladder in OF_PARTS}
+    shared = set.intersection(*map(set, cells.values()))
+    rows = []
+    for method, title in PARTS.items():
+        of_method = [{seed: cells[method, ladder][seed] for seed in shared} for ladder in OF_PARTS]
+        rows.append([title, *map(_bold, of_method)])
+    yield from table(["", *OF_PARTS], rows)
+
+
+def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
+    if not seeds:
+        return "-"
+    best, mean, worst = best_mean_worst(seeds)
+    text = f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
+    return f"{text} ({len(seeds)})"
+
+
+def _of_group(distances: Distances, method: str, ladders: tuple[str, ...]) -> dict[int, float]:
+    """By seed that has all of these ladders, the mean member's mean over them."""
+    cells = [distances.get((method, ladder), {}) for ladder in ladders]
+    seeds = set.intersection(*map(set, cells))
+    return {seed: float(np.mean([cell[seed].mean() for cell in cells])) for seed in sorted(seeds)}
+
+
+def _gap(distances: Distances, ladders: tuple[str, ...]) -> str:
+    with_dbat = _of_group(distances, "holds-dbat", ladders)
+    without = _of_group(distances, "holds-none", ladders)
+    return difference(np.array([without[seed] - with_dbat[seed] for seed in without if seed in with_dbat]), 1)
+
+
+def _values(by_seed: dict[int, float]) -> NDArray[np.float64]:
+    return np.array(list(by_seed.values()))
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("csv", type=Path, help="the file of cells")
+    print("\n".join(tables(parser.parse_args().csv)))
+
+
+if __name__ == "__main__":
+    main()
