@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 BASE = 400e6  # a process with torch, before it does anything
 MEMBER = 8e6  # weights of a member with the user's network, which is not run
-WINDOWS = 6e6  # a member's cached windows (hypotheses.known_windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 LIGHT_POLICIES = 1e6  # weights of all light policies, most of them shared; 0.4 MB for 15 options, 0.7 with a grid
 COPIES = 5  # of weights in training: the weights, a target, gradients, Adam's two moments
@@ -169,7 +168,7 @@ def play_needs(domain: Domain, ensemble: dict[str, Any], config: TrainOptionsCon
 
 def judging_member(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
     """Bytes of a member that predicts states, with a second copy of its weights in ``hypotheses.stacked``."""
-    return 2 * member_bytes(network, shape, dtype) + WINDOWS
+    return 2 * member_bytes(network, shape, dtype)
 
 
 def baseline_needs(

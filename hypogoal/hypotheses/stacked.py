@@ -15,7 +15,6 @@ from hypogoal.core.compute import tensor
 from hypogoal.dataset import Observations
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, PATCH_CHUNK, Ensemble
-from hypogoal.hypotheses.known_windows import KnownWindows, split_of
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.pooling import LeanMaxPool2d
 from hypogoal.hypotheses.views import FullView
@@ -31,11 +30,9 @@ class StackedMembers:
     ``joined``: each ensemble predicts by itself.
 
     The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
-    ``repeats``: states come from a grid world, so the convolutions' outputs for windows are kept, see
-    :mod:`.known_windows`; it has no effect where members see a part of a state, or on a GPU.
     """
 
-    def __init__(self, ensembles: Sequence[Ensemble], *, repeats: bool = False):
+    def __init__(self, ensembles: Sequence[Ensemble]):
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
@@ -45,14 +42,8 @@ class StackedMembers:
         self.count = len(networks)
         self.joined = _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
-        self._windows: KnownWindows | None = None
-        if not self.joined:
-            return
-        for layers in zip(*networks, strict=True):
-            self._steps.append((layers[0], _stack(list(layers))))
-        split = split_of(networks[0]) if repeats and self._one_view and self.device.type == "cpu" else None
-        self._windows = KnownWindows(self._steps[:split], self.count) if split else None
-        self._first = split or 0  # of the layers behind the windows
+        if self.joined:
+            self._steps = [(layers[0], _stack(list(layers))) for layers in zip(*networks, strict=True)]
 
     def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
@@ -106,13 +97,9 @@ class StackedMembers:
 
     def _logits(self, seen: Any) -> Tensor:
         """What :meth:`_see` returns -> logits (members, N, 2)."""
-        x = self._windows.of(seen) if self._windows is not None else as_input(tensor(seen, self.device))
-        return self._apply(self._first, len(self._steps), x)
-
-    def _apply(self, first: int, end: int, x: Tensor) -> Tensor:
-        """Apply the layers from ``first`` up to ``end``, exclusive."""
-        groups = self.count if first else 1 if self._one_view else len(self.ensembles)
-        for layer, weights in self._steps[first:end]:
+        x = as_input(tensor(seen, self.device))
+        groups = 1 if self._one_view else len(self.ensembles)
+        for layer, weights in self._steps:
             if isinstance(layer, nn.Conv2d):
                 bias = weights[1] if len(weights) > 1 else None
                 x = functional.conv2d(x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups)
@@ -143,7 +130,7 @@ def _can_be_joined(network: nn.Sequential) -> bool:
 
 
 def _stack(layers: list[nn.Module]) -> list[Tensor]:
-    """Join the weights of one layer of every member as :meth:`StackedMembers._apply` needs them."""
+    """Join the weights of one layer of every member as :meth:`StackedMembers._logits` needs them."""
     first = layers[0]
     state = [layer.state_dict() for layer in layers]
 

@@ -208,7 +208,7 @@ def learned_terminations(
     ``running_only``: states are classified for the running options only, which costs a K-th.
     ``rule``: see :func:`rule_of`.
     """
-    stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
+    stacked = StackedMembers(ensembles)
     networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
     members = len(ensembles[0])
 

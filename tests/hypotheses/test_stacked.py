@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from uneven import Uneven
 
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
@@ -34,31 +33,6 @@ def test_stacked_members_equal_each_ensemble(network: str, shape: tuple[int, ...
     assert StackedMembers(ensembles).log_odds(states[:0]).shape == (0, 4)
 
 
-def grid_worlds(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Images of 8 x 8 tiles of which there are three."""
-    tiles = rng.integers(0, 256, size=(3, 8, 8, 3), dtype=np.uint8)
-    cells = rng.integers(0, 3, size=(count, 8, 8)) * (rng.random((count, 8, 8)) < 0.2)
-    return tiles[cells].transpose(0, 1, 3, 2, 4, 5).reshape(count, 64, 64, 3)
-
-
-def test_known_windows_equal_whole_images() -> None:
-    """What was kept of other states' windows gives what each state gives by itself, also when too many are known."""
-    rng = np.random.default_rng(0)
-    generator = torch.Generator().manual_seed(0)
-    ensembles = [Ensemble("doorkey", (64, 64, 3), 2, generator).eval() for _ in range(2)]
-    states = grid_worlds(60, rng)
-    plain = StackedMembers(ensembles).log_odds(states)
-    windows = StackedMembers(ensembles, repeats=True)
-    assert windows._windows is not None
-    for most in (16_384, 500):
-        windows._windows.most = most
-        for start in range(0, 60, 7):
-            found = windows.log_odds(states[start : start + 7])
-            np.testing.assert_allclose(found, plain[start : start + 7], atol=1e-6)
-            assert 0 < len(windows._windows._rows) <= most
-    assert np.ptp(plain) > 1e-3
-
-
 def test_cells_are_judged_as_their_images() -> None:
     """As each ensemble judges the images; each distinct one once, whatever the order."""
     rng = np.random.default_rng(2)
@@ -71,35 +45,6 @@ def test_cells_are_judged_as_their_images() -> None:
     found = stacked.log_odds_of_cells(engine.codes(ids).reshape(-1, 8, 8), engine.tiles)
     np.testing.assert_allclose(found, plain, atol=1e-6)
     assert np.ptp(plain) > 1e-3
-
-
-def test_a_window_s_numbers_do_not_depend_on_its_company() -> None:
-    """Spec G1: a resumed run, which knows no windows yet, judges as one that knows many, on any processor."""
-    rng = np.random.default_rng(1)
-    ensembles = [Ensemble("doorkey", (64, 64, 3), 3, torch.Generator().manual_seed(0)).eval() for _ in range(5)]
-    states = grid_worlds(40, rng)
-    learned = StackedMembers(ensembles, repeats=True)
-    with Uneven():
-        learned.log_odds(states[rng.permutation(40)])
-        for start in range(0, 40, 3):
-            some = states[start : start + 3]
-            fresh = StackedMembers(ensembles, repeats=True)
-            np.testing.assert_array_equal(fresh.log_odds(some), learned.log_odds(some))
-
-
-def test_networks_without_windows_are_judged_whole() -> None:
-    """Spec C5: an own network with padding, pictures that are no grid world."""
-    from hypogoal.hypotheses.known_windows import split_of
-
-    padded = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3, padding=1), torch.nn.ReLU())
-    assert split_of(padded) is None
-    assert split_of(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3, 2))) is None
-    generator = torch.Generator().manual_seed(0)
-    ensemble = Ensemble("doorkey", (64, 64, 3), 1, generator).eval()
-    assert split_of(ensemble.networks[0]) is not None
-    windows = StackedMembers([ensemble], repeats=True)._windows
-    assert windows is not None
-    assert (windows.side, windows.stride) == (17, 8)
 
 
 OWN = {
@@ -127,7 +72,7 @@ def test_own_networks_of_other_layers_predict_the_same(name: str, monkeypatch: p
     generator = torch.Generator().manual_seed(0)
     ensembles = [Ensemble("own", (16, 16, 3), 2, generator).eval() for _ in range(2)]
     states = np.random.default_rng(0).integers(0, 256, size=(10, 16, 16, 3), dtype=np.uint8)
-    stacked = StackedMembers(ensembles, repeats=True)
+    stacked = StackedMembers(ensembles)
     assert stacked.joined == (name == "joined after all")
     plain = np.concatenate([ensemble.log_odds(states) for ensemble in ensembles], axis=1)
     np.testing.assert_allclose(stacked.log_odds(states), plain, atol=1e-5)
