@@ -111,31 +111,11 @@ def make_tables(observations: Sequence[NDArray[Any]], network: nn.Sequential) ->
     return sample if count == total else _tables(np.concatenate(observations), windows)
 
 
-def tables_of_codes(codes: NDArray[np.uint8], tiles: NDArray[np.uint8], windows: Sequence[tuple[int, int]]) -> Tables:
-    """As :func:`make_tables` makes them of the images that cells draw, without drawing these: a third of the time.
-
-    Takes codes (N, rows, columns) of cells and the ``tiles`` uint8 (T, height, width, C) that they stand for.
-    """
-    count, down, across = codes.shape
-    height, width, channels = tiles.shape[1:]
-    which, code_rows = distinct_items(codes.reshape(count * down, across))
-    drawn = tiles[code_rows].transpose(0, 2, 1, 3, 4).reshape(-1, across * width * channels)
-    lines, pixel_rows = distinct_items(drawn)
-    lines = lines.reshape(-1, height)[which].reshape(count, down * height)
-    return _tables_of_rows(lines, pixel_rows.reshape(-1, across * width, channels), windows)
-
-
 def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]]) -> Tables:
     count, height, width, channels = observations.shape
-    lines, pixel_rows = distinct_items(observations.reshape(count * height, width * channels))
-    return _tables_of_rows(lines.reshape(count, height), pixel_rows.reshape(-1, width, channels), windows)
-
-
-def _tables_of_rows(
-    lines: NDArray[np.int32], pixel_rows: NDArray[np.uint8], windows: Sequence[tuple[int, int]]
-) -> Tables:
-    """Of images, each as indices (N, H) of distinct rows of pixels (R, W, C)."""
-    rows, colours = distinct_items(pixel_rows.reshape(-1, pixel_rows.shape[2]))
+    lines, pixel_rows = _distinct_items(observations.reshape(count * height, width * channels))
+    lines, pixel_rows = lines.reshape(count, height), pixel_rows.reshape(-1, width, channels)
+    rows, colours = _distinct_items(pixel_rows.reshape(-1, pixel_rows.shape[2]))
     rows = rows.reshape(pixel_rows.shape[:2])
     levels: list[Level] = []
     for kernel, stride in windows:
@@ -173,7 +153,7 @@ def _rank(values: NDArray[np.int64], bound: int) -> tuple[NDArray[np.int32], NDA
     return (np.cumsum(occurs, dtype=np.int32) - 1)[values], np.flatnonzero(occurs)
 
 
-def distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+def _distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     """Items (N, bytes) -> (indices of distinct items (N,), the distinct items in order of appearance)."""
     whole: list[bytes] = np.ascontiguousarray(items).view(f"V{items.shape[1]}").ravel().tolist()
     index_of = {item: index for index, item in enumerate(dict.fromkeys(whole))}

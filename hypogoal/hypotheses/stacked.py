@@ -13,8 +13,7 @@ from torch.nn import functional
 
 from hypogoal.core.compute import tensor
 from hypogoal.dataset import Observations
-from hypogoal.hypotheses import patches
-from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, PATCH_CHUNK, Ensemble
+from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.pooling import LeanMaxPool2d
 from hypogoal.hypotheses.views import FullView
@@ -57,33 +56,6 @@ class StackedMembers:
                 logits = self._logits(seen[start : start + chunk])
                 rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
         return np.concatenate(rows)
-
-    @property
-    def knows_cells(self) -> bool:
-        """Whether it has :meth:`log_odds_of_cells`."""
-        if not self.joined or not self._one_view or self.device.type != "cpu":
-            return False
-        return patches.windows_of(self.ensembles[0].networks[0]) is not None
-
-    def log_odds_of_cells(self, codes: NDArray[np.uint8], tiles: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Each ensemble's own ``log_odds`` of images made of cells, float32 (N, G*K), several times as fast.
-
-        Takes codes (N, rows, columns) and the ``tiles`` (T, height, width, C) that they stand for. Each distinct image
-        is judged once, and each distinct patch looked for once for all ensembles. Needs ``knows_cells``.
-        """
-        places, distinct = patches.distinct_items(codes.reshape(len(codes), -1))
-        distinct = distinct.reshape(-1, *codes.shape[1:])
-        networks = [network for ensemble in self.ensembles for network in ensemble.networks]
-        windows = patches.windows_of(networks[0])
-        assert windows is not None
-        rows = []
-        with torch.inference_mode():
-            for start in range(0, len(distinct), PATCH_CHUNK):
-                some = distinct[start : start + PATCH_CHUNK]
-                batch = patches.take(patches.tables_of_codes(some, tiles, windows), np.arange(len(some)))
-                logits = torch.stack([patches.forward(network, batch) for network in networks], dim=1)
-                rows.append((logits[..., 1] - logits[..., 0]).numpy())
-        return np.concatenate(rows)[places]
 
     def _see(self, observations: Observations, positions: NDArray[np.int64] | None) -> Any:
         """The ensembles' view, uint8 (N, h, w, C), or (N, h, w, G*C) if their views differ.

@@ -218,14 +218,7 @@ def learned_terminations(
             raise UserError(fault, None, "Train it with localiser=learned.")
         return engine.images(ids), engine.positions(ids) if stacked.needs_positions else None
 
-    knows_cells = stacked.knows_cells and engine.tiles is not None
-
     def classify(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        if len(ids) >= MANY and knows_cells:
-            tiles = engine.tiles
-            assert tiles is not None
-            rows = engine.observation_shape[0] // tiles.shape[1]
-            return stacked.log_odds_of_cells(engine.codes(ids).reshape(len(ids), rows, -1), tiles)
         states = look_at(ids)
         if len(ids) < MANY:
             return stacked.log_odds(*states)

@@ -100,19 +100,6 @@ def test_tables_by_hand() -> None:
     assert batch.places == ((4,),)
 
 
-def test_tables_of_cells_are_those_of_their_images() -> None:
-    """Number by number, so that members' outputs are, too."""
-    rng = np.random.default_rng(0)
-    tiles = rng.integers(0, 256, size=(4, 8, 8, 3), dtype=np.uint8)
-    codes = rng.integers(0, 4, size=(30, 6, 6)).astype(np.uint8)
-    images = tiles[codes].transpose(0, 1, 3, 2, 4, 5).reshape(30, 48, 48, 3)
-    windows = [(5, 2), (3, 2), (3, 2), (4, 2)]
-    plain, fast = patches._tables(images, windows), patches.tables_of_codes(codes, tiles, windows)
-    assert torch.equal(fast.colours, plain.colours) and len(fast.levels) == 4
-    for ours, theirs in zip(fast.levels, plain.levels, strict=True):
-        assert all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in ("parts", "rows", "lines"))
-
-
 def test_only_what_repeats_is_tabled() -> None:
     """Noise and photographs take the plain way; so do layers that tables do not know."""
     network = build_network("doorkey", (48, 48, 3), torch.Generator())

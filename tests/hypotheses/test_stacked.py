@@ -7,8 +7,6 @@ import pytest
 import torch
 from torch import nn
 
-from hypogoal.domains.base import Layouts
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import NETWORKS
 from hypogoal.hypotheses.stacked import StackedMembers
@@ -31,20 +29,6 @@ def test_stacked_members_equal_each_ensemble(network: str, shape: tuple[int, ...
     np.testing.assert_allclose(stacked, plain, atol=1e-5)
     assert np.ptp(plain) > 1e-3
     assert StackedMembers(ensembles).log_odds(states[:0]).shape == (0, 4)
-
-
-def test_cells_are_judged_as_their_images() -> None:
-    """As each ensemble judges the images; each distinct one once, whatever the order."""
-    rng = np.random.default_rng(2)
-    engine = DoorKeyEngine(Layouts((3, 4)), 2)
-    ids = rng.permutation(engine.plan().ids)
-    ensembles = [Ensemble("doorkey", (64, 64, 3), 2, torch.Generator().manual_seed(0)).eval() for _ in range(2)]
-    plain = np.concatenate([ensemble.log_odds(engine.images(ids)) for ensemble in ensembles], axis=1)
-    stacked = StackedMembers(ensembles)
-    assert stacked.knows_cells
-    found = stacked.log_odds_of_cells(engine.codes(ids).reshape(-1, 8, 8), engine.tiles)
-    np.testing.assert_allclose(found, plain, atol=1e-6)
-    assert np.ptp(plain) > 1e-3
 
 
 OWN = {
