@@ -28,7 +28,6 @@ from hypogoal.core.own_code import UsersCode, as_number, load_own
 from hypogoal.core.tensors import KEPT
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
 from hypogoal.hypotheses.load import ByKey
-from hypogoal.hypotheses.pooling import lean
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
@@ -222,10 +221,10 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
     ReLU is monotone, so the order changes neither values nor gradients, but behind the pooling it has a quarter of the
     work. Only attribution needs the other order.
     """
-    layers = [_reordered_by_key(layer) if isinstance(layer, ByKey) else lean(layer) for layer in network]
+    layers = [_reordered_by_key(layer) if isinstance(layer, ByKey) else layer for layer in network]
     for index, (layer, following) in enumerate(pairwise(network)):
         if isinstance(layer, nn.ReLU) and isinstance(following, nn.MaxPool2d):
-            layers[index], layers[index + 1] = lean(following), layer
+            layers[index], layers[index + 1] = following, layer
     return nn.Sequential(*layers)
 
 

@@ -19,8 +19,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.hypotheses.pooling import LeanMaxPool2d
-
 WORTHWHILE = 0.5  # of the plain network's work in convolutions; above, gathering patches costs more than it saves
 SAMPLE = 64  # images from which that is estimated,
 SAMPLE_PIXELS = 2**19  # or fewer images, within this number of pixels: each takes some 250 bytes
@@ -63,7 +61,7 @@ def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
     """(kernel size, stride) of each convolution and pooling; None if a layer is not supported."""
     windows = []
     for layer in network:
-        if type(layer) in (nn.Conv2d, nn.MaxPool2d, LeanMaxPool2d):  # other subclasses may compute otherwise
+        if type(layer) in (nn.Conv2d, nn.MaxPool2d):  # subclasses may compute otherwise
             kernel, stride = _side(layer.kernel_size), _side(layer.stride)
             plain = min(kernel, stride) > 0 and _side(layer.padding) == 0 and _side(layer.dilation) == 1
             if not plain or getattr(layer, "groups", 1) != 1 or getattr(layer, "ceil_mode", False):

@@ -15,10 +15,9 @@ from hypogoal.core.compute import tensor
 from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble
 from hypogoal.hypotheses.networks import as_input, at_once, folded
-from hypogoal.hypotheses.pooling import LeanMaxPool2d
 from hypogoal.hypotheses.views import FullView
 
-WITHOUT_WEIGHTS = (nn.ReLU, LeanMaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
+WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
 
 
 class StackedMembers:
