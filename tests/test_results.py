@@ -1,6 +1,8 @@
 """Published tables are drawn from the committed cells (Spec F5, H7)."""
 
+import importlib
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import groupby
@@ -9,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders, one_room
 from studies.cells import collect_once, difference, interval, run_cells
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
     "distilled": distilled.tables,
@@ -66,7 +70,7 @@ def test_history_is_short_and_each_row_whole() -> None:
 def test_tables_of_the_readme_and_the_first_page_have_the_numbers_of_the_pages() -> None:
     """Every decimal in a table stands in a table of a page that its section links; the README's in any."""
     first = (RESULTS / "index.md").read_text(encoding="utf-8")
-    readme = (RESULTS.parents[1] / "README.md").read_text(encoding="utf-8")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
     tables = 0
     for section in (*first.split("\n## ")[2:], readme + " ".join(f"({name}.md)" for name in PAGES)):  # not the claims
         pages = {name for name in PAGES if f"({name}.md)" in section}
@@ -76,6 +80,25 @@ def test_tables_of_the_readme_and_the_first_page_have_the_numbers_of_the_pages()
         tables += bool(shown := _numbers(section))
         assert shown <= published, section.partition("\n")[0]
     assert tables >= 4
+
+
+def test_each_claim_of_the_paper_names_a_command_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An experiment lists what it would do (``--dry-run``), a study its arguments."""
+    monkeypatch.chdir(ROOT)
+    claims = (RESULTS / "index.md").read_text(encoding="utf-8").split("\n## ")[1].partition("\n### ")[0]
+    rows = [line.rstrip(" |").split("|") for line in claims.splitlines() if line.startswith("| ")][1:]
+    commands = {row[-1].strip(" `") for row in rows}
+    assert len(rows) == 10 and len(commands) >= 7
+    for command in commands:
+        runner, *words = command.split()
+        if runner == "hypogoal":
+            assert main([*words, "--dry-run", "--out", str(tmp_path / "out")]) == 0, command
+        else:
+            study = importlib.import_module(words[1])
+            monkeypatch.setattr(sys, "argv", [command, "--help"])
+            with pytest.raises(SystemExit, match="0"):
+                study.main()
+    assert not list(tmp_path.iterdir())
 
 
 def _numbers(text: str) -> set[str]:
