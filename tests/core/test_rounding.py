@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from hypogoal.core.rounding import above, at_least
-from hypogoal.diversity import ace
 from hypogoal.domains import montezuma_states
 from hypogoal.evaluation.curves import NEAR, SOLVED
 from hypogoal.hypotheses.thresholds import ENOUGH
@@ -35,7 +34,6 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
             NEAR,
             SOLVED,
             ENOUGH,
-            ace.LEAST_SHARE,
             *montezuma_states.KIND_SHARES.values(),
             montezuma_states.SPARE,
         ),

@@ -49,7 +49,7 @@ def confident(*classes: int, gap: float = 6.0) -> Tensor:
 def test_the_objectives_are_those_of_the_spec() -> None:
     """Spec C1."""
     assert set(PAIRED) < set(OBJECTIVES)
-    assert ENSEMBLES == ["ace", "dbat-unpaired", "divdis", "repulsive"]
+    assert ENSEMBLES == ["dbat-unpaired", "divdis"]
 
 
 @pytest.mark.parametrize("name", DIVERSE)
@@ -248,33 +248,6 @@ def test_divdis_moves_members_that_are_positive_everywhere() -> None:
         assert least <= float(gradient[..., 1].sum()) <= most
 
 
-def test_repulsive_is_the_kernels_own_repulsion() -> None:
-    """Its gradient by one member's gaps is the sum of the kernel's gradients over the kernel's sum."""
-    context = context_of(3, 5)
-    (gradient,) = torch.autograd.grad(load_objective("repulsive").losses(context).sum(), context.unlabelled)
-    gaps = (context.unlabelled[..., 1] - context.unlabelled[..., 0]).detach()
-    squared = (gaps[:, None] - gaps[None]).square().mean(-1)
-    width = squared[~torch.eye(3, dtype=torch.bool)].median() / math.log(3)
-    kernel = torch.exp(-squared / width)
-    for member in range(3):
-        away = sum(kernel[member, j] * -2 * (gaps[member] - gaps[j]) / 5 / width for j in range(3))
-        torch.testing.assert_close(gradient[member, :, 1], away / kernel[member].sum())
-    assert ensemble_loss("repulsive", context_of(1)) == 0.0
-
-
-def test_ace_asks_for_the_easiest_tenth_only() -> None:
-    """Of 20 states the two cheapest of each direction; the others get no gradient."""
-    generator = torch.Generator().manual_seed(1)
-    logits = torch.randn(2, 20, 2, generator=generator, dtype=torch.float64).requires_grad_()
-    loss = load_objective("ace").losses(replace(context_of(2, 20), unlabelled=logits)).sum()
-    log = torch.log_softmax(logits.detach(), -1)
-    costs = [-(log[0, :, 1] + log[1, :, 0]), -(log[1, :, 1] + log[0, :, 0])]
-    assert loss.item() == pytest.approx(sum(float(cost.sort().values[:2].mean()) for cost in costs))
-    (gradient,) = torch.autograd.grad(loss, logits)
-    asked = set(costs[0].argsort()[:2].tolist()) | set(costs[1].argsort()[:2].tolist())
-    assert set((gradient.abs().sum((0, 2)) > 0).nonzero().flatten().tolist()) == asked
-
-
 def test_the_double_sum_by_hand() -> None:
     """Eq. (1), Spec C4: each pair in training counts in both orders, pairs with frozen members once."""
     logits = torch.stack([torch.full((1, 2), float(value)) for value in (1, 2, 4)])
@@ -309,7 +282,7 @@ def test_a_function_of_one_argument_is_of_the_whole_ensemble(monkeypatch: pytest
 def test_an_unknown_objective_is_one_clear_line() -> None:
     """Spec G2."""
     with pytest.raises(
-        UserError, match=r"unknown diversity objective: dbta\. Choose one of ace, dbat, dbat-unpaired, divdis"
+        UserError, match=r"unknown diversity objective: dbta\. Choose one of dbat, dbat-unpaired, divdis"
     ):
         load_objective("dbta")
 

@@ -24,7 +24,6 @@ CASES = {
         "threshold": "unlabelled-q95",
     },
     "changed shades": {"diversity": "none", "augment": "grey"},
-    **{name: {"diversity": name} for name in ("ace", "repulsive")},
 }
 
 
