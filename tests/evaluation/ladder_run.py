@@ -95,6 +95,8 @@ def write_members(out: Path, data: Path, groups: int, method: str, seed: int, **
         "network": "montezuma",
         "sub_goals": [SUB_GOAL],
         "observation_shape": list(SHAPE),
+        "observation_dtype": "uint8",
+        "view": "full",
         "domain": DOMAIN.name,
         "domain_config": {"groups": groups},
         **more,
