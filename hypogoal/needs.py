@@ -171,17 +171,12 @@ def judging_member(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -
     return 2 * member_bytes(network, shape, dtype)
 
 
-def baseline_needs(
-    observation: int, played: float, steps: int, chosen: PPOSettings | DQNSettings, members: float = 0.0
-) -> Needs:
-    """``train-baseline`` on observations of this many bytes, of which the engine keeps ``played`` bytes.
-
-    ``members`` are the bytes of the members that earn a bonus.
-    """
+def baseline_needs(observation: int, played: float, steps: int, chosen: PPOSettings | DQNSettings) -> Needs:
+    """``train-baseline`` on observations of this many bytes, of which the engine keeps ``played`` bytes."""
     replays = isinstance(chosen, DQNSettings)
     state = 2.0 * observation * min(chosen.replay if isinstance(chosen, DQNSettings) else chosen.rollout, steps)
     learned = 2 * LEARNED * observation * chosen.batch * (1 + replays)  # with a replay the next states, too
-    memory = BASE + 100e6 + played + 2 * state + learned + members
+    memory = BASE + 100e6 + played + 2 * state + learned
     return Needs(memory, CHECKPOINTS * (replays * state + 50e6) + LOGS)
 
 

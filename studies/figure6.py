@@ -1,6 +1,7 @@
 """Figure 6 at the paper's budget: how soon agents solve a layout, in how many steps, and whether they lose it again.
 
 hypogoal sweep examples.figure6:figure6 --out runs/figure6
+python -m studies.bonus runs/figure6 docs/results/figure6-doorkey.csv
 python -m studies.figure6 runs/figure6 docs/results/figure6-doorkey.csv
 python -m studies.figure6 --tables docs/results/figure6-doorkey.csv
 python -m studies.figure6 --tables --picture docs/results/figure6.png docs/results/figure6-doorkey.csv
@@ -9,7 +10,7 @@ python -m studies.figure6 --tables --picture docs/results/figure6.png docs/resul
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ METHODS = {
     "literal-none": "the same, networks without memory",
 }
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
+Agents = dict[tuple[str, str], list[dict[str, str]]]  # their rows, by method and layout
 POINTS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1000, 1250, 1500)  # thousands of steps: of a curve
 LINES = {  # colour, dashes
     "dbat-k3": ("#0b5394", "-"),
@@ -57,24 +59,34 @@ LINES = {  # colour, dashes
 
 def collect(run: Path, path: Path) -> None:
     """A row for every number of every finished agent, those that are there first."""
-    rows_of: dict[tuple[str, ...], list[dict[str, str]]] = {}
-    if path.exists():
-        for row in read_rows(path):
-            rows_of.setdefault((row["method"], row["layout"]), []).append(row)
+    agents = read_agents(path)
     for kind in ("meta", "baseline"):
         for artefact in find_artefacts(run, kind):
             read = read_run(artefact, artefact.path.name)
             method = method_of(read.config, artefact.path.name)
-            key = (method, str(read.layout["layout_seed"]))
-            if key not in rows_of:
-                key_columns = dict(zip(COLUMNS, (*key, str(read.seed)), strict=False))
-                rows_of[key] = [
-                    key_columns | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"}
-                    for chooser, name, value in _numbers(artefact, read)
-                ]
+            agent = (method, str(read.layout["layout_seed"]))
+            if agent in agents:
+                continue
+            agents[agent] = training_rows(method, read)
+            if kind == "meta":
+                agents[agent] += _rows(method, read, _frozen_numbers(artefact, read))
+    write_agents(path, agents)
+
+
+def read_agents(path: Path) -> Agents:
+    """The rows that are there."""
+    agents: Agents = {}
+    if path.exists():
+        for row in read_rows(path):
+            agents.setdefault((row["method"], row["layout"]), []).append(row)
+    return agents
+
+
+def write_agents(path: Path, agents: Agents) -> None:
+    """All rows, by method and layout."""
     order = list(METHODS)
-    places = sorted(rows_of, key=lambda key: (order.index(key[0]), int(key[1])))
-    write_rows(path, COLUMNS, [row for place in places for row in rows_of[place]])
+    places = sorted(agents, key=lambda agent: (order.index(agent[0]), int(agent[1])))
+    write_rows(path, COLUMNS, [row for place in places for row in agents[place]])
 
 
 def method_of(config: Mapping[str, Any], place: str) -> str:
@@ -83,11 +95,21 @@ def method_of(config: Mapping[str, Any], place: str) -> str:
         return "oracle"
     if config.get("network") == "paper":
         return "literal" if config.get("recurrence") != "none" else "literal-none"
-    return "ppo-bonus" if config.get("bonus") else next(name for name in METHODS if f"-{name}-" in f"-{place}-")
+    return next(name for name in METHODS if f"-{name}-" in f"-{place}-")
 
 
-def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
-    """Chooser, quantity and value of one agent: of its training, and of frozen play where it chooses options."""
+def training_rows(method: str, run: Run) -> list[dict[str, str]]:
+    """The rows of one agent's training."""
+    return _rows(method, run, _training_numbers(run))
+
+
+def _rows(method: str, run: Run, numbers: Iterable[tuple[str, str, float]]) -> list[dict[str, str]]:
+    agent = {"method": method, "layout": str(run.layout["layout_seed"]), "seed": str(run.seed)}
+    return [agent | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"} for chooser, name, value in numbers]
+
+
+def _training_numbers(run: Run) -> Iterator[tuple[str, str, float]]:
+    """Chooser, quantity and value of one agent's training."""
     shortest = run.layout["shortest_path"]
     numbers = run_numbers(run.episodes, shortest)
     reached = numbers["steps_to_95"]
@@ -101,14 +123,18 @@ def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
         seen = run.episodes.at(run.episodes.step <= step).last()
         yield "agent", f"success_at_{step}", float(seen.succeeded.mean())
         yield "agent", f"length_at_{step}", float(seen.length.mean()) / shortest
-    if artefact.kind == "meta":
-        loop = agent_of(artefact, run.seed, ENVIRONMENTS)
-        choosers = {"frozen": loop.chooser, UNIFORM: RandomChooser(rng_for(run.seed, "uniform-choice"))}
-        for name, chooser in choosers.items():
-            episodes = play(loop, chooser)
-            for quantity in ("success", "near"):
-                yield name, quantity, float(episodes.scores(shortest)[quantity].mean())
-            yield name, "length_over_shortest", float(episodes.length.mean()) / shortest
+
+
+def _frozen_numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
+    """The same of play without learning: of its own choice, and of uniform-random choice among its options."""
+    shortest = run.layout["shortest_path"]
+    loop = agent_of(artefact, run.seed, ENVIRONMENTS)
+    choosers = {"frozen": loop.chooser, UNIFORM: RandomChooser(rng_for(run.seed, "uniform-choice"))}
+    for name, chooser in choosers.items():
+        episodes = play(loop, chooser)
+        for quantity in ("success", "near"):
+            yield name, quantity, float(episodes.scores(shortest)[quantity].mean())
+        yield name, "length_over_shortest", float(episodes.length.mean()) / shortest
 
 
 def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: float | None) -> float:

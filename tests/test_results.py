@@ -150,9 +150,8 @@ def test_agents_of_figure_6_are_told_apart() -> None:
     place = "method-dbat-k3-layout-300-seed-3000"
     assert figure6.method_of({}, place) == "dbat-k3"
     assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
-    assert figure6.method_of({"bonus": 0.1}, place) == "ppo-bonus"
     assert figure6.method_of({"network": "paper"}, "meta") == "literal"
-    assert figure6.method_of({"bonus": 0.0}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
+    assert figure6.method_of({}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:

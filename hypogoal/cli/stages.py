@@ -92,13 +92,10 @@ def train_baseline(
     call: cli.StageCall,
     domain: cli.DomainName,
     data: Annotated[Path | None, Option(help="Play in the world where these states were collected.")] = None,
-    ensemble: Annotated[
-        Path | None, Option(help="Pay --set bonus=X for a member's first positive prediction in an episode.")
-    ] = None,
     tensorboard: cli.Tensorboard = None,
 ) -> None:
     """Train PPO or DQN on primitive actions, to compare."""
-    numbers = call.make(domain, data=data, ensemble=ensemble, tensorboard=tensorboard)
+    numbers = call.make(domain, data=data, tensorboard=tensorboard)
     call.end(numbers, "evaluate", call.out.parent)
 
 

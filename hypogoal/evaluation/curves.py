@@ -191,7 +191,7 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = LAS
 def base_name(kind: str, config: Mapping[str, Any]) -> str:
     """Spec E6, E7: an agent's name: how it chooses and what ends its options."""
     if kind == "baseline":
-        return f"{config['agent'].upper()} {config['setting']}" + (", bonus" if config.get("bonus") else "")
+        return f"{config['agent'].upper()} {config['setting']}"
     if kind == "options":
         return PRETRAINING
     chooser, oracle = config["chooser"], config["termination"] == "oracle"

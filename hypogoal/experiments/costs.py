@@ -13,7 +13,7 @@ from hypogoal.core.terminal import amount
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
-from hypogoal.needs import BASE, baseline_needs, ensemble_process, judging, judging_member, play_needs
+from hypogoal.needs import BASE, baseline_needs, ensemble_process, judging, play_needs
 from hypogoal.settings import configuration
 
 LONG_SECONDS = 3600.0  # above this the user is asked first
@@ -85,10 +85,8 @@ class Estimates:
         }
         if cell.stage == "train-baseline":
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
-            judges = len(ensemble["sub_goals"]) * ensemble["members"] if source else 0
-            members = judges * judging_member(ensemble["network"], shape, dtype)
             played, chosen = domain.played_bytes(config.steps, 0), HYPERPARAMETERS[config.agent, config.setting]
-            needs = baseline_needs(domain.observation_bytes, played, config.steps, chosen, members)
+            needs = baseline_needs(domain.observation_bytes, played, config.steps, chosen)
             return Cost(seconds, needs.memory)
         for start in config.start.split(","):
             domain.rooms_of(start)  # an unknown start is a UserError

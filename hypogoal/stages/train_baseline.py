@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim, open_artefact
+from hypogoal.core.artefacts import claim
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
@@ -13,8 +13,8 @@ from hypogoal.core.training import training
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain, require_one_kind
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
-from hypogoal.meta.training import check_start, cut, judged, played_world, write_layout
-from hypogoal.needs import baseline_needs, judging_member
+from hypogoal.meta.training import check_start, cut, played_world, write_layout
+from hypogoal.needs import baseline_needs
 from hypogoal.options.tables import Episodes
 
 
@@ -24,7 +24,6 @@ def train_baseline(
     out: Path,
     *,
     data: Path | None = None,
-    ensemble: Path | None = None,
     seed: int = 0,
     force: bool = False,
     resume: bool = False,
@@ -34,30 +33,19 @@ def train_baseline(
 ) -> dict[str, Any]:
     """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
 
-    With ``data``, states of the domain, it plays in the world they are of; without, in that of the ``ensemble``, whose
-    members' positive predictions earn the bonus; else in that of the domain's defaults.
+    With ``data``, states of the domain, it plays in the world they are of; else in that of the domain's defaults.
     ``tensorboard``, a folder, gets the numbers of the log.
-    Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states or
-    an ensemble of another domain, a bonus without an ensemble or the other way round, or an ``out`` that exists is a
-    ``UserError``, NaN or Inf in a weight a ``NumericalError``.
+    Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states of
+    another domain, or an ``out`` that exists is a ``UserError``, NaN or Inf in a weight a ``NumericalError``.
     """
     from hypogoal.learners.baselines.agents import train, weights
-    from hypogoal.learners.baselines.engine_env import Bonus, EngineEnv
+    from hypogoal.learners.baselines.engine_env import EngineEnv
 
     device = prepare(device)
-    if ensemble and not config.bonus:
-        raise UserError("an ensemble without a bonus changes nothing", ensemble, "Give --set bonus=0.1 too.")
-    if config.bonus and not ensemble:
-        fault = "a bonus is paid where an ensemble's members are positive"
-        raise UserError(fault, f"bonus={config.bonus:g}", "Give --ensemble too, or leave bonus out.")
-    taught = open_artefact(ensemble, "ensemble").whole() if ensemble else None
-    if taught and taught.config["domain"] != domain:
-        fault = f"this ensemble is for {taught.config['domain']!r}, not for {domain!r}"
-        raise UserError(fault, taught.path, "Name its domain.")
-    inputs = [path for path in (data, ensemble) if path]
+    inputs = [data] if data else []
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, by_user=True)
-    lived: dict[str, Any] = played.world(taught.config["domain_config"]) if taught else {}
+    lived: dict[str, Any] = {}
     if data:
         dataset = open_dataset(data)
         if dataset.domain != domain:
@@ -77,22 +65,14 @@ def train_baseline(
     require_one_kind(engine)
     if data and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
-    judges = 0.0
-    if taught:
-        members = len(taught.config["sub_goals"]) * taught.config["members"]
-        judges = members * judging_member(taught.config["network"], engine.observation_shape, engine.observation_dtype)
     size = EngineEnv(engine).observation_space.sample().nbytes
-    needs = baseline_needs(size, played.played_bytes(config.steps, 0), config.steps, chosen, judges)
+    needs = baseline_needs(size, played.played_bytes(config.steps, 0), config.steps, chosen)
     settings = as_dict(config) | {"domain": domain, "domain_config": world}
     settings |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
     artefact: dict[str, Any] = {"kind": "baseline", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
     with training("train-baseline", out, needs, **how, **artefact) as work:
-        bonus = None
-        if taught:
-            terminations = judged(engine, taught.path, taught.config, device)
-            bonus = Bonus(terminations.of, terminations.options, engine.count, config.bonus, terminations)
-        env = EngineEnv(engine, bonus)
+        env = EngineEnv(engine)
         agent = train(env, chosen, config.steps, seed, work.log, work.progress, work.checkpoints, device)
         work.progress.update(config.steps)
         Episodes.of_rows(env.episodes).write(work.folder)

@@ -150,7 +150,7 @@ def test_settings_of_run_are_the_signatures() -> None:
     assert rows["oracle"]["type"] == "bool" and "workers" in rows and "evaluate" in rows
 
 
-@pytest.mark.parametrize(("name", "count"), [("figure6", 143), ("preference", 139), ("choosing_baselines", 23)])
+@pytest.mark.parametrize(("name", "count"), [("figure6", 133), ("preference", 139), ("choosing_baselines", 23)])
 def test_the_examples_are_experiments(monkeypatch: pytest.MonkeyPatch, name: str, count: int) -> None:
     """The functions in examples/."""
     monkeypatch.chdir(ROOT)

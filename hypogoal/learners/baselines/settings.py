@@ -77,12 +77,6 @@ class BaselineConfig(WorldConfig):
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
     environments: int = setting(0, "environments stepped together; 0 for the setting's own", low=0, high=4096)
-    bonus: float = setting(
-        0.0,
-        "reward for the first time in an episode that a member of --ensemble is positive; 0 for none",
-        source="ours: a flat agent with the same knowledge",
-        low=0.0,
-    )
     # Last, because from here on the name means this field.
     setting: str = setting(
         "tuned",
