@@ -20,7 +20,7 @@ from hypogoal.dataset import NUMBERS, PICTURE, fields_of, open_dataset, values_i
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
-from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig, layout_seeds
+from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.recording import STOPS_KEPT
 
 if TYPE_CHECKING:
@@ -31,9 +31,6 @@ MEMBER = 8e6  # weights of a member with the user's network, which is not run
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 LIGHT_POLICIES = 1e6  # weights of all light policies, most of them shared; 0.4 MB for 15 options, 0.7 with a grid
 COPIES = 5  # of weights in training: the weights, a target, gradients, Adam's two moments
-PLANNED_LAYOUT = 3_000  # states of a layout in the plans of distilled options: DoorKey's
-PLANNED_STATE = 150  # bytes of one, with what the engine keeps of it; and per option
-PLANNED_OPTION = 6  # bytes: a member's log-odds, the best actions
 PER_TRANSITION = 50  # bytes in a replay, with its sum tree
 CHECKPOINTS = 2  # on disk: the old one stays until the new one is whole
 LOGS = 5e6
@@ -149,13 +146,10 @@ def play_needs(domain: Domain, ensemble: dict[str, Any], config: TrainOptionsCon
     picture, shape, dtype = domain.observation_bytes, domain.observation_shape, domain.observation_dtype
     paper = config.network == "paper"
     replays = options if paper else 1
-    embedding = 0.0 if config.embedding in ("auto", "grid", "deep") else member_bytes(config.embedding, shape, dtype)
+    embedding = 0.0 if config.embedding == "auto" else member_bytes(config.embedding, shape, dtype)
     weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + embedding
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     replay = config.replay * PER_TRANSITION
-    if config.network == "distilled":
-        planned = len(layout_seeds(config.layouts, config.layout_seed)) * isinstance(config, TrainOptionsConfig)
-        replay = planned * PLANNED_LAYOUT * (PLANNED_STATE + PLANNED_OPTION * options)
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * replay + COPIES * weights + kept
     classifiers = sub_goals * members * judging_member(ensemble.get("network", "auto"), shape, dtype)

@@ -55,7 +55,7 @@ def test_the_memory_said_for_own_data_is_what_they_take(tmp_path: Path, shape: t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ensemble", "options", "distilled", "meta", "descent", "ppo", "dqn"])
+@pytest.mark.parametrize("name", ["ensemble", "options", "meta", "descent", "ppo", "dqn"])
 def test_the_memory_said_is_what_it_takes(tmp_path: Path, name: str) -> None:
     """Spec G1: at toy scale, where most of it is the libraries; they are most of it at the demo's scale too."""
     for part in needed([name]):

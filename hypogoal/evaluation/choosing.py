@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 LEAST = 20.0  # expected choices of a member, below which its preference is not told
 DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to choose
-MEMORYLESS = ("light", "planned", "distilled")  # option policies that can be asked in any state
+MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
 TITLE = "What choosing is worth"

@@ -26,10 +26,10 @@ class MetaConfig:
 
     meta_network: str = setting(
         "light",
-        "light, a small network on cells; grid or deep, as the options' embedding, for many layouts; or the paper's "
-        "three convolutions",
+        "light, a small network on cells; the paper's three convolutions; or the light one with an own embedding",
         source="paper: three convolutions; the others: ours",
-        choices=("light", "grid", "deep", "paper"),
+        choices=("light", "paper"),
+        own=True,
     )
     head: str = setting(
         "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")

@@ -2,33 +2,29 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hypogoal.dataset import Standard
-from hypogoal.hypotheses.networks import AUTO
-from hypogoal.options.networks import DEEP, GRID, WIDTH, CellEmbedding, LightNetwork, NumberEmbedding, embedding_for
+from hypogoal.options.networks import WIDTH, CellEmbedding, Embedding, LightNetwork, NumberEmbedding, OwnEmbedding
 
 
 class LightMetaNetwork(LightNetwork):
-    """Cells, or numbers where there is a ``standard`` of them, or an ``embedding``; two dense layers, actor, critic."""
+    """Cells, or numbers where there is a ``standard`` of them, or an own embedding; two dense layers, actor, critic."""
 
     def __init__(
-        self,
-        observation_shape: tuple[int, ...],
-        options: int,
-        standard: Standard | None = None,
-        embedding: str = AUTO,
+        self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None, name: str = "light"
     ):
-        if embedding != AUTO:
-            super().__init__(embedding_for(observation_shape, standard, embedding, "meta_network"))
+        embedding: Embedding
+        if name != "light":
+            embedding = OwnEmbedding(name, observation_shape, standard)
         elif standard is not None:
-            super().__init__(NumberEmbedding(observation_shape, standard))
+            embedding = NumberEmbedding(observation_shape, standard)
         else:
-            super().__init__(CellEmbedding(observation_shape))
+            embedding = CellEmbedding(observation_shape)
+        super().__init__(embedding)
         self.outputs = nn.Linear(WIDTH, options + 1)
         _quiet_start(self.outputs)
 
@@ -154,9 +150,12 @@ class GaussianHead(Head):
 
 
 HEADS: dict[str, Callable[[int], Head]] = {"categorical": CategoricalHead, "gaussian": GaussianHead}
-NETWORKS: dict[str, Callable[[tuple[int, ...], int, Standard | None], nn.Module]] = {
-    "light": LightMetaNetwork,
-    GRID: partial(LightMetaNetwork, embedding=GRID),
-    DEEP: partial(LightMetaNetwork, embedding=DEEP),
-    "paper": PaperMetaNetwork,
-}
+
+
+def meta_network(
+    name: str, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None
+) -> LightMetaNetwork | PaperMetaNetwork:
+    """The network of this ``name``: ``light``, ``paper``, or ``module:function``, as a light network's embedding."""
+    if name == "paper":
+        return PaperMetaNetwork(observation_shape, options, standard)
+    return LightMetaNetwork(observation_shape, options, standard, name)

@@ -19,7 +19,7 @@ from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.networks import HEADS, NETWORKS
+from hypogoal.meta.networks import HEADS, meta_network
 from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
 from hypogoal.options.config import OptionConfig
@@ -64,7 +64,7 @@ class MetaPolicy(Chooser):
         self.device = torch.device(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "meta-weights"))
-            network = NETWORKS[config.meta_network](engine.observation_shape, options, engine.standard)
+            network = meta_network(config.meta_network, engine.observation_shape, options, engine.standard)
             self.network = network.to(self.device)
             self.head = HEADS[config.head](options).to(self.device)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head})

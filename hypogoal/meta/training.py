@@ -311,7 +311,7 @@ def write_trained(
         loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
         loop.visited.write(folder, domain, ensemble_config, seed)
-    save_tensors(folder / loop.learner.FILE, loop.learner.state() | loop.terminations.state())
+    save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
     if weights := loop.chooser.state():
         save_tensors(folder / loop.chooser.FILE, weights)
     places = {"start": config.start, "layouts": config.layouts.strip()}

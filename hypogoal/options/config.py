@@ -17,24 +17,18 @@ class OptionConfig:
         "network=planned": (
             *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
             *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
-            *("exploration", "epsilon_steps", "epsilon_final", "epsilon_from", "rate_steps", "recurrence"),
+            *("exploration", "epsilon_steps", "epsilon_final", "epsilon_from", "recurrence"),
         ),
-        "network=distilled": (
-            *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "positives", "experience"),
-            *("target_interval", "target_tau", "n_step", "epsilon_steps", "epsilon_final", "epsilon_from"),
-            "recurrence",
-        ),
-        "network=light": ("rate_steps", "recurrence"),
-        "network=paper": ("positives", "rate_steps"),
+        "network=light": ("recurrence",),
+        "network=paper": ("positives",),
     }
 
     network: str = setting(
         "light",
         "Q-network: light, a small one on cells; paper, a conv-GRU; or, where an engine knows what each action leads "
-        "to: planned, the shortest path; distilled, a light network that learns such paths in 'layouts' and is played "
-        "in others",
+        "to: planned, the shortest path",
         source="paper, appendix; the others: ours",
-        choices=("light", "paper", "planned", "distilled"),
+        choices=("light", "paper", "planned"),
         own=True,
     )
     recurrence: str = setting(
@@ -52,9 +46,8 @@ class OptionConfig:
     )
     embedding: str = setting(
         "auto",
-        "how the light network reads observations: cells, convolutions or numbers, whichever suits them; grid, cells "
-        "with convolutions over them, for many layouts; deep, more of them and attention; or a member network's "
-        "layers, by name or as module:function",
+        "how the light network reads observations: cells, convolutions or numbers, whichever suits them; or a member "
+        "network's layers, by name or as module:function",
         source="ours",
     )
     experience: str = setting(
@@ -84,9 +77,6 @@ class OptionConfig:
     option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
     positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
     option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
-    rate_steps: int = setting(
-        60_000, "steps until Adam's step size has fallen to a twentieth; 0: it stays (distilled)", unit="steps", low=0
-    )
     target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
     target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
     n_step: int = setting(

@@ -27,7 +27,6 @@ from hypogoal.options.termination import ORACLE, Terminations
 COUNTERS = ("option_steps", "steps_since_positive")
 LEARNERS = {
     "light": "hypogoal.options.light:LightLearner",
-    "distilled": "hypogoal.options.distilled:DistilledLearner",
     "paper": "hypogoal.options.recurrent:RecurrentLearner",
     "planned": "hypogoal.options.planned:PlannedLearner",
 }
@@ -79,9 +78,7 @@ class Learner(Part, ABC):
     """The intra-option policies of all O options.
 
     Attributes:
-        FILE: what an artefact calls the file of its :meth:`state`.
         NEEDS: settings that must have this value.
-        ONCE: whether it learns in one run of ``train-options`` alone, and is only played afterwards.
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
         steps_since_positive: int64 (O,), those since the first one of these, also in a run that this one continues.
@@ -90,9 +87,7 @@ class Learner(Part, ABC):
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    FILE: ClassVar[str] = "options.safetensors"
     NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO}
-    ONCE: ClassVar[bool] = False
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *COUNTERS)
 
     def __init__(

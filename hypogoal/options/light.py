@@ -28,8 +28,6 @@ from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
 from hypogoal.options.networks import (
-    DEEP,
-    GRID,
     LightQNetwork,
     PictureEmbedding,
     Pixels,
@@ -230,7 +228,7 @@ class LightPolicies:
         embedding = config.get("embedding", AUTO)
         standard = standard_in(weights, saved.shape)
         make = partial(LightQNetwork, saved.shape, saved.count, actions, standard, embedding)
-        custom = embedding not in (AUTO, GRID, DEEP, *NETWORKS)
+        custom = embedding not in (AUTO, *NETWORKS)
         self.network = load_fitting(make, weights, "options.safetensors", custom=custom)
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

@@ -16,24 +16,25 @@ from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
 
 CELL = 8  # pixels
-GRID, DEEP = "grid", "deep"  # the embeddings of these names
 WIDTH = 128  # of dense layers
 SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
 
 class CellEmbedding(nn.Module):
-    """A convolution whose kernel and stride are one cell (8 pixels), to ``channels`` features each, then ReLU.
+    """A convolution whose kernel and stride are one cell (8 pixels), to ``CHANNELS`` features each, then ReLU.
 
     Images made of few distinct tiles are looked up: each tile is convolved once, its features gathered by tile code.
     The values and gradients are the same. An image that whole cells do not fill is continued in black.
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], channels: int = 8):
+    CHANNELS = 8
+
+    def __init__(self, observation_shape: tuple[int, ...]):
         super().__init__()
         height, width, depth = observation_shape
-        self.conv = nn.Conv2d(depth, channels, CELL, stride=CELL)
+        self.conv = nn.Conv2d(depth, self.CHANNELS, CELL, stride=CELL)
         self._more = (0, 0, 0, -width % CELL, 0, -height % CELL)  # no channels; columns and rows behind the last
-        self.features = channels * -(-height // CELL) * -(-width // CELL)
+        self.features = self.CHANNELS * -(-height // CELL) * -(-width // CELL)
         self._tiles: NDArray[np.uint8] | None = None
         self._pixels = torch.empty(0)
 
@@ -42,7 +43,7 @@ class CellEmbedding(nn.Module):
         if any(self._more):
             images = nn.functional.pad(images, self._more)
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return self.across(torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1))
+        return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 
     def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
         """The same from tile codes, integers (N, cells), and the tiles uint8 (T, 8, 8, C) that they stand for."""
@@ -52,62 +53,7 @@ class CellEmbedding(nn.Module):
             self._pixels = pixels.permute(0, 3, 1, 2).flatten(1).float() / 255.0
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
         # index_select, not embedding: the same, and its gradient takes a sixth of the time.
-        return self.across(table.index_select(0, codes.flatten().long()).view(len(codes), -1))
-
-    def across(self, features: Tensor) -> Tensor:
-        """Further layers over all cells' features (N, features); none by default."""
-        return features
-
-
-class GridEmbedding(CellEmbedding):
-    """Whole cells, and ``LAYERS`` residual convolutions of 3 x 3 over their features: the same rule in every place.
-
-    For options that meet many layouts: docs/results/many-layouts.md.
-    """
-
-    CHANNELS, LAYERS = 16, 2
-
-    def __init__(self, observation_shape: tuple[int, ...]):
-        super().__init__(observation_shape, self.CHANNELS)
-        self._cells = (observation_shape[0] // CELL, observation_shape[1] // CELL, self.CHANNELS)
-        self.layers = nn.ModuleList(nn.Conv2d(self.CHANNELS, self.CHANNELS, 3, padding=1) for _ in range(self.LAYERS))
-
-    def across(self, features: Tensor) -> Tensor:
-        # Channels stay last in memory, where the look-up puts them: of 256 states a layer takes half the time.
-        grid = features.view(-1, *self._cells).permute(0, 3, 1, 2)
-        for layer in self.layers:
-            grid = grid + torch.relu(layer(grid))
-        return grid.permute(0, 2, 3, 1).flatten(1)
-
-
-class DeepEmbedding(CellEmbedding):
-    """Whole cells with their places, ``LAYERS`` residual convolutions of 3 x 3, and what ``HEADS`` queries read there.
-
-    A query's weights over cells, a softmax, ask where something is; the mean over all cells is read, too. For options
-    distilled from plans: docs/results/distilled.md.
-    """
-
-    CHANNELS, LAYERS, HEADS, CONTRAST = 24, 6, 4, 10.0
-
-    def __init__(self, observation_shape: tuple[int, ...]):
-        super().__init__(observation_shape, self.CHANNELS)
-        self._cells = (observation_shape[0] // CELL, observation_shape[1] // CELL)
-        self.place = nn.Parameter(torch.zeros(1, self.CHANNELS, *self._cells))
-        self.layers = nn.ModuleList(nn.Conv2d(self.CHANNELS, self.CHANNELS, 3, padding=1) for _ in range(self.LAYERS))
-        self.query = nn.Linear(self.CHANNELS, self.HEADS)
-        self.features = self.CHANNELS * (self.HEADS + 1)
-        # With the usual small weights all cells look alike at first, and learning stands still for 200 updates.
-        with torch.no_grad():
-            self.conv.weight.mul_(self.CONTRAST)
-            self.query.weight.normal_()
-
-    def across(self, features: Tensor) -> Tensor:
-        grid = features.view(-1, *self._cells, self.CHANNELS).permute(0, 3, 1, 2) + self.place
-        for layer in self.layers:
-            grid = grid + torch.relu(layer(grid))
-        cells = grid.permute(0, 2, 3, 1).flatten(1, 2)
-        read = self.query(cells).softmax(1).transpose(1, 2) @ cells
-        return torch.cat([read.flatten(1), cells.mean(1)], 1)
+        return table.index_select(0, codes.flatten().long()).view(len(codes), -1)
 
 
 class PictureEmbedding(nn.Module):
@@ -174,22 +120,12 @@ def standard_in(weights: Mapping[str, Tensor], shape: tuple[int, ...]) -> Standa
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
 
 
-def embedding_for(
-    observation_shape: tuple[int, ...],
-    standard: Standard | None = None,
-    name: str = AUTO,
-    setting: str = "embedding",
-) -> Embedding:
-    """The embedding of this ``name``, a ``setting``'s value; a ``UserError`` where the observations do not suit it.
+def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None, name: str = AUTO) -> Embedding:
+    """The embedding of this ``name``; a ``UserError`` where the observations do not suit it.
 
     ``auto`` is numbers where there is a ``standard``, else cells, or convolutions where whole cells do not fill the
     image.
     """
-    if name in (GRID, DEEP):
-        if standard is not None or any(side % CELL for side in observation_shape[:2]):
-            fault = f"only pictures that whole cells of {CELL} x {CELL} pixels fill have a grid"
-            raise UserError(fault, f"{setting}={name}, observations {observation_shape}", f"Leave {setting} out.")
-        return (GridEmbedding if name == GRID else DeepEmbedding)(observation_shape)
     if name != AUTO:
         return OwnEmbedding(name, observation_shape, standard)
     if standard is not None:

@@ -9,7 +9,6 @@ from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, open_artefact
 from hypogoal.core.compute import prepare
-from hypogoal.core.errors import UserError
 from hypogoal.core.training import training
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainMetaConfig
@@ -23,7 +22,6 @@ from hypogoal.meta.training import (
     write_trained,
 )
 from hypogoal.needs import play_needs
-from hypogoal.options.learner import load_learner
 from hypogoal.options.tables import Episodes
 
 FIXED = (  # as of the options trained before
@@ -56,9 +54,6 @@ def train_meta(
     practice = open_artefact(options, "options").whole() if options else None
     if practice:
         check_fit(practice, source, config, FIXED)
-    elif load_learner(config.network).ONCE:
-        fault = "these options learn in train-options alone"
-        raise UserError(fault, f"network={config.network}", "Train them there, then give --options.")
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])

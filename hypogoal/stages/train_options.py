@@ -5,7 +5,6 @@ from typing import Any
 
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.compute import prepare
-from hypogoal.core.errors import UserError
 from hypogoal.core.training import training
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainOptionsConfig
@@ -21,7 +20,6 @@ from hypogoal.meta.training import (
     write_trained,
 )
 from hypogoal.needs import play_needs
-from hypogoal.options.learner import load_learner
 
 # As of the options trained before.
 FIXED = ("network", "recurrence", "embedding", "termination")
@@ -50,9 +48,6 @@ def train_options(
     source = open_artefact(ensemble, "ensemble").whole()
     practice = open_artefact(options, "options").whole() if options else None
     if practice:
-        if load_learner(config.network).ONCE:
-            fault = "these options learn once and for all"
-            raise UserError(fault, f"network={config.network}", "Train them anew, without --options.")
         check_fit(practice, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)

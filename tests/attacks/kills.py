@@ -81,16 +81,6 @@ _ALL = (
         ("ensemble",),
     ),
     Stage(
-        "distilled",
-        (
-            *("train-options", "{ensemble}"),
-            *_set(
-                "network=distilled", "embedding=deep", "layouts=1000-1019", "steps=1000", "rate_steps=1000", *QUICK[1:]
-            ),
-        ),
-        ("ensemble",),
-    ),
-    Stage(
         "meta",
         (
             *("train-meta", "{ensemble}", "--options", "{options}"),

@@ -1,40 +1,204 @@
-"""The example of distilled options, by its own commands (Spec H6)."""
+"""The example of distilled options: what it learns, that it carries over, and its own commands (Spec H6)."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from corridor import Corridor
 from test_examples import settings
+from torch import Tensor
 
+import hypogoal
+from examples import distilled
+from examples.distilled import FINAL, PLANNED, VISITED, Deep, Grid, Learner
 from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.core.tensors import load_tensors
+from hypogoal.domains.base import Layouts
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.evaluation.choosing import qualities
+from hypogoal.meta.config import TrainOptionsConfig
+from hypogoal.meta.episodes import agent_of
+from hypogoal.options.choosers import Ids, RandomChooser
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.planned import FAR, PlannedLearner
+from hypogoal.options.recording import Recorder
+from hypogoal.options.termination import oracle_terminations
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "distilled.py"
+GOALS = 5
+GRID = "examples.distilled:Grid"
+QUICK: dict[str, Any] = {
+    "network": "examples.distilled:Learner", "embedding": GRID, "environments": 8, "option_batch": 64,
+    "update_interval": 8, "option_learning_rate": 2e-3, "steps": 3200,
+}  # fmt: skip
 SHORT = {  # appended to the page's commands, so that they end in seconds
     "collect": settings("heldout_layouts=1", "unlabelled_seeds=1"),
     "train-ensemble": settings("steps=2", "members=2", "workers=1"),
-    "train-options": settings("steps=640", "rate_steps=640", "layouts=1000-1002", "random_episodes=0"),
+    "train-options": settings("steps=640", "layouts=1000-1002", "random_episodes=0"),
     "train-meta": settings("steps=320", "random_episodes=0"),
     "evaluate": ["--layouts", "6000-6001"],
 }
 
 
+@pytest.fixture(autouse=True)
+def trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = (f"examples.distilled:{name}" for name in ("Learner", "Deep", "Grid"))
+    monkeypatch.setenv("HYPOGOAL_TRUST", ",".join(names))
+
+
+def loop_of(engine: Any, kind: type[Learner] = Learner) -> OptionLoop:
+    ends, config = oracle_terminations(engine, range(GOALS)), TrainOptionsConfig(**QUICK)
+    learner, recorder = kind(engine, ends, config, seed=0), Recorder(GOALS, engine)
+    return OptionLoop(engine, ends, learner, RandomChooser(rng_for(0, "c")), recorder, config, gamma=1.0)
+
+
+def layouts(*seeds: int) -> Layouts:
+    return Layouts(seeds, rng_for(0, "layouts"))
+
+
+class Aimless(Learner):
+    """Random actions, of those that plans know."""
+
+    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
+        return self.rng.choice(self.actions, len(ids))
+
+
+def arrival(kind: type[Learner], state: Mapping[str, Tensor], seed: int) -> float:
+    """How often greedy executions in a layout reach a sub-goal that can be had in time: the mean over sub-goals."""
+    loop = loop_of(DoorKeyEngine(seed, 1), kind)
+    loop.learner.load(state)
+    states = loop.engine.plan().ids[::20]
+    return float(np.nanmean(qualities(loop, np.arange(GOALS), states)))
+
+
+def test_options_carry_over_to_layouts_that_nobody_played() -> None:
+    """Distilled from twelve layouts, they reach their sub-goals in others twice as often as random actions do."""
+    loop = loop_of(DoorKeyEngine(layouts(*range(1000, 1012)), 8))
+    for _ in range(400):
+        loop.step()
+    state = loop.learner.state()
+    distilled_options, random_actions = (
+        np.array([arrival(kind, state, seed) for seed in range(6000, 6004)]) for kind in (Learner, Aimless)
+    )
+    assert (distilled_options > random_actions).all()
+    assert distilled_options.mean() > 2 * random_actions.mean()
+
+
+def test_what_it_learns_are_the_plans_best_actions() -> None:
+    """In every state of every layout played, all actions that a planned option may begin a shortest way with."""
+    loop = loop_of(DoorKeyEngine(layouts(3, 5), 8))
+    learner = loop.learner
+    assert isinstance(learner, Learner)
+    for _ in range(30):
+        loop.step()
+    for seed in (3, 5):
+        engine = DoorKeyEngine(seed)
+        ends = oracle_terminations(engine, range(GOALS))
+        planned = PlannedLearner(engine, ends, TrainOptionsConfig(network="planned"), 0)
+        theirs = engine.plan()
+        ours = learner.engine.plan(np.array([loop.engine._start(seed)]))
+        assert len(ours.ids) == len(theirs.ids)
+        place = {row.tobytes(): number for number, row in enumerate(engine.codes(theirs.ids))}
+        same = np.array([place[row.tobytes()] for row in learner.engine.codes(ours.ids)])
+        ahead = planned.steps[planned._after[same]]  # (n, A, O)
+        nearest = ahead.min(1)
+        wanted = (ahead == nearest[:, None]) & (nearest < FAR)[:, None]
+        bits = learner.best[ours.ids].astype(np.int64)[:, None] >> learner.actions[:, None] & 1
+        assert np.array_equal(bits.astype(bool), wanted)
+        assert np.array_equal(learner.kind[ours.ids] == FINAL, ours.final)
+        assert (learner.kind[ours.ids[~ours.final]] >= PLANNED).all()
+    assert 0 < (learner.kind == VISITED).sum() < (learner.kind >= PLANNED).sum() / 4
+
+
+def test_while_it_learns_its_plan_plays_and_afterwards_its_network() -> None:
+    """Three tenths of the actions are random, which may be best by luck; then play needs no plan at all."""
+    loop = loop_of(DoorKeyEngine(layouts(3, 5, 7), 8))
+    learner, best = loop.learner, []
+    for _ in range(200):
+        loop._choose()
+        ids, options = loop.engine.ids.copy(), loop.option.copy()
+        moved = loop.advance()
+        chosen = learner.best[ids, options] >> moved.actions & 1
+        best += chosen[learner.best[ids, options] > 0].tolist()
+    assert 0.7 < np.mean(best) < 0.85
+    fresh = loop_of(DoorKeyEngine(layouts(11), 8))
+    fresh.learner.load(learner.state())
+    for _ in range(30):
+        assert fresh.step() == {}
+    assert len(fresh.learner.kind) == 0
+
+
+def test_it_goes_on_where_it_was() -> None:
+    """Spec G1: the same weights as without a break."""
+    whole, begun, resumed = (loop_of(DoorKeyEngine(layouts(3, 5), 8)) for _ in range(3))
+    for _ in range(20):
+        whole.step()
+    for _ in range(8):
+        begun.step()
+    resumed.restore(begun.snapshot())
+    for _ in range(12):
+        resumed.step()
+    for name, value in whole.learner.state().items():
+        assert torch.equal(value, resumed.learner.state()[name]), name
+
+
+def test_it_needs_a_model() -> None:
+    """One line of what, where and what to do."""
+    engine = Corridor(2)
+    config = TrainOptionsConfig(network="examples.distilled:Learner")
+    with pytest.raises(UserError, match=r"does not know what each action leads to: network=examples.distilled:Learner"):
+        Learner(engine, oracle_terminations(engine, (0,)), config, seed=0)
+
+
+def test_the_grid_has_one_rule_for_all_places() -> None:
+    """What it makes of a cell depends on the cells within two of it, wherever they are."""
+    torch.manual_seed(0)
+    pictures, tile = torch.zeros(3, 3, 80, 88), torch.rand(3, 8, 8)
+    pictures[1, :, 32:40, 32:40], pictures[2, :, 40:48, 48:56] = tile, tile
+    plain, first, second = Grid((80, 88, 3))(pictures).view(3, 16, 10, 11)
+    changed = (first - plain).abs().amax(0) > 0
+    assert changed[2:7, 2:7].sum() > 9 and changed.sum() == changed[2:7, 2:7].sum()
+    torch.testing.assert_close(first[:, 2:7, 2:7], second[:, 3:8, 4:9])
+
+
+def test_deep_sees_all_cells_and_where_they_are() -> None:
+    """What it reads anywhere changes with any cell, and with the place of the same picture."""
+    torch.manual_seed(0)
+    pictures, tile = torch.zeros(3, 3, 80, 88), torch.rand(3, 8, 8)
+    pictures[1, :, 72:, :8], pictures[2, :, 32:40, 32:40] = tile, tile
+    plain, corner, middle = Deep((80, 88, 3))(pictures)
+    assert len(plain) == 24 * 5
+    assert not torch.allclose(plain, corner, atol=1e-3) and not torch.allclose(corner, middle, atol=1e-3)
+
+
 def test_distilled_options_go_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec H6: from plans to play in other layouts, inside an engine and without it."""
-    text = EXAMPLE.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 40
+    """From plans to play in other layouts, inside an engine and without it; an agent over them, which is drawn."""
+    text = Path(distilled.__file__).read_text(encoding="utf-8").replace("\\\n", "")
+    assert len(text.splitlines()) <= 350
     monkeypatch.chdir(tmp_path)
     lines = [line.split() for line in text.splitlines() if line.startswith("    hypogoal ")]
     assert len(lines) == 5
     for words in lines:
-        assert main([*words[1:], *SHORT[words[1]], "-q"]) == 0, words
+        more = settings(f"meta_network={GRID}") if words[1] == "train-meta" else []
+        assert main([*words[1:], *SHORT[words[1]], *more, "-q"]) == 0, words
     metrics = json.loads(Path("runs/far/evaluation/metrics.json").read_text(encoding="utf-8"))
     assert metrics["zero_shot"]["layouts"] == [6000, 6001] and len(metrics["zero_shot"]["options"]) == 5 * 3
-    spec = importlib.util.spec_from_file_location("distilled", EXAMPLE)
-    assert spec is not None and spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    played = example.play(6100)
+    played = distilled.play(6100)
     assert len(played) == 10 and all("steps its" in line for line in played)
+    options, meta = (Path("runs/far") / name for name in ("options", "meta"))
+    learned, kept = (load_tensors(folder / "options.safetensors") for folder in (options, meta))
+    assert all(torch.equal(value, kept[name]) for name, value in learned.items() if name.startswith("online."))
+    loaded, loop = hypogoal.load_options(meta), agent_of(open_artefact(meta, "meta"), 0, 1)
+    ids = loop.engine.plan().ids[::97]
+    for option in range(loaded.count):
+        inside = loop.learner.act(ids, np.full(len(ids), option), np.zeros(len(ids), np.int64), explore=False)
+        outside = [loaded.policies(option)(image) for image in loop.engine.images(ids)]
+        assert inside.tolist() == outside

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import make_policies
@@ -128,51 +127,3 @@ def test_numbers_and_member_networks_by_name(monkeypatch: pytest.MonkeyPatch) ->
     network = LightQNetwork((24, 40, 3), 2, 7, embedding="tiles")
     assert network(torch.zeros(5, 24, 40, 3, dtype=torch.uint8)).shape == (5, 2, 7)
     assert network.cells.features == 64
-
-
-def test_the_grid_has_one_rule_for_all_places() -> None:
-    """Spec H6: what it makes of a cell depends on the cells within two of it, wherever they are."""
-    torch.manual_seed(0)
-    embedding, images = embedding_for((80, 88, 3), name="grid"), torch.zeros(3, 80, 88, 3, dtype=torch.uint8)
-    tile = torch.randint(256, (8, 8, 3), dtype=torch.uint8)
-    images[1, 32:40, 32:40], images[2, 40:48, 48:56] = tile, tile
-    plain, first, second = embedding(images).view(3, 10, 11, 16)
-    changed = (first - plain).abs().amax(2) > 0
-    assert changed[2:7, 2:7].sum() > 9 and changed.sum() == changed[2:7, 2:7].sum()
-    torch.testing.assert_close(first[2:7, 2:7], second[3:8, 4:9])
-
-
-def test_the_deep_embedding_sees_all_cells_and_where_they_are() -> None:
-    """Spec H6: what it reads anywhere changes with any cell, and with the place of the same picture."""
-    torch.manual_seed(0)
-    embedding, images = embedding_for((80, 88, 3), name="deep"), torch.zeros(3, 80, 88, 3, dtype=torch.uint8)
-    tile = torch.randint(256, (8, 8, 3), dtype=torch.uint8)
-    images[1, 72:, :8], images[2, 32:40, 32:40] = tile, tile
-    plain, corner, middle = embedding(images)
-    assert len(plain) == embedding.features == 120
-    assert not torch.allclose(plain, corner, atol=1e-3) and not torch.allclose(corner, middle, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["grid", "deep"])
-@pytest.mark.parametrize(("shape", "standard"), [((84, 84, 3), None), ((16,), (np.zeros(16), np.ones(16)))])
-def test_what_is_no_grid_is_refused(shape: tuple[int, ...], standard: object, name: str) -> None:
-    """Spec G2."""
-    with pytest.raises(UserError, match=rf"fill have a grid: embedding={name}, observations .* Leave embedding out"):
-        embedding_for(shape, standard, name)
-
-
-@pytest.mark.parametrize("embedding", ["grid", "deep"])
-def test_options_with_a_grid_play_out_of_their_weights(embedding: str) -> None:
-    """Spec D2, G2: the policies of an artefact prefer what the learner preferred."""
-    engine = DoorKeyEngine(3, 4)
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        engine.step(rng.integers(7, size=4))
-    learner = LightLearner(engine, oracle_terminations(engine, (0, 1)), OptionConfig(embedding=embedding), 0)
-    policies = make_policies(
-        {**LIGHT, "embedding": embedding}, learner.state(), {"observation_shape": engine.observation_shape}
-    )
-    ids = np.arange(engine.n_states)
-    for option in (0, 1):
-        greedy = learner.act(ids, np.full(len(ids), option), np.ones(len(ids)), explore=False)
-        assert greedy.tolist() == [policies(option)(image) for image in engine.images(ids)]

@@ -148,8 +148,7 @@ def test_choices_are_counted_per_window(tmp_path: Path) -> None:
     assert sum(int(row[6]) for row in rows) <= recorder.steps == 400
 
 
-@pytest.mark.parametrize("embedding", ["auto", "grid"])
-def test_the_tile_path_is_the_image_path(embedding: str) -> None:
+def test_the_tile_path_is_the_image_path() -> None:
     """Spec D2 (light): values and gradients from tile codes equal those from the images."""
     engine = DoorKeyEngine(3, 8)
     rng = np.random.default_rng(0)
@@ -157,7 +156,7 @@ def test_the_tile_path_is_the_image_path(embedding: str) -> None:
         engine.step(rng.integers(7, size=8))
     ids = np.arange(engine.n_states)
     torch.manual_seed(0)
-    network = LightQNetwork(engine.observation_shape, 15, 7, embedding=embedding)
+    network = LightQNetwork(engine.observation_shape, 15, 7)
     by_image = network(torch.from_numpy(engine.images(ids)))
     by_tile = apply_to_states(network, engine, ids)
     torch.testing.assert_close(by_tile, by_image)
