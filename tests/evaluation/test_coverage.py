@@ -1,4 +1,4 @@
-"""What the scores say of members whose knowledge is known."""
+"""What coverage says of members whose knowledge is known (Spec H1)."""
 
 from __future__ import annotations
 
