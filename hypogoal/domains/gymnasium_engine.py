@@ -14,7 +14,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest, mixed_type
 from hypogoal.domains.base import Layouts, Step, TurnEngine
-from hypogoal.domains.observations import Reading, reading_of, resized_picture
+from hypogoal.domains.observations import CLEARLY, Reading, reading_of, resized_picture
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
@@ -101,7 +101,7 @@ def reader_of(env: gymnasium.Env) -> Reader:
 
 
 def _reading(space: spaces.Box) -> Reading:
-    return reading_of(space.shape, space.dtype, float(np.max(space.high, initial=0)))
+    return reading_of(space.shape, space.dtype)
 
 
 def _is_picture(space: spaces.Space[Any]) -> bool:
@@ -130,11 +130,9 @@ def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
                 do = "Give a Dict with each picture under a key of its own, beside those of numbers."
                 raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
             if reading.fault:
-                if key:
-                    shown = reading.picture.expression() if reading.picture else "uint8 (H, W, C)"
-                    do = f"Under that key give {shown} of pictures, x.reshape(-1) of numbers."
-                    raise UserError(f"observations {reading.fault}", f"{key}, {part.dtype} {part.shape}", do)
-                raise UserError(f"observations {reading.fault}", f"{part.dtype} {part.shape}", _wrapped(reading, name))
+                label, received = key or name, f"{part.dtype} {part.shape}"
+                where = f"{label}, {received}" if label else received
+                raise UserError(f"observations {reading.fault}", where, CLEARLY)
             return Reader(part, reading.shape, PICTURE, key=name)
         doubt = doubt or reading.doubt
     try:
@@ -147,18 +145,6 @@ def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
     features = [(name if size == 1 else f"{name}[{place}]") if name else f"x{place}" for name, size, place in names]
     shape = (isinstance(space, spaces.Box) and space.shape) or (len(features),)
     return Reader(space, shape, NUMBERS, tuple(features), doubt=doubt)
-
-
-def _wrapped(reading: Reading, key: str) -> str:
-    """The wrappers that turn observations, or a dictionary's entry ``key``, into what they may be meant to be."""
-    numbers = "of numbers: env = gymnasium.wrappers.FlattenObservation(env)"
-    if reading.picture is None:
-        return f"Give pictures, uint8 (H, W, C); {numbers}"
-    function = reading.picture.expression()
-    if key:
-        function = function.replace("x", f"x[{key!r}]", 1)
-    box = f'gymnasium.spaces.Box(0, 255, {reading.picture.shape}, "uint8")'
-    return f"Of pictures: env = gymnasium.wrappers.TransformObservation(env, lambda x: {function}, {box}); {numbers}"
 
 
 def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:

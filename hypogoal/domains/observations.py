@@ -1,7 +1,6 @@
 """How an observation is read, by its shape and type (the table in docs/own-domain.md), and how pictures are resized.
 
-Environments and imported arrays share these rules. An ambiguous observation is refused, or comes with a warning; both
-name the expression that makes it a picture.
+Environments and imported arrays share these rules. An ambiguous observation is refused, or comes with a warning.
 """
 
 from __future__ import annotations
@@ -17,62 +16,45 @@ from PIL import Image
 from hypogoal.dataset import NUMBERS, PICTURE
 
 MOST_CHANNELS = 16  # an axis as short as this may hold channels or frames; the sides of a picture are longer
-
-
-class Arrangement(NamedTuple):
-    """How an observation becomes a picture (H, W, C) of ``shape``: ``cast`` to bytes, then its axes reordered.
-
-    ``axes`` are height and width, then those that become channels: frames, and colours last.
-    """
-
-    cast: str
-    axes: tuple[int, ...]
-    shape: tuple[int, ...]
-
-    def expression(self, *, batch: bool = False) -> str:
-        """As a Python expression of x, an observation, or with ``batch`` several (N, ...)."""
-        if self.axes == (0, 1):
-            return f"{self.cast}[..., None]"
-        if self.axes == (0, 1, 2):
-            return self.cast
-        axes = (0, *(axis + 1 for axis in self.axes)) if batch else self.axes
-        moved = f"{self.cast}.transpose{axes}"
-        return moved if len(self.axes) == 3 else f"{moved}.reshape{(-1, *self.shape) if batch else self.shape}"
-
-    def arrange(self, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Observations (N, ...) of bytes as pictures (N, H, W, C)."""
-        moved = values.transpose(0, *(axis + 1 for axis in self.axes))
-        return moved.reshape(len(values), *self.shape)
+CLEARLY = "Give pictures as uint8 (H, W, C), stacked frames among the channels, and numbers as one row of float32."
 
 
 class Reading(NamedTuple):
-    """How an observation is read: ``dtype`` PICTURE or NUMBERS, ``shape``, and the ``fault`` for which it is refused.
+    """How an observation is read.
 
-    ``doubt`` is a warning. With a fault or a doubt, ``picture`` is how it becomes a picture; None if that is unclear.
+    Attributes:
+        dtype: PICTURE or NUMBERS.
+        shape: what it becomes, (H, W, C) of a picture.
+        fault: why it is refused; empty if it is not.
+        doubt: a warning; empty if there is none.
+        axes: of a picture, its height and width, then those that become channels: frames, and colours last. Empty if
+            that is unclear.
     """
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     fault: str = ""
     doubt: str = ""
-    picture: Arrangement | None = None
+    axes: tuple[int, ...] = ()
+
+    def arranged(self, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Observations (N, ...) as pictures (N, H, W, C); needs ``axes``."""
+        moved = values.transpose(0, *(axis + 1 for axis in self.axes))
+        return moved.reshape(len(values), *self.shape)
 
 
-def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any], top: float = 1.0) -> Reading:
-    """The reading of an observation of this shape and type, with numbers or truth values up to ``top``."""
+def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Reading:
+    """The reading of an observation of this shape and type."""
     if len(shape) < 2:
         return Reading(NUMBERS, shape or (1,))
-    casts = {"f": "x.round()" if 1 < top < np.inf else "(255 * x).round()", "b": "(255 * x)"}
-    cast = "x" if dtype == PICTURE else f"{casts.get(dtype.kind, 'x')}.astype('uint8')"
-    picture = _arrangement(shape, cast)
     if dtype == PICTURE:
-        return Reading(PICTURE, picture.shape if picture else shape, _byte_fault(shape), picture=picture)
+        axes, target = _arrangement(shape)
+        return Reading(PICTURE, target, _byte_fault(shape), axes=axes)
     if not any(min(pair) > MOST_CHANNELS for pair in pairwise(shape)):  # not shaped like a picture
         return Reading(NUMBERS, shape)
     if dtype.kind == "f":
-        remedy = f": of pictures give {picture.expression()}" if picture else ""
-        return Reading(NUMBERS, shape, doubt=f"{dtype} {shape} is taken for numbers{remedy}", picture=picture)
-    return Reading(NUMBERS, shape, "could be pictures or numbers", picture=picture)
+        return Reading(NUMBERS, shape, doubt=f"{dtype} {shape} is taken for numbers: give pictures as uint8 (H, W, C)")
+    return Reading(NUMBERS, shape, "could be pictures or numbers")
 
 
 def _byte_fault(shape: tuple[int, ...]) -> str:
@@ -96,18 +78,20 @@ def channels_first(shape: tuple[int, ...]) -> bool:
     return shape[0] <= MOST_CHANNELS or 2 * shape[0] <= min(shape[1:])
 
 
-def _arrangement(shape: tuple[int, ...], cast: str) -> Arrangement | None:
-    """How an observation of two axes or more becomes a picture; None if the result would be refused again."""
+def _arrangement(shape: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The axes that make bytes of two axes or more a picture, and its shape; no axes if it would be refused again."""
     if len(shape) == 2:
-        return Arrangement(cast, (0, 1), (*shape, 1))
+        return (0, 1), (*shape, 1)
     if len(shape) == 3 and not channels_first(shape):
-        return Arrangement(cast, (0, 1, 2), shape)
+        return (0, 1, 2), shape
     pairs = list(pairwise(shape))
     height = max(range(len(pairs)), key=lambda axis: (min(pairs[axis]), axis == 1))  # the longest two neighbours
     others = sorted({*range(len(shape))} - {height, height + 1}, key=lambda axis: shape[axis] in (1, 3))
     sides = shape[height], shape[height + 1]
     target = (*sides, prod(shape) // prod(sides))
-    return None if channels_first(target) else Arrangement(cast, (height, height + 1, *others), target)
+    if channels_first(target):
+        return (), shape
+    return (height, height + 1, *others), target
 
 
 def shrunk_picture(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, require_file
 from hypogoal.dataset import PICTURE
-from hypogoal.domains.observations import reading_of, shrunk_picture
+from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.own_data.arrays import DAMAGED
-from hypogoal.own_data.parts import Parts, require_memory
+from hypogoal.own_data.parts import STACKED, Parts, require_memory
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -86,11 +86,10 @@ def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
             if values.ndim < 3 or values.dtype != PICTURE or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
             reading = reading_of(values.shape, values.dtype)
-            if reading.picture is None or (reading.fault and not stack):
-                expression = reading.picture.expression() if reading.picture else "uint8 (H, W, C)"
-                do = f"Give {expression}, as 'import --stack' does." if reading.picture else f"Give {expression}."
+            if not reading.axes or (reading.fault and not stack):
+                do = f"{CLEARLY} {STACKED}" if reading.axes else CLEARLY
                 raise UserError(f"states {reading.fault}", f"{file}, {values.dtype} {values.shape}", do)
-            return np.array(reading.picture.arrange(values[None])[0])
+            return np.array(reading.arranged(values[None])[0])
         quiet = warnings.catch_warnings(action="ignore")
         with quiet, open_file(file, "the image is", DO) as raw, PIL.Image.open(raw, formats=FORMATS) as image:
             if (pixels := image.width * image.height) > MOST_PIXELS:

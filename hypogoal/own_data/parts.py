@@ -25,12 +25,13 @@ from hypogoal.dataset import (
     require_names,
     type_text,
 )
-from hypogoal.domains.observations import Reading, reading_of, shrunk_picture
+from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.own_data.supervision import contradictions, looks_of, near_duplicates, require_own_pictures
 
 # Pictures (N, H, W, C) or (N, H, W), or numbers (N, *shape); such arrays by key; or mixed observations (N,).
 Source: TypeAlias = NDArray[Any] | Mapping[str, NDArray[Any]]
 Resize: TypeAlias = int | Mapping[str, int]  # most pixels on the longer side, 0: any; or by key, "" for other pictures
+STACKED = "'import --stack' puts stacked frames among the channels."
 COPIES = 4  # of the states, in memory at once while they are compared and written
 
 
@@ -66,7 +67,10 @@ def collected_of(
     warned: list[str] = []
     images = as_observations(parts.observations, "the labelled observations", resize=resize, stack=stack)
     sources = parts.observations.values() if isinstance(parts.observations, Mapping) else [parts.observations]
-    warned += [doubt for source in sources if not source.dtype.names and (doubt := _reading(source).doubt)]
+    for source in sources:
+        doubt = "" if source.dtype.names else reading_of(source.shape[1:], source.dtype).doubt
+        if doubt:
+            warned.append(doubt)
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
         counts = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
         raise UserError("the number of feature names is wrong", counts, "Give one for each.")
@@ -185,15 +189,12 @@ def _of_one_kind(values: NDArray[Any], subject: str, resize: int, stack: bool) -
         raise UserError(f"{subject} are not observations", actual, do)
     if not len(values):
         raise UserError(f"{subject} are empty", actual, "Give some; unlabelled ones from other contexts.")
-    reading = _reading(values)
-    stackable = reading.dtype == PICTURE and reading.picture is not None and len(reading.picture.axes) > 2
+    reading = reading_of(values.shape[1:], values.dtype)
+    stackable = len(reading.axes) > 2
     if reading.fault and not (stack and stackable):
-        pictures = reading.picture.expression(batch=True) if reading.picture else "uint8 (N, H, W, C)"
-        stacks = ", as 'import --stack' does" if stackable else ""
-        do = f"Of pictures give {pictures}{stacks}; of numbers x.reshape(len(x), -1)"
-        raise UserError(f"{subject} {reading.fault}", actual, f"{do}.")
+        raise UserError(f"{subject} {reading.fault}", actual, f"{CLEARLY} {STACKED}" if stackable else CLEARLY)
     if reading.dtype == PICTURE:
-        values = reading.picture.arrange(values) if reading.picture else values
+        values = reading.arranged(values)
         if resize and max(values.shape[1:3]) > resize:
             values = np.stack([shrunk_picture(picture, resize) for picture in values])
     elif resize:
@@ -203,12 +204,6 @@ def _of_one_kind(values: NDArray[Any], subject: str, resize: int, stack: bool) -
         if not np.isfinite(values).all():
             raise UserError(f"{subject} have numbers that are not finite", actual, "Give finite ones.")
     return values
-
-
-def _reading(values: NDArray[Any]) -> Reading:
-    """How observations (N, ...) are interpreted."""
-    top = float(values.max()) if values.dtype.kind == "f" and values.size else 0.0
-    return reading_of(values.shape[1:], values.dtype, top)
 
 
 def as_labels(values: NDArray[Any], count: int, subject: str, goals: int | None = None) -> NDArray[np.bool_]:

@@ -101,17 +101,18 @@ def test_collected_numbers_are_kept_with_their_names(tmp_path: Any) -> None:
         open_dataset(path).unlabelled()
 
 
-def test_files_from_before_there_were_numbers_hold_pictures(tmp_path: Any) -> None:
-    """Spec A8: without a word of the type it is uint8; a word that says something else is refused."""
+def test_a_file_says_what_its_observations_are(tmp_path: Any) -> None:
+    """Spec A8: pictures or numbers; what is neither is refused, and so is silence."""
     path = tmp_path / "corridor.h5"
     found = corridor_env.DOMAIN.collect(SMALL, 0, Progress("collect", 1, quiet=True))
     write_dataset(path, found, domain="own", config={}, seed=0)
-    with h5py.File(path, "r+") as file:
-        del file.attrs["observation_dtype"]
-    assert open_dataset(path).observation_dtype == np.uint8
     np.testing.assert_array_equal(open_dataset(path).unlabelled(), found.unlabelled.observations)
     with h5py.File(path, "r+") as file:
         file.attrs["observation_dtype"] = np.bytes_("int64")
+    with pytest.raises(UserError, match="not a hypogoal data file"):
+        open_dataset(path)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["observation_dtype"]
     with pytest.raises(UserError, match="not a hypogoal data file"):
         open_dataset(path)
 

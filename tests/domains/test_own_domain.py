@@ -75,7 +75,7 @@ def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
         ("NAMELESS", "a sub-goal's name must be usable as a file name: 'rooms/low'"),
         ("TWICE", "two sub-goals have the same name: End, end"),
         ("STACKED", "observations have their channels, or stacked frames, first: uint8 (4, 48, 48)"),
-        ("FRAMES", "observations are stacks of pictures: uint8 (4, 48, 48, 3). Of pictures: env = gymnasium.wrappers."),
+        ("FRAMES", "observations are stacks of pictures: uint8 (4, 48, 48, 3). Give pictures as uint8 (H, W, C), "),
         ("TURNED", "the environment gave an observation that does not fit its space: uint8 (48, 48, 3)"),
         ("RAISING", "a sub-goal's function raised AttributeError: "),
     ],

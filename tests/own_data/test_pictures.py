@@ -138,7 +138,7 @@ def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
         (tmp_path / "stacks" / name).mkdir(parents=True)
         np.save(tmp_path / "stacks" / name / "1.npy", many)
     with pytest.raises(
-        UserError, match=r"states are stacks of pictures: .*1\.npy, uint8 \(4, 48, 60, 3\)\. Give x\.tr"
+        UserError, match=r"states are stacks of pictures: .*1\.npy, uint8 \(4, 48, 60, 3\)\. Give pictures as uint8"
     ):
         read_images(tmp_path / "stacks")
     stacked = read_images(tmp_path / "stacks", stack=True).unlabelled[0]
