@@ -9,7 +9,6 @@ from itertools import product
 from typing import Annotated
 
 from hypogoal.experiments.choosing import LAYOUTS
-from hypogoal.experiments.doorkey import RATES
 from hypogoal.experiments.experiment import (
     Command,
     Layouts,
@@ -22,7 +21,7 @@ from hypogoal.experiments.experiment import (
 )
 
 
-@experiment("doorkey", stages=("collect", "train-baseline"), rates={**RATES, "collect": 3})
+@experiment("doorkey", stages=("collect", "train-baseline"))
 def choosing_baselines(
     *,
     layouts: Layouts = LAYOUTS,

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.doorkey import RATES
 from hypogoal.experiments.experiment import (
     Command,
     Integers,
@@ -41,7 +40,6 @@ PAPERS = {"ppo-paper": "--agent ppo --set setting=paper", "dqn-paper": "--agent 
 @experiment(
     "doorkey",
     stages=("collect", "train-ensemble", "train-options", "train-meta", "train-baseline"),
-    rates={**RATES, "step": {"light": 0.3e-3}},
 )
 def figure6(
     *,

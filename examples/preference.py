@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.doorkey import RATES
 from hypogoal.experiments.experiment import (
     Command,
     Layouts,
@@ -24,7 +23,7 @@ from hypogoal.experiments.experiment import (
 METHODS = {"dbat-k3": "--diversity dbat --members 3", "none-k3": "--diversity none --members 3"}
 
 
-@experiment("doorkey", stages=("collect", "train-ensemble", "train-meta"), rates={**RATES, "collect": 3})
+@experiment("doorkey", stages=("collect", "train-ensemble", "train-meta"))
 def preference(
     *,
     layouts: Layouts = tuple(range(300, 334)),

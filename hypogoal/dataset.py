@@ -366,12 +366,6 @@ class Dataset:
         with self._file() as file:
             return self._observations(file, "unlabelled")
 
-    def sample(self, part: str, count: int) -> Observations:
-        """About ``count`` states spread over ``unlabelled`` or ``labelled/<sub-goal>``; reads no others."""
-        with self._file() as file:
-            rows = _spread(self._count(file, part), count)
-            return np.concatenate([self._observations(file, part, block) for block in rows])
-
     def some_heldout(self, sub_goal: str, count: int) -> States:
         """About ``count`` held-out states of each class of a sub-goal, spread over the file; reads no others."""
         base = f"heldout/{sub_goal}"

@@ -42,7 +42,7 @@ KillWait={kill_wait}
 ReturnToService=2
 SchedulerParameters=batch_sched_delay=0,sched_interval=2,sched_min_interval=0,bf_interval=2
 NodeName={host} NodeAddr=127.0.0.1 CPUs={cpus} RealMemory={memory} State=UNKNOWN
-PartitionName=main Nodes=ALL Default=YES DefMemPerCPU=100 MaxTime=60 State=UP
+PartitionName=main Nodes=ALL Default=YES DefMemPerCPU=1500 MaxTime=60 State=UP
 """
 
 

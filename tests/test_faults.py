@@ -285,8 +285,9 @@ def test_nothing_depends_on_the_clock() -> None:
     [
         (MemoryError(), "there is not enough memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "there is not enough memory"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"), "Lower batch_size, workers or environments"),
         (ImportError("x.so: failed to map segment from shared object"), "there is not enough memory"),
-        (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), "Free some memory"),
+        (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), "Lower batch_size, workers or environments"),
         (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "ulimit -n"),
         (RuntimeError("unable to open file <x> in read-only mode: Too many open files (24)"), "ulimit -n"),
         (BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)), "ulimit -u"),

@@ -350,8 +350,8 @@ def test_one_way_to_print_and_one_to_open() -> None:
     printing = re.compile(r"typer\.echo\(|(?<![\w.])print\(|Console\(|sys\.std(out|err)\.write")
     opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
     own = {
-        "core/compute.py", "core/config.py", "core/drafts.py", "core/files.py", "core/locks.py",
-        "core/preflight.py", "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/records.py",
+        "core/config.py", "core/drafts.py", "core/files.py", "core/locks.py",
+        "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/records.py",
         "hypotheses/load.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
         "own_data/videos.py", "stages/export_ensemble.py", "stages/train_ensemble.py",
     }  # fmt: skip

@@ -23,9 +23,15 @@ from hypogoal.core.surroundings import shield
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
 from hypogoal.settings import CONFIGS, TABLES
 
-NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller settings."
+NO_MEMORY = "Lower batch_size, workers or environments (--set batch_size=N), or allow more (ulimit -v)."
 # Texts of errors that torch and the loader of libraries raise in place of a MemoryError.
-MEMORY_TEXTS = ("can't allocate memory", "Cannot allocate memory", "failed to map segment")
+MEMORY_TEXTS = (
+    "can't allocate memory",
+    "Cannot allocate memory",
+    "not enough memory",
+    "CUDA out of memory",
+    "failed to map segment",
+)
 
 __all__ = ["app", "inspect", "main", "own_data", "stages", "sweep"]
 

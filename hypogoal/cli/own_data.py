@@ -16,6 +16,8 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import amount, give, say
 from hypogoal.settings import configuration
 
+LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
+
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
 
@@ -73,7 +75,6 @@ def import_(
 def _print_observations(data: Path, resized: bool, quiet: bool) -> None:
     """Say how states were read, as pictures or numbers; of large pictures, how to import them smaller."""
     from hypogoal.dataset import PICTURE, fields_of, open_dataset
-    from hypogoal.needs import LARGE, longest_side
 
     dataset = open_dataset(data)
     for key, (dtype, shape) in fields_of(dataset.observation_shape, dataset.observation_dtype).items():
@@ -81,7 +82,7 @@ def _print_observations(data: Path, resized: bool, quiet: bool) -> None:
         if not quiet:
             kind = "pictures" if dtype == PICTURE else "numbers"
             say(f"{f'{key}: ' if key else ''}taken for {kind}, {sizes} {dtype}")
-        if longest_side(shape, dtype) > LARGE and not resized:
+        if dtype == PICTURE and max(shape[:2]) > LARGE and not resized:
             say(f"hypogoal: pictures of {sizes} need much memory and time; add --resize {LARGE} --force", err=True)
 
 
@@ -126,7 +127,6 @@ def check(
     set_: cli.Set = None,
     seed: cli.Seed = 0,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play.")] = 0,
-    minutes: Annotated[float, Option(min=0.01, help="About how long it may take: a slow domain plays less.")] = 2.0,
 ) -> None:
     """Check that your domain, objective or network keeps its contract.
 
@@ -141,7 +141,7 @@ def check(
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
         config = configuration("collect", domain, None, set_, {}, by_user=True) if domain else None
         with Progress("check", total=1, quiet=domain is None) as progress:
-            options = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
+            options = {"layout_seed": layout_seed, "seed": seed, "progress": progress}
             for verdict in _verdicts(domain, diversity, network, config, options):
                 with progress.paused():
                     for line in verdict.lines:

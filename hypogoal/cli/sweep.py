@@ -1,12 +1,10 @@
 """Many cells with one command: ``run`` chains the stages, ``sweep`` runs experiments here or by Slurm (Spec A6, G4)."""
 
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from typer import Argument, Option
 
 from hypogoal.cli import common as cli
@@ -20,7 +18,7 @@ From = Annotated[
     str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it; keep the rest.")
 ]
 Only = Annotated[str | None, Option("--only", metavar="STAGE", help="Make this stage again and run no other.")]
-DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost; run none.")]
+DryRun = Annotated[bool, Option("--dry-run", help="List the commands; run none.")]
 _slurm = partial(Option, rich_help_panel="Slurm (with --engine slurm)")
 
 
@@ -81,7 +79,6 @@ def sweep(
     only: Only = None,
     engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
-    assume_yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
     status: Annotated[bool, Option("--status", help="Only show how far the sweep is.")] = False,
     cancel: Annotated[bool, Option("--cancel", help="Only cancel its Slurm jobs; they save first.")] = False,
     gather: Annotated[bool, Option("--gather", help="Only write results.csv of the cells done so far.")] = False,
@@ -90,7 +87,7 @@ def sweep(
     as_json: cli.AsJson = False,
     partition: Annotated[str, _slurm(help="Partition, as for sbatch.")] = "",
     time: Annotated[str, _slurm(help="Time limit of a cell, as for sbatch: 4:00:00.")] = "",
-    memory: Annotated[str, _slurm(help="Memory of a cell, as for sbatch --mem; else estimated.")] = "",
+    memory: Annotated[str, _slurm(help="Memory of a cell, as for sbatch --mem.")] = "",
     cpus: Annotated[int, _slurm(min=0, help="Processors of a cell; 0: as many as it can use.")] = 0,
     gpus: Annotated[int, _slurm(min=0, help="GPUs of a cell.")] = 0,
     cap: Annotated[int, _slurm(min=0, help="Cells of an array that run at once.")] = 0,
@@ -146,16 +143,15 @@ def sweep(
     if dry_run:
         _list(planned, out, chosen)
         return
-    ask = None if assume_yes or not sys.stdin.isatty() else _confirm
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
         with own_code.given(*cli.values_of(set_)):
             go_on = stage.AGAIN if not planned.anew else "give it without --from and --only to go on"
-            give(stage.sweep(planned, out, quiet=quiet, confirm=ask, go_on=go_on, only=chosen))
+            give(stage.sweep(planned, out, quiet=quiet, go_on=go_on, only=chosen))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
     with own_code.given(*cli.values_of(set_)):
-        jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask, only=chosen)
+        jobs = stage.submit(planned, out, options, quiet=quiet, only=chosen)
     for job in jobs:
         say(f"job {job['id']}: {job['name']}, {amount(max(1, len(job['cells'])), 'cell')}", err=True)
     give(out)
@@ -178,17 +174,9 @@ def _in_part(planned: Any, from_: str | None, only: str | None) -> tuple[Any, fr
 
 
 def _list(planned: Any, out: Path, chosen: frozenset[str]) -> None:
-    """The commands of all cells or, with ``--from`` and ``--only``, of those that would run; and their cost."""
-    from hypogoal.experiments.costs import cost_lines
+    """The commands of all cells or, with ``--from`` and ``--only``, of those that would run."""
     from hypogoal.stages.sweep import to_run
 
     cells = to_run(planned, out, chosen) if planned.anew else planned.cells
     for cell in cells:
         say(cell.text)
-    for line in cost_lines(cells, planned.workers):
-        say(line, err=True)
-
-
-def _confirm(cost: str) -> None:
-    if not typer.confirm(f"{cost}. Begin?", err=True):
-        raise typer.Exit(1)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import path_part, require_file
-from hypogoal.core.preflight import free_memory, human
 
 FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # all of them built into h5py
 MOST_RATIO = 1032  # bytes from one compressed byte: deflate's limit, the highest of these filters
@@ -168,9 +167,9 @@ def checked(file: Any, name: str, kinds: str) -> Any:
         chunks = prod(-(-side // width) for side, width in zip(shape, sides, strict=True) if width)
     size = size_of(dataset)
     if stored > whole or size > (MOST_RATIO if filters else 1) * stored or chunk > MAX_CHUNK_BYTES:
-        raise Foreign(f"{name!r} declares {human(size)} but stores {human(stored)} in a file of {human(whole)}")
+        raise Foreign(f"{name!r} declares {size:,} bytes but stores {stored:,} in a file of {whole:,}")
     if chunks > min(MAX_CHUNKS, max(stored, 1)):  # ``stored`` may be a lie
-        raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks but stores {human(stored)}")
+        raise Foreign(f"{name!r} declares {size:,} bytes in {chunks} chunks but stores {stored:,}")
     return dataset
 
 
@@ -180,10 +179,8 @@ def size_of(dataset: Any) -> int:
 
 
 def read_array(file: Any, name: str, kinds: str, rows: slice | NDArray[np.int64] | None = None) -> NDArray[Any]:
-    """A dataset's values, or ``rows`` of them; ``Foreign`` if damaged, or read whole and larger than free memory."""
-    dataset, free = checked(file, name, kinds), free_memory()
-    if rows is None and free is not None and size_of(dataset) > free:
-        raise Foreign(f"{name!r} needs {human(size_of(dataset))} of memory, {human(free)} are free")
+    """A dataset's values, or ``rows`` of them; ``Foreign`` if damaged."""
+    dataset = checked(file, name, kinds)
     with _readable(repr(name)):
         return np.asarray(dataset[() if rows is None else rows])
 

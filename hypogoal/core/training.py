@@ -9,7 +9,6 @@ from typing import Any
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
 from hypogoal.core.manifests import LOG
-from hypogoal.core.preflight import Needs, preflight
 from hypogoal.core.progress import MetricsLog, Progress
 
 
@@ -27,7 +26,6 @@ class Training:
 def training(
     stage: str,
     out: Path,
-    needs: Needs,
     *,
     steps: int,
     quiet: bool,
@@ -35,12 +33,11 @@ def training(
     tensorboard: Path | None = None,
     **artefact: Any,
 ) -> Iterator[Training]:
-    """Refuse what does not fit on this machine, then open the artefact; train and fill it in the block.
+    """Open the artefact; train and fill it in the block.
 
     ``tensorboard``: see :class:`hypogoal.core.progress.MetricsLog`; ``artefact``: see
     :func:`hypogoal.core.artefacts.create_artefact`.
     """
-    preflight(stage, out, needs, resume=resume, quiet=quiet)
     with (
         create_artefact(out, resume=resume, **artefact) as folder,
         contextlib.closing(MetricsLog(folder / LOG, tensorboard)) as log,

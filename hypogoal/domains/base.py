@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from math import prod
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -319,7 +318,6 @@ class Domain(ABC):
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence for people on how to read its observations.
         labels_stand_in: for people, where the domain's author adds a sub-goal.
-        packed: about how many times smaller collected states are on disk than in memory; 1 if unknown.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
@@ -339,7 +337,6 @@ class Domain(ABC):
     labels_stand_in = "its sub_goals and what its engine's labels() return"
     measures = pictures = sees_agent = False
     near = 0
-    packed = 1
 
     @property
     def usual_sub_goals(self) -> tuple[str, ...]:
@@ -359,11 +356,6 @@ class Domain(ABC):
     def doubt(self) -> str:
         """A warning if its observations are read as numbers but look like pictures; else empty."""
         return reading_of(tuple(self.observation_shape), self.observation_dtype).doubt
-
-    @property
-    def observation_bytes(self) -> int:
-        """Bytes of one observation."""
-        return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     @abstractmethod
     def collect(self, config: Any, seed: int, progress: Any) -> Collected:
@@ -410,22 +402,6 @@ class Domain(ABC):
     def small(self, config: Any) -> Any:
         """The settings with which ``check`` collects: ``config`` with fewer states."""
         return config
-
-    def shortened(self, config: Any, steps: int) -> Any:
-        """The settings with which ``check`` collects a slow domain in about ``steps``; needs ``collected_steps``."""
-        return config
-
-    def collected_steps(self, config: Any) -> int:
-        """The environment steps that ``collect`` will play; 0 if unknown."""
-        return 0
-
-    def collected_bytes(self, config: Any) -> int:
-        """An upper bound on the bytes of observations that ``collect`` makes; 0 if unknown."""
-        return 0
-
-    def played_bytes(self, steps: int, frames: int) -> int:
-        """Bytes of pictures that an engine keeps while playing ``steps`` if replays need ``frames`` of them."""
-        return 0
 
     def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
         """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""

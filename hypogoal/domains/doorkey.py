@@ -4,7 +4,6 @@ See also ``doorkey_env`` (the Gymnasium environment and the sub-goals) and ``doo
 """
 
 import itertools
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -84,13 +83,7 @@ class DoorKeyDomain(Domain):
     engine_settings = ("door_label", "wrong_key")
     env_id = "hypogoal/DoorKey-8x8-v0"
     many_layouts = True
-    packed = 20  # 26 measured
     defaults, sources = DEFAULTS, SOURCES
-
-    def collected_bytes(self, config: DoorKeyConfig) -> int:
-        """An upper bound: layout 0 has some 1,640 states, others up to 2,500."""
-        layouts = 1 + len(config.unlabelled_seeds) + config.heldout_layouts
-        return layouts * 2_500 * math.prod(self.observation_shape)
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """Spec B3: labelled, unlabelled and held-out states, each with its origin.

@@ -22,7 +22,6 @@ from hypogoal.domains.base import Domain
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 """How to play when collecting states: (environment, observation, random numbers) -> action."""
 SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
-FEW_STEPS = 200  # on a layout; with fewer, check plays on fewer layouts
 
 
 @dataclass(frozen=True)
@@ -159,27 +158,6 @@ class GymnasiumDomain(Domain):
     def small(self, config: GymnasiumConfig) -> GymnasiumConfig:
         return replace(config, states=min(config.states, 200))
 
-    def shortened(self, config: GymnasiumConfig, steps: int) -> GymnasiumConfig:
-        """Fewer steps on each layout; if that leaves few, one layout per set."""
-        seeds = {name: getattr(config, name) for name in SEEDS}
-        if steps < FEW_STEPS * sum(map(len, seeds.values())):
-            seeds = {name: values[:1] for name, values in seeds.items()}
-        share = max(1, steps // max(1, sum(map(len, seeds.values()))))
-        return replace(config, **seeds, steps=min(config.steps, share))
-
-    def collected_steps(self, config: GymnasiumConfig) -> int:
-        return self._layouts(config) * config.steps
-
-    def collected_bytes(self, config: GymnasiumConfig) -> int:
-        return self._layouts(config) * min(config.states, config.steps) * self.observation_bytes
-
-    @staticmethod
-    def _layouts(config: GymnasiumConfig) -> int:
-        return sum(len(getattr(config, name)) for name in SEEDS)
-
-    def played_bytes(self, steps: int, frames: int) -> int:
-        return min(2 * self.memory, steps) * self.observation_bytes
-
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states reached in play on each layout, each picture once.
 
@@ -189,7 +167,7 @@ class GymnasiumDomain(Domain):
         """
         seeds_of_sets = [getattr(config, name) for name in SEEDS]
         env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
-        progress.expect(self.collected_steps(config))
+        progress.expect(config.steps * sum(map(len, seeds_of_sets)))
         training: set[bytes] = set()  # digests of labelled and unlabelled states
         sets: list[States] = []
         for seeds in seeds_of_sets:

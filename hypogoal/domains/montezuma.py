@@ -5,7 +5,6 @@ positions), ``montezuma_sub_goals`` (climbing, passing enemies), ``montezuma_sta
 ``montezuma_env`` and ``montezuma_engine`` (one game and many, from the top of a ladder).
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -137,7 +136,6 @@ class MontezumaDomain(Domain):
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(BEGINNINGS)
     many_starts = True
-    packed = 20  # 24 measured
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
     near = 12
@@ -161,15 +159,6 @@ class MontezumaDomain(Domain):
             "audit": ALONE,
         }
     )
-
-    def collected_bytes(self, config: MontezumaConfig) -> int:
-        """An upper bound: every room labelled, unlabelled and held out."""
-        each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
-        return ROOMS * each * math.prod(self.observation_shape)
-
-    def played_bytes(self, steps: int, frames: int) -> int:
-        """One frame per step, as far back as replays reach."""
-        return frames * math.prod(self.observation_shape[:2])
 
     def collect(
         self, config: MontezumaConfig, seed: int, progress: Any, kept: Callable[[str], Checkpoints] | None = None

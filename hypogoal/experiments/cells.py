@@ -4,7 +4,6 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from hypogoal.core.errors import UserError
 from hypogoal.settings import CONFIGS, options_of
@@ -16,17 +15,6 @@ COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # of ``results.csv
 Axes = tuple[tuple[str, str | int | float], ...]
 
 
-class Cost(NamedTuple):
-    """The estimated cost of a cell; 0 if unknown."""
-
-    seconds: float = 0.0  # on one core like that of docs/performance.md
-    memory: float = 0.0  # bytes, of each of its processes
-    cores: int = 1  # processes that it can use
-
-
-UNKNOWN = Cost()
-
-
 @dataclass(frozen=True)
 class Cell:
     """One command of an experiment."""
@@ -35,7 +23,7 @@ class Cell:
     arguments: tuple[str, ...]  # of ``hypogoal``, without ``--force``
     out: Path  # what it writes
     needs: tuple[Path, ...] = ()  # outputs of other cells that it reads
-    cost: Cost = UNKNOWN
+    cores: int = 1  # processes that it can use
     axes: Axes = ()  # its place in the experiment, columns of ``results.csv``: seed, method, ...
 
     @property
@@ -85,12 +73,12 @@ class Plan:
         return frozenset(names)
 
 
-def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> list[Cell]:
-    """Evaluate (which takes ``cost``) and report, when everything else is complete."""
+def closing_cells(run: Path, needs: Sequence[Path], cores: int = 1) -> list[Cell]:
+    """Evaluate, in so many processes, and report, when everything else is complete."""
     evaluation = run / "evaluation"
     return [
-        Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs), cost),
-        Cell("report", ("report", str(run)), run / "report", (evaluation,), cost),
+        Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs), cores),
+        Cell("report", ("report", str(run)), run / "report", (evaluation,)),
     ]
 
 

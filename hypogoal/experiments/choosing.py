@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.doorkey import RATES
 from hypogoal.experiments.experiment import Command, Layouts, Paired, Seeds, Value, agents_of, experiment, explained
 
 METHODS = {
@@ -20,7 +19,7 @@ METHODS = {
 LAYOUTS = (70100, 70101, 70102, 70103, 70105, 70107, 70109, 70110, 70111, 70112)  # solvable without a wrong key
 
 
-@experiment("doorkey", stages=("collect", "train-ensemble", "train-options", "train-meta"), rates=RATES)
+@experiment("doorkey", stages=("collect", "train-ensemble", "train-options", "train-meta"))
 def choosing(
     *,
     layouts: Layouts = LAYOUTS,

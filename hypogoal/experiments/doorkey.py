@@ -19,13 +19,6 @@ from hypogoal.experiments.experiment import (
     explained,
 )
 
-RATES = {
-    "heldout": "heldout_layouts",
-    "collect": 15,
-    "member_step": {"light": 0.15},
-    "step": {"planned": 0.3e-3, "light": 0.8e-3, "paper": 25e-3, "paper-none": 15e-3},
-    "baseline_step": {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45e-3, "dqn-tuned": 0.57e-3},
-}
 CONTROLS = {"random": "--set chooser=random", "oracle": "--set termination=oracle"}
 BASELINES = {
     f"{agent}-{tuning}": f"--agent {agent} --set setting={tuning}"
@@ -39,7 +32,6 @@ Baselines = Annotated[Names, explained("agents on primitive actions", source="pa
 @experiment(
     "doorkey",
     stages=("collect", "train-ensemble", "train-options", "train-meta", "train-baseline"),
-    rates=RATES,
 )
 def doorkey(
     stage: Callable[[str], Any],

@@ -21,10 +21,8 @@ from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hin
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, load_own
-from hypogoal.experiments.cells import Cost
 
 MAX_CELLS = 20_000
-ONE_PROCESS = Cost(memory=1e9)  # of a command that is not estimated otherwise
 MEND = "Mend the experiment or its settings, see docs/formats.md."
 KINDS = (bool, int, float, str, tuple[int, ...], tuple[float, ...], tuple[str, ...])
 COMMON = ("workers", "evaluate")  # settings of every experiment
@@ -41,7 +39,6 @@ class Command:
     name: str  # its place in the run's folder: ensemble/seed-0
     command: str | Sequence[str]  # as one would type it, or its words
     columns: Mapping[str, Value] = field(default_factory=dict)  # of results.csv: seed, method, ...
-    cost: Cost = ONE_PROCESS  # where the experiment has no rates
 
     @property
     def words(self) -> list[str]:
@@ -61,7 +58,6 @@ class Experiment:
     config_class: type  # the settings of ``hypogoal run``: the function's, then those of all experiments
     domain: str | None = None  # whose presets and settings its stages take; None: each command says all itself
     stages: tuple[str, ...] = ()  # whose settings can be changed for all commands
-    rates: Mapping[str, Any] = field(default_factory=dict)  # see :class:`hypogoal.experiments.costs.Estimates`
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -94,9 +90,7 @@ Seeds = Annotated[Integers, explained("run seeds, each with ensembles of its own
 Paired = Annotated[bool, explained("each layout with the seed at its place in the list, instead of all with all")]
 
 
-def experiment(
-    domain: str, *, stages: Sequence[str], rates: Mapping[str, Any] | None = None
-) -> Callable[[Callable[..., Iterable[Any]]], Experiment]:
+def experiment(domain: str, *, stages: Sequence[str]) -> Callable[[Callable[..., Iterable[Any]]], Experiment]:
     """Makes a function an experiment on ``domain``; the arguments are those of :class:`Experiment`.
 
     Presets, ``--device`` and settings of ``stages`` then apply to all its commands, and it may ask for the settings of
@@ -104,7 +98,7 @@ def experiment(
     """
 
     def decorated(function: Callable[..., Iterable[Any]]) -> Experiment:
-        return _experiment_of(function, domain=domain, stages=(*stages,), rates=rates or {})
+        return _experiment_of(function, domain=domain, stages=(*stages,))
 
     return decorated
 

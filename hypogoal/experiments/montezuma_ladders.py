@@ -10,14 +10,6 @@ from typing import Annotated
 
 from hypogoal.experiments.experiment import Command, Integers, Names, Seeds, experiment, explained
 
-RATES = {
-    "heldout": "heldout_per_room",
-    "collect": 30,
-    "collect_cores": 6,  # rooms that a collection plays in at once, at most
-    "member_step": {"montezuma": 0.08, "montezuma-crop": 0.01},
-    "localiser": 90,
-    "step": {"light": 2.5e-3, "paper": 2.4, "paper-none": 0.042},
-}
 METHODS = {
     "dbat": "--set diversity=dbat",
     "none": "--set diversity=none",
@@ -32,7 +24,7 @@ SUB_GOAL = "what is labelled, a sub-goal of collect montezuma; empty: climb-down
 ORACLE = "options that end at the true sub-goal beside them, on each ladder"
 
 
-@experiment("montezuma", stages=("collect", "train-ensemble", "train-options"), rates=RATES)
+@experiment("montezuma", stages=("collect", "train-ensemble", "train-options"))
 def montezuma_ladders(
     *,
     groups: Annotated[Integers, explained("labelled ladder groups (N)", source="Figure 3", low=1, high=7)] = (

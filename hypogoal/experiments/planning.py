@@ -1,6 +1,5 @@
-"""From an experiment to its cells in a folder: what each reads, costs and is called (Spec A6, G4)."""
+"""From an experiment to its cells in a folder: what each reads and is called (Spec A6, G4)."""
 
-import contextlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,11 +12,12 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import path_part, plain_name
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import COLUMNS, RESERVED, UNKNOWN, Cell, Plan, closing_cells
-from hypogoal.experiments.costs import Estimates
+from hypogoal.experiments.cells import COLUMNS, RESERVED, Cell, Plan, closing_cells
 from hypogoal.experiments.experiment import MEND, Command, Experiment
 from hypogoal.settings import CONFIGS, STAGES, TABLES, configuration
 
+MOST_JUDGED = 6  # ensembles that an evaluation judges at once
+ROOMS_AT_ONCE = 6  # that a collection of Montezuma plays in, each in a process
 FOLDERS = ("evaluation", "report", "logs", "slurm")  # in every run's folder
 READ = re.compile(r"--[\w-]+=@.+")
 
@@ -60,12 +60,10 @@ def make_plan(
         settings_of(stage)  # a mistake in any of them is refused, whether a command uses it or not
         common[stage] += [word for pair in by_stage.get(stage, ()) for word in ("--set", pair)]
         common[stage] += ["--device", device] if device != "auto" and stage in CONFIGS else []
-    planned, closing = _cells(commands, out, common, short=short and experiment.domain is not None), UNKNOWN
-    if experiment.rates:
-        estimates = Estimates(experiment.rates, domain)
-        planned, closing = estimates.priced(planned), estimates.closing(planned)
+    planned = _cells(commands, out, common, short=short and experiment.domain is not None)
     if config.evaluate:
-        planned += closing_cells(out, [cell.out for cell in planned], closing)
+        ensembles = sum(cell.stage == "train-ensemble" for cell in planned)
+        planned += closing_cells(out, [cell.out for cell in planned], max(1, min(MOST_JUDGED, ensembles)))
     return Plan(experiment.name, planned, config.workers or cores())
 
 
@@ -122,13 +120,13 @@ def _cells(commands: Sequence[Command], out: Path, common: Mapping[str, Sequence
                     raise UserError(f"{command.name} would read what no cell before it makes", word[1:], MEND)
                 sources.append(cells[word[1:]])
                 words[number] = str(sources[-1].out)
-        cost = command.cost._replace(cores=_cores(words, sources))
+        processes = _cores(words, sources)
         # Options of all cells of a stage stand before the cell's own: the last setting of a name counts, so --set
         # cannot turn a method or a control into another.
         words[2:2] = common[words[0]]
         target = out / (place + (".h5" if words[0] == "collect" else ""))
         arguments, needs = (*words, "--out", str(target)), tuple(source.out for source in sources)
-        cells[command.name] = Cell(place.replace("/", "-"), arguments, target, needs, cost, _axes(command))
+        cells[command.name] = Cell(place.replace("/", "-"), arguments, target, needs, processes, _axes(command))
     names = Counter([*(command.name.replace("/", "-") for command in commands), "evaluate", "report"])
     if len(names) < len(commands) + 2:
         raise UserError("two cells would be the same", names.most_common(1)[0][0], f"Give each value once. {MEND}")
@@ -144,14 +142,24 @@ def _axes(command: Command) -> tuple[tuple[str, str | int | float], ...]:
 
 
 def _cores(words: Sequence[str], sources: Sequence[Cell]) -> int:
-    """The processes that a command can use: train-ensemble one for each sub-goal, if those are known here."""
-    if words[0] != "train-ensemble":
-        return 1
+    """The processes that a command can use: one for each sub-goal or room, as far as those are known here."""
     settings = dict(re.findall(r"--set[ =](\w+)=(\S+)", " ".join(words)))
-    sub_goals: Sequence[str] = settings["sub_goals"].split(",") if "sub_goals" in settings else ()
-    if not sub_goals:
-        domain = next((cell.arguments[1] for cell in sources if cell.stage == "collect"), "")
-        with contextlib.suppress(UserError):  # its cell refuses a domain that may not be loaded
-            sub_goals = load_domain(domain).usual_sub_goals
+    if words[0] == "train-ensemble":
+        most = _sub_goals(settings, sources)
+    elif words[:2] == ["collect", "montezuma"]:
+        most = ROOMS_AT_ONCE
+    else:
+        return 1
     workers = settings.get("workers", "")
-    return max(1, min(len(sub_goals), int(workers) if workers.isdigit() and int(workers) else len(sub_goals)))
+    return min(most, int(workers)) if workers.isdigit() and int(workers) else most
+
+
+def _sub_goals(settings: Mapping[str, str], sources: Sequence[Cell]) -> int:
+    """How many sub-goals an ensemble is trained for; 1 where that is not known."""
+    if "sub_goals" in settings:
+        return len(settings["sub_goals"].split(","))
+    domain = next((cell.arguments[1] for cell in sources if cell.stage == "collect"), "")
+    try:
+        return max(1, len(load_domain(domain).usual_sub_goals))
+    except UserError:  # its cell refuses a domain that may not be loaded
+        return 1

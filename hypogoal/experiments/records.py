@@ -19,10 +19,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
 from hypogoal.core.locks import try_lock
 from hypogoal.core.schemas import LARGEST, Schema, is_amount, is_count, is_list, is_table, is_text, misfit
-from hypogoal.experiments.cells import DERIVED, RESERVED, Cell, Cost, Plan, closing_cells, moved
+from hypogoal.experiments.cells import DERIVED, RESERVED, Cell, Plan, closing_cells, moved
 from hypogoal.settings import STAGES
 
-FORMAT_VERSION = 2  # 1: with forecasts of disk and of the machine's speed, which are ignored
+FORMAT_VERSION = 3  # 2, of 0.23: with forecasts of seconds and memory, which are ignored
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
 AGAIN = "Start the sweep again."
@@ -115,7 +115,7 @@ def _row(cell: Cell, run: Path) -> dict[str, Any]:
     """What is written of a cell."""
     cell = moved(cell, str(run), RUN)
     places = {"out": str(cell.out), "needs": [str(need) for need in cell.needs]}
-    return {"name": cell.name, "arguments": [*cell.arguments], **places, "axes": dict(cell.axes), **cell.cost._asdict()}
+    return {"name": cell.name, "arguments": [*cell.arguments], **places, "axes": dict(cell.axes), "cores": cell.cores}
 
 
 class LostPlan(UserError):
@@ -138,8 +138,8 @@ def read_plan(run: Path) -> Plan:
         raise LostPlan(f"the sweep's plan is damaged ({key or 'no JSON object'})", path, GIVE)
     cells, outs = [], set[Path]()
     for row in content["cells"]:
-        cost, needs = Cost(*(row[name] for name in Cost._fields)), tuple(map(Path, row["needs"]))
-        cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, cost, tuple(row["axes"].items()))
+        needs, axes = tuple(map(Path, row["needs"])), tuple(row["axes"].items())
+        cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, row["cores"], axes)
         cells.append(moved(cell, RUN, str(run)))
         if not outs.issuperset(cells[-1].needs) or cells[-1].out in outs:
             raise LostPlan(f"the sweep's plan is damaged (what {cell.name} needs or writes)", path, GIVE)
@@ -181,8 +181,6 @@ CELL: Schema = {
     "out": _is_place,
     "needs": is_list(_is_place),
     "axes": is_table(lambda value: is_text(value) or isinstance(value, int | float)),
-    "seconds": is_amount,
-    "memory": is_amount,
     "cores": lambda value: is_count(value) and value > 0,
 }
 PLAN_KEYS: Schema = {

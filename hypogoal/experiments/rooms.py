@@ -10,12 +10,6 @@ from typing import Annotated
 
 from hypogoal.experiments.experiment import Command, experiment, explained
 
-RATES = {
-    "heldout": "heldout_layouts",
-    "collect": 1,
-    "member_step": {"tiles": 0.01},
-    "step": {"planned": 0.5e-3},
-}
 METHODS = {  # one member more than features, and two for joint
     "dbat": "--diversity dbat --members 3",
     "divdis": "--diversity divdis --members 3",
@@ -27,7 +21,7 @@ Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles,
 Truths = Annotated[tuple[str, ...], explained("what the reward asks for", choices=("shape", "place"))]
 
 
-@experiment("rooms", stages=("collect", "train-ensemble", "train-meta"), rates=RATES)
+@experiment("rooms", stages=("collect", "train-ensemble", "train-meta"))
 def rooms(
     *,
     seeds: Rooms = tuple(range(990, 1000)),

@@ -97,16 +97,16 @@ def to_remake(plan: Plan, run: Path, cell: Cell) -> bool:
 def time_left(states: Sequence[State], workers: int) -> float | None:
     """Seconds until every cell that can be done is done; None if nothing is known of one of those left.
 
-    A cell takes as long as those of its stage that are done, else as estimated.
+    A cell takes as long as those of its stage that are done.
     """
     left = []
     for row in states:
         if row.state in (DONE, FAILED, HELD) or row.cell.stage in DERIVED:
             continue
         alike = [other.record.seconds for other in states if (other.state, other.cell.stage) == (DONE, row.cell.stage)]
-        seconds = sum(alike) / len(alike) if any(alike) else row.cell.cost.seconds
-        if not seconds:
+        if not any(alike):
             return None
+        seconds = sum(alike) / len(alike)
         spent = row.record.seconds + (time.time() - row.record.started if row.state == RUNNING else 0.0)
         left.append(max(0.0, seconds - spent))
     return max(sum(left) / workers, max(left, default=0.0))

@@ -12,15 +12,13 @@ from typing import Any
 from hypogoal.core.config import MAX_PRESET_BYTES, parse_integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, read_text
-from hypogoal.experiments.cells import COLUMNS, Cost
-from hypogoal.experiments.experiment import COMMON, ONE_PROCESS, Command, Experiment, Value, run_config
+from hypogoal.experiments.cells import COLUMNS
+from hypogoal.experiments.experiment import COMMON, Command, Experiment, Value, run_config
 
 FORMAT_VERSION = 1
-NUMBER = (int, float)
 KEYS: Mapping[str, Any] = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
-CELL_KEYS: Mapping[str, Any] = {"name": str, "command": str, "axes": list, "minutes": NUMBER, "memory_gb": NUMBER}
+CELL_KEYS: Mapping[str, Any] = {"name": str, "command": str, "axes": list}
 TAKEN = ("run", *COMMON, "cell", "stage", "group", *COLUMNS)  # axes become columns
-MOST = 1e7  # minutes, gigabytes
 MEND = "Mend the file, or write a Python function, see docs/formats.md."
 REFERENCE = re.compile(r"\{([^{}]*)\}")
 
@@ -44,8 +42,6 @@ def read_toml(path: Path) -> Experiment:
             raise UserError("cells need a name of their own", where, MEND)
         if not all(isinstance(axis, str) and axis in axes for axis in names) or len({*names}) < len(names):
             raise UserError("cells over an axis that does not exist", where, MEND)
-        if not all(0 <= row.get(key, 0) < MOST for key in ("minutes", "memory_gb")):
-            raise UserError("minutes and memory_gb cannot have these values", where, MEND)
         rows[name] = row
 
     def commands(**values: tuple[Value, ...]) -> Iterator[Command]:
@@ -101,9 +97,8 @@ def _command(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], poin
         return f"@{_name(rows[key], point)}"
 
     words = Command(row.get("name", ""), row.get("command", "")).words
-    memory = 1e9 * row["memory_gb"] if "memory_gb" in row else ONE_PROCESS.memory
-    columns, cost = {"group": row.get("name", ""), **point}, Cost(60.0 * row.get("minutes", 0), memory)
-    return Command(_name(row, point), [REFERENCE.sub(filled, word) for word in words], columns, cost)
+    columns = {"group": row.get("name", ""), **point}
+    return Command(_name(row, point), [REFERENCE.sub(filled, word) for word in words], columns)
 
 
 def _name(row: Mapping[str, Any], point: Point) -> str:

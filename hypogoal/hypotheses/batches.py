@@ -69,11 +69,6 @@ class TrainingStates:
         self._images = [as_tensor(some).to(device) for some in images] if self._tables is None else []
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
 
-    @property
-    def whole(self) -> bool:
-        """Whether networks get the states themselves, not their patches."""
-        return bool(self._images)
-
     def forward(
         self,
         networks: Sequence[nn.Sequential],

@@ -14,7 +14,7 @@ from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
 from hypogoal.dataset import NUMBERS, Dataset, Observations, fields_of
-from hypogoal.own_data.parts import Parts, require_memory
+from hypogoal.own_data.parts import Parts
 
 NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
@@ -96,7 +96,6 @@ def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
             raise UserError("this is not a .npz file", path, do) from None
         if any(entry.compress_type not in PACKED or entry.flag_bits & ENCRYPTED for entry in entries):
             raise UserError("the arrays are not packed as numpy packs them", path, do)
-        require_memory(sum(entry.file_size for entry in entries), path)
         raw.seek(0)
         try:
             with np.load(raw, allow_pickle=False) as arrays:
@@ -112,7 +111,6 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
     files = [*path.glob("*.npy"), *(file for name in STATES for file in (path / name).glob("*.npy"))]
     existing = {file.relative_to(path).with_suffix("").as_posix(): file for file in sorted(files) if file.is_file()}
     _require_known(existing, path)
-    require_memory(sum(file.stat().st_size for file in existing.values()), path)
     for name, file in existing.items():
         try:
             arrays[name] = np.load(file, allow_pickle=False)

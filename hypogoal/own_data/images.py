@@ -16,7 +16,7 @@ from hypogoal.core.files import open_file, require_file
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.own_data.arrays import DAMAGED
-from hypogoal.own_data.parts import STACKED, Parts, require_memory
+from hypogoal.own_data.parts import STACKED, Parts
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -39,8 +39,7 @@ def read_images(folder: Path, *, resize: int = 0, stack: bool = False) -> Parts:
     if (folder / "heldout").is_dir():
         names += ["heldout/positive", "heldout/negative"]
     files = {name: _files(folder / name) for name in names}
-    count = sum(map(len, files.values()))
-    images = {name: _read(of_kind, count, resize, stack) for name, of_kind in files.items()}
+    images = {name: _read(of_kind, resize, stack) for name, of_kind in files.items()}
     sizes = {_size(some[0]): name for name, some in images.items()}
     if len(sizes) > 1:
         text = ", ".join(f"{name} {size}" for size, name in sizes.items())
@@ -118,14 +117,12 @@ def _opaque(image: Image, file: Path) -> Image:
     return image
 
 
-def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArray[np.uint8]]:
-    """The images in some files, all of one size; ``count`` is the total in all folders."""
+def _read(files: list[Path], resize: int, stack: bool) -> list[NDArray[np.uint8]]:
+    """The images in some files, all of one size."""
     images: list[NDArray[np.uint8]] = []
     for file in files:
         image = read_image(file, stack=stack)
         images.append(shrunk_picture(image, resize) if resize else image)
-        if len(images) == 1:
-            require_memory(count * images[0].nbytes, file)
         if _size(images[-1]) != _size(images[0]):
             fault = f"the image is {_size(images[-1])}, others are {_size(images[0])}"
             raise UserError(fault, file, "Make them all one size.")

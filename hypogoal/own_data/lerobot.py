@@ -22,7 +22,7 @@ from hypogoal.dataset import MAX_SIDE, NUMBERS, PICTURE, Observations
 from hypogoal.domains.observations import shrunk_sides
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.images import FORMATS, MOST_PIXELS
-from hypogoal.own_data.parts import Resize, require_memory, resize_of
+from hypogoal.own_data.parts import Resize, resize_of
 from hypogoal.own_data.recordings import Recording, chosen_keys, kept
 from hypogoal.own_data.videos import needed, read_frames
 
@@ -197,8 +197,6 @@ def _table(file: Path, names: Sequence[str] | None = None) -> Any:
     with open_file(file, "the table is", AGAIN) as raw:
         try:
             opened = parquet.ParquetFile(raw)
-            groups = [opened.metadata.row_group(group) for group in range(opened.metadata.num_row_groups)]
-            require_memory(sum(group.total_byte_size for group in groups), file)
             table = opened.read(columns=names, use_threads=False)
         except (pyarrow.ArrowException, *DAMAGED):
             raise UserError("the table is truncated or damaged", file, AGAIN) from None

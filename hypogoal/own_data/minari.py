@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import checked, create_hdf5, find, members, open_hdf5, read_array, size_of
+from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import PICTURE, write_observations
 from hypogoal.meta.episodes import Episode
-from hypogoal.own_data.parts import Parts, Source, require_memory
+from hypogoal.own_data.parts import Parts, Source
 from hypogoal.own_data.recordings import split_episodes
 
 MINARI = Path("data") / "main_data.hdf5"  # in a dataset's folder
@@ -68,7 +68,6 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list
             fault = "its images are stored as JPEG, not as they were seen"
             raise UserError(fault, path, "Make it with jpeg_encoding=False.")
         places = [f"{name}/{place}" for name in names]
-        require_memory(sum(size_of(checked(file, name, "uif")) for name in places), path)
         episodes = [read_array(file, name, "uif") for name in places]
     if len({episode.shape[1:] for episode in episodes}) > 1 or not all(episode.ndim for episode in episodes):
         raise UserError("its episodes have observations of different shapes", path, "Give those of one shape.")

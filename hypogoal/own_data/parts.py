@@ -3,14 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.preflight import free_memory, human
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import (
     NUMBERS,
@@ -32,7 +30,6 @@ from hypogoal.own_data.supervision import contradictions, looks_of, near_duplica
 Source: TypeAlias = NDArray[Any] | Mapping[str, NDArray[Any]]
 Resize: TypeAlias = int | Mapping[str, int]  # most pixels on the longer side, 0: any; or by key, "" for other pictures
 STACKED = "'import --stack' puts stacked frames among the channels."
-COPIES = 4  # of the states, in memory at once while they are compared and written
 
 
 @dataclass(frozen=True)
@@ -126,14 +123,6 @@ def _of_rows(states: States, name: Callable[[int], str]) -> Callable[[int], str]
 def _one_after_another(count: int, first: Callable[[int], str], second: Callable[[int], str]) -> Callable[[int], str]:
     """The names of ``count`` states followed by others."""
     return lambda index: first(index) if index < count else second(index - count)
-
-
-def require_memory(size: int, where: Path) -> None:
-    """Refuse (``UserError``) states whose ``size`` bytes, with the copies made of them, exceed the free memory."""
-    free = free_memory()
-    if free is not None and COPIES * size > free:
-        fault = f"the states need {human(COPIES * size)} of memory, {human(free)} are free"
-        raise UserError(fault, where, "Give fewer states.")
 
 
 def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, role: str, do: str, warned: list[str]) -> States:

@@ -19,7 +19,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Fields, Observations, mixed_type
 from hypogoal.domains.observations import shrunk_picture
 from hypogoal.own_data.marks import BYTE_ORDER
-from hypogoal.own_data.parts import Parts, require_memory
+from hypogoal.own_data.parts import Parts
 
 SPLIT = (0.4, 0.4, 0.2)  # shares of episodes that are labelled, unlabelled and held out
 LAST, TABLE = "last:", ".csv"  # how rules begin and end that are no columns
@@ -86,7 +86,6 @@ def recorded_parts(recording: Recording, rules: Mapping[str, str], *, every: int
     frames = [kept(length, every) for length in recording.lengths]
     order, dtype = np.concatenate(parts).tolist(), mixed_type(recording.fields)
     ends = np.cumsum([len(frames[episode]) for episode in order])
-    require_memory(int(ends[-1]) * dtype.itemsize, recording.path)
     states: Any = np.empty(ends[-1], dtype)
     recording.fill(dict(zip(order, np.split(states, ends[:-1]), strict=True)), every)
     states = states[dtype.names[0]] if len(recording.fields) == 1 and dtype.names else states

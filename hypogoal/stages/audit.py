@@ -24,7 +24,6 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.config import AuditConfig
 from hypogoal.meta.training import assemble, columns_of, description, start_arguments, train, write_trained
-from hypogoal.needs import play_needs
 from hypogoal.options.tables import read_table
 from hypogoal.options.termination import ORACLE, Terminations, rule_of
 
@@ -65,10 +64,9 @@ def audit(
         "domain_config": target.domain_config,
     }
     out = claim(out, kind="audit", inputs=target.inputs, force=force, resume=resume)
-    start_arguments(world, config, 1, seed)  # refuse an impossible start before estimating the cost
+    start_arguments(world, config, 1, seed)  # refuse an impossible start before any work
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
     settings = description(world, ensemble_config, config, classifier=classifier, member=member, steps=steps)
-    needs = play_needs(world, ensemble_config, config)
 
     def ends(engine: Engine) -> Terminations:
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -78,7 +76,7 @@ def audit(
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 
     artefact: dict[str, Any] = {"kind": "audit", "config": settings, "seed": seed, "inputs": target.inputs}
-    with training("audit", out, needs, steps=steps, quiet=quiet, resume=resume, force=force, **artefact) as work:
+    with training("audit", out, steps=steps, quiet=quiet, resume=resume, force=force, **artefact) as work:
         loop = assemble(world, Path(), ensemble_config, config, seed, device, ends, target.standard)
         train(loop, steps, work.log, work.progress, work.checkpoints)
         write_trained(work.folder, loop, world, ensemble_config, config, seed)

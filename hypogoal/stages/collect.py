@@ -10,14 +10,11 @@ from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
-from hypogoal.core.preflight import Needs, preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
 from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
 from hypogoal.domains.base import BUILT_IN, Domain
 from hypogoal.options.config import OptionConfig
-
-COLLECT_BASE = 200e6  # bytes of a process that collects almost nothing
 
 
 def collect(
@@ -45,8 +42,6 @@ def collect(
         raise check_complete(before, identity, requested)
     if domain.doubt:
         say(f"hypogoal: {domain.doubt}", err=True)
-    size = domain.collected_bytes(config)
-    preflight("collect", out, Needs(COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
     with draft(out, {"kind": "data", **identity, "versions": versions()}, force=force, resume=resume) as work:
         kept = {"kept": partial(checkpoints_of, work.files)} if domain.resumes else {}
         with Progress(f"collect {identity['domain']}", total=1, quiet=quiet) as progress:

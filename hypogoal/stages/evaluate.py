@@ -1,7 +1,6 @@
 """Spec A5, F: every number of the report, from whatever artefacts a run has; what is missing is named."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.preflight import free_memory, preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import cores
 from hypogoal.evaluation.curves import SOLVED, group_runs, read_run
@@ -26,7 +24,6 @@ from hypogoal.experiments.records import PLAN, read_plan
 from hypogoal.experiments.status import stamp_of
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.config import layout_seeds
-from hypogoal.needs import evaluation_needs
 
 SETTINGS = {"window": LAST, "solved": SOLVED}
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
@@ -50,10 +47,6 @@ def evaluate(
     data = sorted({artefact.input("data") for artefact in contents.ensembles})
     cases = cases_of(contents.ensembles)
     workers = processes_for([case for _, case in cases], cores())
-    needs = evaluation_needs(data, workers)
-    if workers > 1 and needs.memory > (free_memory() or math.inf):
-        workers, needs = 1, evaluation_needs(data, 1)
-    preflight("evaluate", out, needs, resume=resume, quiet=quiet)
     with create_artefact(
         out, kind="evaluation", config=settings, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:

@@ -21,7 +21,6 @@ from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments import records
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
-from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, wall_seconds
 from hypogoal.experiments.experiment import Experiment, load_experiment
 from hypogoal.experiments.named import CELLS, EXPERIMENTS, FIGURES, NAMES
 from hypogoal.experiments.planning import make_plan
@@ -157,7 +156,6 @@ def sweep(
     *,
     force: bool = False,
     quiet: bool = False,
-    confirm: Callable[[str], None] | None = None,
     go_on: str = AGAIN,
     only: Set[str] = frozenset(),
 ) -> Path:
@@ -165,12 +163,12 @@ def sweep(
 
     It may be killed and started again at any time: finished cells are recognised and never run again, others continue
     at their checkpoints. ``force``: make finished ones anew; without it those that the plan names. ``only``: run none
-    but these. ``confirm`` is called before something long begins and raises if the answer is no. A user who interrupts
+    but these. A user who interrupts
     the sweep reads ``go_on``. Another process that runs it, another sweep's folder, or a cell that failed is a
     ``UserError``.
     """
     say = _speaker(quiet)
-    with _begun(planned, out, force, say, confirm, only) as (planned, todo):
+    with _begun(planned, out, force, say, only) as (planned, todo):
         try:
             outcome = run_cells(_alone(planned, todo) if only else planned, out, say=say)
         except KeyboardInterrupt as error:
@@ -198,13 +196,12 @@ def submit(
     options: slurm.Options,
     *,
     quiet: bool = False,
-    confirm: Callable[[str], None] | None = None,
     only: Set[str] = frozenset(),
 ) -> list[dict[str, Any]]:
     """Submit unfinished cells to Slurm; arguments and errors as of :func:`sweep`, returns the jobs."""
     slurm.check(out, options)
     at_once = options.cap or len(planned.cells)  # an upper bound: who else is in the queue is not known
-    with _begun(replace(planned, workers=at_once), out, False, _speaker(quiet), confirm, only) as (planned, todo):
+    with _begun(replace(planned, workers=at_once), out, False, _speaker(quiet), only) as (planned, todo):
         if not only:
             done = done_of(planned, out)
             todo = [cell for cell in planned.cells if cell.out not in done or not is_finished(cell)]
@@ -228,10 +225,9 @@ def _begun(
     out: Path,
     force: bool,
     say: Callable[[str], None],
-    confirm: Callable[[str], None] | None,
     only: Set[str],
 ) -> Iterator[tuple[Plan, list[Cell]]]:
-    """Before the first cell: check the folder, forecast the cost, ask, write the plan; it and the cells to run."""
+    """Before the first cell: check the folder and write the plan; returns it and the cells to run."""
     if out.exists() and not out.is_dir():
         raise UserError("a run needs a folder, this is a file", out, "Choose another --out.")
     check_parent(out)
@@ -248,7 +244,8 @@ def _begun(
             names = {cell.name for cell in before.cells} | anew
             unplanned = [cell for cell in planned.cells if cell.name not in names and stamp_of(cell)]
             planned = replace(planned, anew=before.anew | anew)
-        _forecast(replace(planned, cells=todo) if only else planned, todo, say, confirm)
+        if not only and len(todo) < len(planned.cells):
+            say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
         (out / records.LOGS).mkdir(parents=True, exist_ok=True)
         for folder in (out, out / records.LOGS):
             sweep_up(folder)
@@ -275,19 +272,6 @@ def _before(planned: Plan, out: Path) -> tuple[Plan, str]:
         return records.read_plan(out), ""
     except records.LostPlan as error:
         return empty, error.what
-
-
-def _forecast(
-    planned: Plan, todo: Sequence[Cell], say: Callable[[str], None], confirm: Callable[[str], None] | None
-) -> None:
-    """Say what the cells left will cost, and ask before a long sweep."""
-    if len(todo) < len(planned.cells):
-        say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
-    lines = cost_lines(todo, planned.workers) if todo else []
-    for line in lines:
-        say(line)
-    if confirm is not None and wall_seconds(todo, planned.workers) > LONG_SECONDS:
-        confirm(lines[-1])
 
 
 def _check_unplanned(unplanned: list[Cell], lost: str, planned: Plan, out: Path, say: Callable[[str], None]) -> None:

@@ -14,7 +14,6 @@ from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain, require_one_kind
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.meta.training import check_start, cut, played_world, write_layout
-from hypogoal.needs import baseline_needs
 from hypogoal.options.tables import Episodes
 
 
@@ -65,13 +64,11 @@ def train_baseline(
     require_one_kind(engine)
     if data and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
-    size = EngineEnv(engine).observation_space.sample().nbytes
-    needs = baseline_needs(size, played.played_bytes(config.steps, 0), config.steps, chosen)
     settings = as_dict(config) | {"domain": domain, "domain_config": world}
     settings |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
     artefact: dict[str, Any] = {"kind": "baseline", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
-    with training("train-baseline", out, needs, **how, **artefact) as work:
+    with training("train-baseline", out, **how, **artefact) as work:
         env = EngineEnv(engine)
         agent = train(env, chosen, config.steps, seed, work.log, work.progress, work.checkpoints, device)
         work.progress.update(config.steps)

@@ -31,7 +31,6 @@ from hypogoal.hypotheses.proposals import agreements, search_steps
 from hypogoal.hypotheses.scores import best_mean_worst, member_scores
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.hypotheses.views import StateOrigins, positions_of
-from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
 HELDOUT, LOOKED_AT = "heldout", 100  # in what the stage returns; states of each class, cheap beside training
@@ -77,10 +76,9 @@ def train_ensemble(
     settings |= {"observation_dtype": type_text(dataset.observation_dtype)}
     settings |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
-    needs = ensemble_needs(data, others or (data,), config, steps_of(config), workers, device)
     steps = len(sub_goals) * (steps_of(config) + search_steps(config))
     artefact: dict[str, Any] = {"kind": "ensemble", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    with training("train-ensemble", out, needs, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
+    with training("train-ensemble", out, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
         folder, parts = work.folder, work.folder.parent / FOLDER
         jobs = []
         for sub_goal in sub_goals:

@@ -21,7 +21,6 @@ from hypogoal.meta.training import (
     train,
     write_trained,
 )
-from hypogoal.needs import play_needs
 from hypogoal.options.tables import Episodes
 
 FIXED = (  # as of the options trained before
@@ -57,12 +56,11 @@ def train_meta(
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
-    start_arguments(domain, config, 1, seed)  # refuse an impossible start before estimating the cost
+    start_arguments(domain, config, 1, seed)  # refuse an impossible start before any work
     settings = description(domain, source.config, config, **steps_spent(practice))
-    needs = play_needs(domain, source.config, config)
     artefact: dict[str, Any] = {"kind": "meta", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
-    with training("train-meta", out, needs, **how, **artefact) as work:
+    with training("train-meta", out, **how, **artefact) as work:
         loop = assemble(domain, source.path, source.config, config, seed, device)
         recorder = loop.recorder
         if practice:

@@ -19,7 +19,6 @@ from hypogoal.meta.training import (
     train,
     write_trained,
 )
-from hypogoal.needs import play_needs
 
 # As of the options trained before.
 FIXED = ("network", "recurrence", "embedding", "termination")
@@ -52,13 +51,12 @@ def train_options(
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
-    start_arguments(domain, config, 1, seed)  # refuse an impossible start before estimating the cost
+    start_arguments(domain, config, 1, seed)  # refuse an impossible start before any work
     steps = config.steps * (options_of(source.config, config) if config.steps_for == "each" else 1)
     settings = description(domain, source.config, config, steps=steps)
-    needs = play_needs(domain, source.config, config)
     artefact: dict[str, Any] = {"kind": "options", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     how: dict[str, Any] = {"steps": steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
-    with training("train-options", out, needs, **how, **artefact) as work:
+    with training("train-options", out, **how, **artefact) as work:
         loop = assemble(domain, source.path, source.config, config, seed, device)
         if practice:
             continue_with(loop, practice)

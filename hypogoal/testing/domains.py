@@ -4,7 +4,6 @@ import dataclasses
 import traceback
 import warnings
 from collections.abc import Iterator, Mapping
-from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.config import from_values, meant, resolve
 from hypogoal.core.own_code import UsersCode
-from hypogoal.core.preflight import human
-from hypogoal.core.progress import Progress, duration
+from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import (
     GET_MORE,
@@ -28,15 +26,9 @@ from hypogoal.dataset import (
 )
 from hypogoal.domains.base import Domain, Engine, Step
 from hypogoal.settings import CONFIGS
-from hypogoal.testing.verdict import Test, TimeUp, Verdict, promise, run
+from hypogoal.testing.verdict import Test, Verdict, promise, run
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
-LEAST_STEPS = 4  # of those STEPS, however slow the environment is
-PLAYS = 6  # how many times the tests of an engine play these steps
-SECONDS = 120.0  # the most that a check takes
-TIMED_SECONDS, TIMED_STEPS = 1.0, 5  # play needed to estimate a step's time, whichever is shorter
-TINY = 1e-9  # seconds
-ENGINE_SHARE, COLLECTING_SHARE = 1 / 3, 0.8  # of the time left when the check is planned
 IGNORED_WARNINGS = ("is different from the unwrapped version",)  # of Gymnasium's checker: wrappers are the point
 DETERMINISM = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."
 
@@ -47,40 +39,22 @@ def check_domain(
     *,
     layout_seed: int = 0,
     seed: int = 0,
-    seconds: float = SECONDS,
     progress: Progress | None = None,
 ) -> Iterator[Verdict]:
     """Whether a domain keeps the promises that the stages rely on.
 
     Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
-    (None: the defaults). ``seed`` is for both. It plays less of a slow domain, so that it takes at most about
-    ``seconds``; what it then skips is a warning, and so is a sub-goal that play does not reach. ``progress`` shows
-    how long this takes.
+    (None: the defaults). ``seed`` is for both. A sub-goal that play does not reach is a warning. ``progress`` shows
+    how far collecting is.
     """
     progress = progress or Progress("check", total=1, quiet=True)
-    progress.expect(PLAYS * COUNT * STEPS)
-    yield from run(_Contract(domain, config, layout_seed, seed, seconds, progress).tests())
-    progress.expect(progress.done)
+    yield from run(_Contract(domain, config, layout_seed, seed, progress).tests())
 
 
 class _Contract:
-    def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int, seconds: float, progress: Progress):
+    def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int, progress: Progress):
         self.domain, self.config, self.layout_seed, self.seed = domain, config, layout_seed, seed
-        self.seconds, self.progress = seconds, progress
-        self.end, self.reached_all = monotonic() + seconds, True
-        self.count = STEPS  # of each test of an engine
-        self.spent, self.played = 0.0, 0  # seconds in ``steps``, and steps of single environments, for the pace
-
-    @property
-    def pace(self) -> float:
-        """Seconds per step of one environment, new episodes and labels included."""
-        return max(self.spent, TINY) / max(1, self.played)
-
-    def require_time(self) -> None:
-        """Raise ``TimeUp`` if time is up."""
-        if monotonic() > self.end:
-            do = "Give it more with --minutes, or seconds= in Python."
-            raise TimeUp(f"the {duration(self.seconds)} that a check may take are over", None, do)
+        self.progress, self.reached_all = progress, True
 
     def tests(self) -> Iterator[Test]:
         yield "names", self.names
@@ -172,7 +146,7 @@ class _Contract:
     def steps(self) -> str:
         engine = self.make_engine()
         ended = played = 0
-        for actions in self.actions(engine, timed=True):
+        for actions in self.actions(engine):
             played += 1
             before = engine.elapsed.copy()
             step: Step = engine.step(actions)
@@ -215,14 +189,14 @@ class _Contract:
             text = f"{ambiguous} of {len(rows)} observations have different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=2)
         counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, positives, strict=True))
-        return f"held in random play, of {self.count * COUNT} states: {counts}"
+        return f"held in random play, of {STEPS * COUNT} states: {counts}"
 
     def determinism(self) -> str:
         first, second = self.make_engine(), self.make_engine()
         for number, actions in enumerate(self.actions(first), 1):
             where = f"two engines of layout_seed {self.layout_seed}, step {number}"
             _same_step(first, second, actions, where, DETERMINISM)
-        return f"two engines of one layout seed stay the same for {self.count} steps"
+        return f"two engines of one layout seed stay the same for {STEPS} steps"
 
     def going_on(self) -> str:
         saved = self.make_engine()
@@ -231,7 +205,7 @@ class _Contract:
             warnings.warn(text, stacklevel=2)
             return "not looked at"
         actions = self.actions(saved)
-        for _ in range(self.count // 2):
+        for _ in range(STEPS // 2):
             saved.step(next(actions))
         restored = self.make_engine()
         restored.restore(saved.snapshot())
@@ -241,8 +215,9 @@ class _Contract:
         return "a restored engine goes on as the one it was saved from"
 
     def collect(self) -> Collected:
+        self.progress.resume(0)
         try:
-            return self.domain.collect(self.collected_with, self.seed, _Collecting(self))
+            return self.domain.collect(self.domain.small(self.config), self.seed, self.progress)
         except Unmet as error:
             if error.collected is None:
                 raise
@@ -250,15 +225,6 @@ class _Contract:
             return error.collected
 
     def collection(self) -> str:
-        self.collected_with = self.domain.small(self.config)
-        planned = self.domain.collected_steps(self.collected_with)
-        affordable = int(COLLECTING_SHARE * (self.end - monotonic()) / 2 / self.pace)
-        self.hurried = planned > affordable
-        if self.hurried:
-            self.collected_with = self.domain.shortened(self.collected_with, affordable)
-            steps = self.domain.collected_steps(self.collected_with)
-            text = f"played {steps:,} of the {planned:,} steps that 'collect' plays, for want of time"
-            warnings.warn(f"{text}: --minutes gives it more", stacklevel=2)
         self.collected = self.collect()
         goals = len(self.domain.usual_sub_goals)
         text = f"the states' sub_goals are {self.collected.sub_goals}"
@@ -276,9 +242,7 @@ class _Contract:
             for origin, values in states.origins.items():
                 fits = values.shape == (count,) and values.dtype.kind in "iu"
                 promise(fits, f"{name} origin {origin} is {values.dtype} {values.shape}", f"Give int ({count},).")
-        counts = ", ".join(f"{len(states.observations)} {name}" for name, states in _sets(self.collected))
-        size = self.domain.collected_bytes(self.config)
-        return f"{counts}; 'collect' keeps up to {human(size)}, twice that in memory" if size else counts
+        return ", ".join(f"{len(states.observations)} {name}" for name, states in _sets(self.collected))
 
     def classes(self) -> str:
         text = []
@@ -328,41 +292,15 @@ class _Contract:
     def never_reached(self, goal: str, always: bool) -> str:
         """The warning about a sub-goal that held in none, or in all (``always``), of the labelled states."""
         text = f"{goal} held in {'every' if always else 'no'} state that play met on the labelled layouts, "
-        text += "in the time that there was: " if self.hurried else "so 'collect' would stop here: "
+        text += "so 'collect' would stop here: "
         text += f"it is {'hard to leave' if always else 'rare'}, or its function errs"
         return f"{text}. {GET_MORE}"
 
-    def actions(self, engine: Engine, *, timed: bool = False) -> Iterator[NDArray[np.int64]]:
-        """Random actions (E,), the same at every call; ``timed``: play less from now on if the first steps are slow."""
+    def actions(self, engine: Engine) -> Iterator[NDArray[np.int64]]:
+        """Random actions (E,), the same at every call."""
         rng = rng_for(self.seed, "check")
-        number = 0
-        while number < self.count:
-            self.require_time()
-            started, number = monotonic(), number + 1
+        for _ in range(STEPS):
             yield rng.integers(engine.n_actions, size=COUNT)
-            if timed:
-                self.spent += monotonic() - started
-                self.played += COUNT
-            if timed and (self.spent >= TIMED_SECONDS or number == TIMED_STEPS):
-                affordable = int(ENGINE_SHARE * (self.end - monotonic()) / (PLAYS * COUNT * self.pace))
-                self.count = min(self.count, max(LEAST_STEPS, affordable))
-            self.progress.advance(COUNT)
-
-
-class _Collecting(Progress):
-    """The progress of collecting, as a part of a check's, which ends when its time is up."""
-
-    def __init__(self, check: _Contract):
-        super().__init__("collect", total=1, quiet=True)
-        self.check = check
-
-    def expect(self, total: int) -> None:
-        self.check.progress.expect(self.check.progress.done + total)
-
-    def update(self, done: int, **numbers: float) -> None:
-        self.check.progress.advance(done - self.done)
-        self.done = done
-        self.check.require_time()
 
 
 def _sets(collected: Collected) -> list[tuple[str, States]]:

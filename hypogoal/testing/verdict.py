@@ -12,10 +12,6 @@ from hypogoal.dataset import Unmet
 Test = tuple[str, Callable[[], str]]
 
 
-class TimeUp(UserError):
-    """A check ran out of time: the rest is skipped, which breaks no promise."""
-
-
 def promise(kept: bool, fault: str, do: str) -> None:
     """Raise a ``UserError``, with what is wrong and what to do about it, unless a promise is ``kept``."""
     if not kept:
@@ -48,8 +44,8 @@ class Verdict:
 def run(tests: Iterable[Test]) -> Iterator[Verdict]:
     """Run tests, pairs of a name and a function, until one fails: later ones build on earlier ones.
 
-    A function returns its finding, or raises. Its warnings are kept. If time is up, or play did not reach the states
-    that later tests need, the rest is skipped, which is no failure.
+    A function returns its finding, or raises. Its warnings are kept. If play did not reach the states that later tests
+    need, the rest is skipped, which is no failure.
     """
     tests = iter(tests)
     for name, test in tests:
@@ -59,7 +55,7 @@ def run(tests: Iterable[Test]) -> Iterator[Verdict]:
             try:
                 with UsersCode("what is checked"):
                     text = test()
-            except (TimeUp, Unmet) as error:
+            except Unmet as error:
                 text, over = "not looked at to the end", True
                 warnings.warn(str(error), stacklevel=1)
                 if rest := [later for later, _ in tests]:

@@ -67,7 +67,7 @@ workers = 2
 axes = { seed = [0, 1], layout = "210-211" }
 cells = [
   { name = "data", command = "collect doorkey --set heldout_layouts=1" },
-  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}", minutes = 1.5 },
+  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}" },
   { name = "ppo", axes = ["seed", "layout"], command = "train-baseline doorkey --layout-seed {layout}" },
 ]
 """
@@ -94,6 +94,7 @@ def make_seeds(root: Path) -> None:
     write_dataset(root / "data.h5", collected, domain="doorkey", config={"a": [1, 2]}, seed=3)
     about = {"sub_goals": list(SUB_GOALS), "members": MEMBERS, "network": NETWORK, "observation_shape": list(SHAPE)}
     about |= {"domain": "doorkey", "domain_config": {"wrong_key": "harmless"}, "diversity": "dbat", "view": "full"}
+    about["observation_dtype"] = "uint8"
     with create_artefact(root / "ensemble", kind="ensemble", config=about, seed=0, inputs=[root / "data.h5"]) as folder:
         for sub_goal in SUB_GOALS:
             write_ensemble(folder, sub_goal, Ensemble(NETWORK, SHAPE, MEMBERS, torch_generator(0, sub_goal)))

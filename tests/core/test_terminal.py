@@ -61,7 +61,7 @@ def test_prose_wraps_at_words_on_a_terminal_alone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither a number nor a command is broken; a pipe gets one line, and what is to be copied is one everywhere."""
-    text = "train-ensemble: needs about 914 MB of memory, then train-options --option-timeout 118 or 0-9"
+    text = "train-ensemble: 914 of 1,000 steps in 26 s, then train-options --option-timeout 118 or 0-9"
     say(text, wrap=True)
     assert capsys.readouterr().out == f"{text}\n"
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
@@ -94,7 +94,7 @@ def test_nothing_in_a_strangers_folder_drives_a_terminal(
     (made / f"c{payload}").write_text("x")
     run = tmp_path / "run"
     cell = {"name": "d[red]x", "arguments": ["collect", "doorkey"], "out": "{run}/x.h5", "needs": [], "axes": {}}
-    cell |= {"seconds": 1, "memory": 1, "disk": 1, "cores": 1}
+    cell["cores"] = 1
     plan = {"format": 1, "experiment": f"e{told}", "workers": 1, "factor": 1, "cells": [cell]}
     (run / PLAN).write_text(json.dumps(plan))
     (run / LOGS).mkdir()
@@ -204,7 +204,7 @@ def test_no_command_waits_for_what_is_no_file(tmp_path: Path) -> None:
         (draft / name).parent.mkdir(parents=True, exist_ok=True)
         (draft / name).write_text("{}")
     cell = {"name": "a", "arguments": ["collect", "doorkey"], "out": "{run}/data.h5", "needs": [], "axes": {}}
-    cell |= {"seconds": 1, "memory": 1, "disk": 1, "cores": 1}
+    cell["cores"] = 1
     (run / PLAN).write_text(json.dumps({"format": 1, "experiment": "x", "workers": 1, "factor": 1, "cells": [cell]}))
     (run / LOGS).mkdir()
     for name in (f"{LOGS}/a.log", f"{LOGS}/a.json", "run.json", "results.csv"):

@@ -20,7 +20,7 @@ from hypogoal.core import own_code
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
-from hypogoal.experiments.cells import Cell, Cost, Plan
+from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import read_plan, read_record
 from hypogoal.experiments.runners.slurm import MOST_ELEMENTS, Options, arrays, submit
 from hypogoal.experiments.status import read_status
@@ -33,8 +33,7 @@ OUT = Path("runs/x")
 
 def some_plan(seeds: int = 3) -> Plan:
     data = Cell("data", ("collect", "doorkey"), OUT / "data.h5")
-    cost = Cost(60.0, 1e9, 2)
-    ensembles = [Cell(f"e-{n}", ("train-ensemble",), OUT / f"e-{n}", (data.out,), cost) for n in range(seeds)]
+    ensembles = [Cell(f"e-{n}", ("train-ensemble",), OUT / f"e-{n}", (data.out,), 2) for n in range(seeds)]
     ppo = [Cell(f"ppo-{n}", ("train-baseline",), OUT / f"ppo-{n}") for n in range(seeds)]
     end = Cell("evaluate", ("evaluate",), OUT / "evaluation", tuple(cell.out for cell in [*ensembles, *ppo]))
     return Plan("x", [data, *ensembles, *ppo, end], 2)
@@ -76,7 +75,7 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     plan, out = some_plan(), tmp_path / "a run"
-    asked = Options("long", "4:00:00", "", 1, 0, 7, 90, ("--account=x",))
+    asked = Options("long", "4:00:00", "2G", 1, 0, 7, 90, ("--account=x",))
     with own_code.given("mine:net"):
         jobs = submit(plan, out, plan.cells, asked)
     assert [job["name"] for job in jobs] == [
@@ -90,7 +89,7 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         "#SBATCH --time=4:00:00",
         "#SBATCH --gres=gpu:1",
         "#SBATCH --cpus-per-task=2",
-        "#SBATCH --mem=2194M",
+        "#SBATCH --mem=2G",
         "#SBATCH --signal=B:USR2@90",
         "#SBATCH --requeue",
         "#SBATCH --account=x",

@@ -396,16 +396,6 @@ def test_a_sweep_killed_at_random_ends_with_the_same_results(tmp_path: Path) -> 
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_a_long_sweep_asks_first_where_somebody_can_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G4: no, and nothing is begun; --yes does not ask."""
-    toy, out = write_toy(tmp_path / "toy.toml"), tmp_path / "out"
-    toy.write_text(toy.read_text() + "minutes = 600\n")
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("typer.confirm", lambda *_, **__: False)
-    assert main(["sweep", str(toy), "--out", str(out), "-q"]) == 1
-    assert not out.exists()
-
-
 WARNED_AT_ONCE = """
 import os, signal, sys
 from hypogoal.cli import main

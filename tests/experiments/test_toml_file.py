@@ -23,7 +23,7 @@ format = 1
 axes = { seed = [0, 1], layout = "210-212" }
 cells = [
   { name = "data", command = "collect doorkey --seed 3" },
-  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}", minutes = 2, memory_gb = 1.5 },
+  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}" },
   { name = "agent", axes = ["seed", "layout"], command = "train-meta {ensemble} --layout-seed {layout} --seed {seed}" },
 ]
 """
@@ -47,8 +47,6 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
     )
     assert one.needs == (OUT / "ensemble/seed-1",)
     assert one.axes == (("group", "agent"), ("seed", 1), ("layout", 212))
-    ensemble = next(cell for cell in plan.cells if cell.stage == "train-ensemble")
-    assert (ensemble.cost.seconds, ensemble.cost.memory) == (120, 1.5e9)
     assert [cell.name for cell in plan.cells[-2:]] == ["evaluate", "report"]
     assert set(plan.cells[-2].needs) == {cell.out for cell in plan.cells[:-2]}
 
@@ -65,11 +63,10 @@ def test_axes_from_the_command_line(tmp_path: Path) -> None:
     [("", 5), ("--set workers=2", 2), ("--set workers=9", 5), ("--set sub_goals=open-red-door,take-red-key", 2)],
 )
 def test_ensembles_get_a_process_for_each_sub_goal(tmp_path: Path, more: str, cores: int) -> None:
-    """Spec G4: as many processors are asked for as it can use, and a gigabyte for each process not spoken of."""
+    """Spec G4: as many processors are asked for as it can use."""
     plan = planned(tmp_path, GOOD.replace("train-ensemble {data}", f"train-ensemble {{data}} {more}"))
-    costs = {cell.stage: cell.cost for cell in plan.cells}
-    assert (costs["train-ensemble"].cores, costs["train-ensemble"].memory) == (cores, 1.5e9)
-    assert (costs["train-meta"].cores, costs["train-meta"].memory) == (1, 1e9)
+    found = {cell.stage: cell.cores for cell in plan.cells}
+    assert (found["train-ensemble"], found["train-meta"]) == (cores, 1)
 
 
 def test_values_may_have_a_dot(tmp_path: Path) -> None:
@@ -91,13 +88,13 @@ def test_the_example_is_one() -> None:
         ("format = 1", "format = 1\ndomain = 'doorkey'"),
         ("format = 1", "format = 1\nsettings.seeds.value = [0]"),
         ("format = 1", "format = 1\npairs = { paired = ['seed', 'layout'] }"),
-        ("minutes = 2", "for = ['seed']"),
-        ("minutes = 2", "evaluated = false"),
+        ('axes = ["seed"],', "for = ['seed'],"),
+        ('axes = ["seed"],', "minutes = 2,"),
         ('axes = ["seed"]', 'axes = { seed = "seed" }'),
     ],
 )
 def test_the_language_of_before_is_refused_with_what_to_do(tmp_path: Path, before: str, after: str) -> None:
-    """Spec G2: what experiments in TOML could say until 0.15."""
+    """Spec G2: what experiments in TOML could say once."""
     with pytest.raises(UserError, match=r"in an experiment.* or write a Python function"):
         planned(tmp_path, GOOD.replace(before, after))
 
@@ -107,9 +104,8 @@ def test_the_language_of_before_is_refused_with_what_to_do(tmp_path: Path, befor
     [
         ("format = 1", "format = 2", "format must be 1"),
         ("format = 1", "format = 1\nsubmit = 'rm'", "no such key"),
-        ("minutes = 2", "minuets = 2", "no such key"),
-        ("minutes = 2", "minutes = nan", "minutes and memory_gb"),
-        ("minutes = 2", "minutes = true", "wrong kind"),
+        ('axes = ["seed"],', "axis = ['seed'],", "no such key"),
+        ('axes = ["seed"],', "axes = true,", "wrong kind"),
         ("train-meta {", "rm -rf {", "must be a stage"),
         ("train-meta {", "train-meta --out /tmp/x {", "given by the sweep"),
         ("train-meta {", "train-meta --force {", "given by the sweep"),

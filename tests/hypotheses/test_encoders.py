@@ -117,6 +117,7 @@ def test_large_networks_are_members(network: str, tmp_path: Path) -> None:
 
     write_ensemble(tmp_path, "goal", ensemble)
     about = {**dataclasses.asdict(config), "observation_shape": list(images.shape[1:]), "sub_goals": ["goal"]}
+    about["observation_dtype"] = "uint8"
     back = read_ensemble(tmp_path, about, "goal")
     np.testing.assert_array_equal(back.logits(images), ensemble.logits(images))
 

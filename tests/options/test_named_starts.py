@@ -55,7 +55,7 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
     shape = domain.observation_shape
     config = {
         "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
-        "network": network, "observation_shape": list(shape),
+        "network": network, "observation_shape": list(shape), "observation_dtype": "uint8", "view": "full",
     }  # fmt: skip
     with create_artefact(folder, kind="ensemble", config=config, seed=0, inputs=[]) as place:
         for number, sub_goal in enumerate(domain.usual_sub_goals):

@@ -31,7 +31,8 @@ QUICK = {
 def ensemble_in(folder: Path, seed: int = 0) -> Path:
     """An ensemble artefact of two members with random weights."""
     config = {"domain": "montezuma", "domain_config": {}, "sub_goals": list(DOMAIN.usual_sub_goals), "members": 2,
-              "observation_shape": list(SHAPE), "network": "montezuma"}  # fmt: skip
+              "observation_shape": list(SHAPE), "observation_dtype": "uint8", "view": "full",
+              "network": "montezuma"}  # fmt: skip
     with create_artefact(folder, kind="ensemble", config=config, seed=seed, inputs=[]) as place:
         ensemble = Ensemble("montezuma", SHAPE, 2, torch.Generator().manual_seed(1))
         write_ensemble(place, DOMAIN.sub_goals[0], ensemble)

@@ -20,7 +20,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data.arrays import read_arrays
 from hypogoal.own_data.images import read_image, read_images
-from hypogoal.own_data.minari import read_minari
 from hypogoal.own_data.parts import Parts, collected_of, held_out
 
 SIDE = 48
@@ -294,23 +293,6 @@ def test_a_name_that_is_no_utf_8_is_imported(tmp_path: Path) -> None:
     np.savez(tmp_path / "own\udcff.npz", **arrays())
     assert main(["import", str(tmp_path / "own\udcff.npz"), "--out", str(tmp_path / "data.h5"), "-q"]) == 0
     assert open_dataset(tmp_path / "data.h5").config["source"] == "own?.npz"
-
-
-def test_what_is_to_be_imported_is_weighed_with_its_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G2: states are held several times over while they are looked at; images and episodes are weighed too."""
-    np.savez(tmp_path / "own.npz", **arrays())
-    size = sum(values.nbytes for values in arrays().values())
-    folder, dataset = save_images(tmp_path / "images"), save_minari(tmp_path / "episodes")
-    with h5py.File(dataset / "data" / "main_data.hdf5", "a") as file:
-        for number in range(10, 60):  # the same bytes again and again
-            file[f"episode_{number}/observations"] = file["episode_0/observations"]
-    monkeypatch.setattr("hypogoal.own_data.parts.free_memory", lambda: size)
-    with pytest.raises(UserError, match=r"need 2\.1 MB of memory, 525 kB are free: .*own\.npz"):
-        read_arrays(tmp_path / "own.npz")
-    with pytest.raises(UserError, match=r"need 1\.1 MB of memory, 525 kB are free: .*images"):
-        read_images(folder)
-    with pytest.raises(UserError, match=r"need 10\.0 MB of memory, 525 kB are free: .*main_data"):
-        read_minari(dataset, [at_right])
 
 
 def save_images(folder: Path, *, held: bool = True, grey: bool = False) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import random
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from hypogoal.domains import base as bases
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.hypotheses.networks import NETWORKS
-from hypogoal.testing import Verdict, check_domain, check_network, check_objective, domains, require
+from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
 from tests.attacks.own_code import FAMILIES
 
 TESTS = Path(__file__).parents[1]
@@ -227,68 +226,6 @@ def test_a_label_of_the_way_there_is_named() -> None:
         assert "asked twice in the same state, labels differ: odd. A label is a function of the state" in fault.text
     both = ("left-end", "right-end")
     require(check_domain(GymnasiumDomain(CorridorEnv, both, labels=all_labels, success=swift), small))
-
-
-class Slow:
-    """A clock, and domains whose environments take some of its seconds, so that nobody needs to wait for them."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch):
-        self.now = 0.0
-        monkeypatch.setattr(domains, "monotonic", lambda: self.now)
-
-    def domain(self, step: float, reset: float = 0.0, make: float = 0.0) -> GymnasiumDomain:
-        clock = self
-
-        class Env(CorridorEnv):
-            def __init__(self) -> None:
-                clock.now += make
-
-            def reset(self, **kwargs: Any) -> Any:
-                clock.now += reset
-                return super().reset(**kwargs)
-
-            def step(self, action: int) -> Any:
-                clock.now += step
-                return super().step(action)
-
-        return GymnasiumDomain(Env, SUB_GOALS)
-
-
-@pytest.mark.parametrize(
-    ("step", "reset", "minutes"), [(0.051, 0.0, 2), (0.051, 0.0, 5), (0.002, 0.5, 2), (0.4, 0.4, 2), (1.0, 0.0, 2)]
-)
-def test_a_slow_domain_takes_no_longer_than_it_may(
-    step: float, reset: float, minutes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Spec B6: it is timed, less is played, and all is looked at."""
-    clock = Slow(monkeypatch)
-    verdicts = list(check_domain(clock.domain(step, reset), seconds=60 * minutes))
-    require(verdicts)
-    assert verdicts[-1].name == "collected again" and verdicts[-1].text == "the same states for the same seed"
-    assert 30 * minutes < clock.now < 66 * minutes, "seconds"
-    (told,) = (verdict.warnings for verdict in verdicts if verdict.name == "collection")
-    assert re.match(r"played [\d,]+ of the 39,000 steps that 'collect' plays, for want of time: --minutes", told[0])
-
-
-def test_what_there_is_no_time_for_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6: it ends where it is, and no promise is broken by that: too slow a step, too slow to make."""
-    clock = Slow(monkeypatch)
-    for domain in (clock.domain(30.0), clock.domain(0.0, make=20.0)):
-        *_, last = check_domain(domain)
-        assert last.ok and last.text == "not looked at to the end"
-        assert "the 2 min that a check may take are over. Give it more with --minutes" in last.warnings[0]
-        assert last.warnings[1].startswith("not looked at: ") and last.warnings[1].endswith("collected again")
-
-
-def test_a_quick_domain_is_looked_at_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6."""
-    clock = Slow(monkeypatch)
-    few = GymnasiumConfig(steps=500, heldout_seeds=(4, 5))
-    with Progress("check", total=1) as progress:
-        verdicts = list(check_domain(clock.domain(0.01), few, progress=progress))
-    require(verdicts)
-    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["classes"]
-    assert progress.done == progress.total == 5_720
 
 
 @pytest.mark.parametrize(("domain", "goal", "word"), [(NEVER, "on-the-moon", "no"), (ALWAYS, "somewhere", "every")])

@@ -11,7 +11,6 @@ from typing import BinaryIO
 from hypogoal.core.drafts import unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import environment_of_children
-from hypogoal.core.preflight import free_memory
 from hypogoal.core.workers import CORES, PYTHON, die_with_parent
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import Record, begun, last_line, log_of, open_log, read_record, write_record
@@ -102,7 +101,7 @@ class Outcome:
 
 
 def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool = False) -> Outcome:
-    """Run unfinished cells in the plan's order, as many at once as cores and memory allow.
+    """Run unfinished cells in the plan's order, as many at once as cores allow.
 
     A failing cell stops only those that need it. ``say`` gets messages on the progress. ``check``: all are complete;
     the stage of each only checks that its command would make the existing output.
@@ -112,7 +111,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
     startable: list[Cell] = []
     running: list[Running] = []
     done: set[Path] = set()
-    budget, reported = free_memory(), time.monotonic()
+    reported = time.monotonic()
 
     def fail(cell: Cell, reason: str) -> None:
         outcome.failed[cell.name] = reason
@@ -132,7 +131,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                 except UserError as error:
                     fail(cell, str(error))
             startable.sort(key=lambda cell: places[cell.name])  # not first those that wait for nothing
-            while startable and (cores := _allotted(startable, running, plan.workers, budget)):
+            while startable and (cores := _allotted(startable, running, plan.workers)):
                 cell = startable.pop(0)
                 try:
                     running.append(start(cell, run, cores=cores, force=cell.name in plan.anew, check=check))
@@ -160,16 +159,13 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
             started.ended(started.process.wait())
 
 
-def _allotted(startable: list[Cell], running: list[Running], workers: int, budget: int | None) -> int:
+def _allotted(startable: list[Cell], running: list[Running], workers: int) -> int:
     """How many processes the next cell gets; 0: it has to wait.
 
     It does not wait for all the cores that it could use, or small cells would always go first. Cells that can start at
     the same time share the cores.
     """
-    cost = startable[0].cost
     free = workers - sum(started.cores for started in running)
-    cores = max(1, min(cost.cores, free // len(startable))) if free > 0 else 0
-    if budget is None or not running or not cost.memory:  # the first always runs; its stage refuses too little memory
-        return cores
-    left = budget - sum(started.cell.cost.memory * started.cores for started in running)
-    return min(cores, max(0, int(left // cost.memory)))
+    if free <= 0:
+        return 0
+    return max(1, min(startable[0].cores, free // len(startable)))

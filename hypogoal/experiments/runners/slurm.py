@@ -36,8 +36,6 @@ from hypogoal.experiments.status import is_finished, to_remake
 
 FOLDER, JOBS = "slurm", "jobs.json"
 MOST_ELEMENTS = 1000  # of an array: Slurm's default limit is 1001
-LEAST_MEMORY = 500e6
-MARGIN, BESIDE = 1.1, 100e6  # factor on estimates, as some clusters kill at the limit; bytes of the job itself
 CANCEL_SECONDS = 120.0
 GATHER = "gather"
 SLOW = "nothing new could be saved before the time limit: give a longer --time, or an earlier --warn"
@@ -46,7 +44,7 @@ STOPPED = (128 + signal.SIGTERM, -signal.SIGTERM)  # exit codes after SIGTERM; t
 
 @dataclass(frozen=True)
 class Options:
-    """What every cell requests from Slurm; empty values are left to Slurm, or estimated (memory, cpus)."""
+    """What every cell requests from Slurm; empty values are left to Slurm."""
 
     partition: str = ""
     time: str = ""  # limit of a cell, as ``sbatch --time`` takes it
@@ -137,14 +135,13 @@ def _script(array: Array, run: Path, options: Options) -> str:
     out = shlex.quote(str(run))
     last = f"exec {shlex.join(PYTHON)} -m hypogoal sweep --out {out}"
     if array.cells:
-        cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
-        memory = max(cell.cost.memory for cell in array.cells)
+        cpus = options.cpus or max(cell.cores for cell in array.cells)
         settings += [
             f"--array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
             f"--cpus-per-task={cpus}",
             "--requeue",
             f"--signal=B:USR2@{options.warn}",
-            *([f"--mem={options.memory or _megabytes(cpus * memory)}"] if options.memory or memory else []),
+            *([f"--mem={options.memory}"] if options.memory else []),
             *([f"--time={options.time}"] if options.time else []),
             *([f"--gres=gpu:{options.gpus}"] if options.gpus else []),
         ]
@@ -156,14 +153,9 @@ def _script(array: Array, run: Path, options: Options) -> str:
             f'{last} --cell "$1"',
         ]
     else:
-        settings.append(f"--mem={_megabytes(0)}")
         commands = [f"{last} --gather"]
     head = ["#!/bin/sh", *(f"#SBATCH {setting}" for setting in settings)]
     return "\n".join([*head, f"cd {shlex.quote(str(Path.cwd()))} || exit 1", *commands, ""])
-
-
-def _megabytes(estimated: float) -> str:
-    return f"{ceil((MARGIN * max(estimated, LEAST_MEMORY) + BESIDE) / 2**20)}M"
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
