@@ -26,7 +26,7 @@ from hypogoal.hypotheses.wrappers import SubgoalReward, ensemble_at
 from hypogoal.inspection import describe_path, lines, numbers_in, outcome
 from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.learner import make_policies
-from hypogoal.options.termination import rule_of
+from hypogoal.options.termination import rule_of, set_thresholds
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "load_ensemble", "load_options"]
 Place = str | os.PathLike[str]
@@ -167,8 +167,8 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     weights = load_tensors(artefact.path / "options.safetensors")
     policies = make_policies(config, weights, source.config)
     goals, members = tuple(config["sub_goals"]), config["members"]
-    rule, _ = rule_of(config["termination"])
-    rule.set_thresholds(ensembles, weights)
+    rule_of(config["termination"])  # a rule of the user's own is refused where it is not allowed
+    set_thresholds(ensembles, weights)
     return Options(
         goals,
         members,

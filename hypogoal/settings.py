@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from hypogoal.core.config import DOMAIN, as_dict, describe, from_values, load_preset, resolve
+from hypogoal.core.config import DOMAIN, as_dict, describe, from_values, gathered, load_preset, resolve
 from hypogoal.domains.doorkey_defaults import DEFAULTS, SOURCES
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import BaselineConfig
@@ -47,7 +47,7 @@ def described(config_class: type, stage: str, domain: str, preset: str | None = 
     if preset is not None:
         values = load_preset(preset, stage, domain, TABLES)
         checked = as_dict(from_values(config_class, values, stage))
-        instead.append(({key: checked[key] for key in values}, f"preset {preset}"))
+        instead.append(({key: checked[key] for key in gathered(values)}, f"preset {preset}"))
     return describe(config_class, *instead)
 
 

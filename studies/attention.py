@@ -21,13 +21,13 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import spread_rows
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE
+from hypogoal.domains.montezuma_emulator import observed_pixel
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import attributed, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import Watcher, fit
-from hypogoal.hypotheses.views import positions_of
 from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 from studies.ladders import METHODS as OF_LADDERS
 from studies.ladders import states_of
@@ -100,14 +100,13 @@ def run_cell(method: str, seed: int) -> list[Row]:
     labels = data.heldout.labels[unseen, 0]
     bases = unseen[labels]
     bases = bases[spread_rows(len(bases), STATES)]
-    positions = positions_of({name: values[bases] for name, values in data.heldout.origins.items()})
-    assert positions is not None
-    places = DOMAIN.agent_pixels(positions)
+    positions = np.stack([data.heldout.origins[name][bases] for name in ("room", "x", "y")], axis=1)
+    places = observed_pixel(positions)
     rows: list[Row] = []
 
     def look(step: int, ensemble: Ensemble) -> None:
-        baseline = mean_state(ensemble.see(data.unlabelled.observations, None))
-        values = attributed(ensemble, ensemble.see(data.heldout.observations[bases], None), baseline).values
+        baseline = mean_state(ensemble.see(data.unlabelled.observations))
+        values = attributed(ensemble, ensemble.see(data.heldout.observations[bases]), baseline).values
         columns = {
             "common": in_common(values),
             "signed": alike(values),

@@ -135,7 +135,7 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
     constant = {field.name: field.default for field in every if not field.init}
     kinds = typing.get_type_hints(config_class)
     checked: dict[str, Any] = {}
-    for key, value in values.items():
+    for key, value in gathered(values).items():
         if key in constant and value == constant[key]:
             continue
         if key not in fields:
@@ -143,6 +143,18 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
             raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}{do}")
         checked[key] = _checked(fields[key], kinds[key], value, stage)
     return config_class(**checked)
+
+
+def gathered(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values with those of a part of one's own, ``view.KEY``, in one: ``view_settings``, a list of KEY=VALUE."""
+    whole: dict[str, Any] = {}
+    for key, value in values.items():
+        part, dot, name = key.partition(".")
+        if dot:
+            whole.setdefault(f"{part}_settings", []).append(f"{name}={value}")
+        else:
+            whole[key] = value
+    return whole
 
 
 def meant(word: str, candidates: Iterable[str]) -> str:

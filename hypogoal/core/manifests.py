@@ -101,11 +101,11 @@ SETTINGS: Schema = {
     "members": _size,
     "observation_shape": lambda value: isinstance(value, list) and all(map(_size, value)),
     "observation_dtype": is_text,
+    "view_settings": is_list(is_text),
     "domain_config": lambda value: isinstance(value, dict),
     "mask_reached": lambda value: isinstance(value, bool),
-    **dict.fromkeys(("crop_height", "crop_width"), _size),
     **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), is_count),
     **dict.fromkeys(("ended_at", "options_ended_at"), is_count),
     **dict.fromkeys(("domain", "network", "setting", "agent", "termination", "chooser", "start"), is_text),
-    **dict.fromkeys(("view", "localiser", "diversity", "layouts"), is_text),
+    **dict.fromkeys(("view", "diversity", "layouts"), is_text),
 }

@@ -318,7 +318,7 @@ class Domain(ABC):
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence for people on how to read its observations.
         labels_stand_in: for people, where the domain's author adds a sub-goal.
-        pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
+        pictures: it has :meth:`picture` and :meth:`pixel`.
     """
 
     name: str
@@ -335,7 +335,7 @@ class Domain(ABC):
     many_layouts = False
     reading = ""
     labels_stand_in = "its sub_goals and what its engine's labels() return"
-    measures = pictures = sees_agent = False
+    measures = pictures = False
     near = 0
 
     @property
@@ -422,10 +422,6 @@ class Domain(ABC):
     def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
         """The column and row of positions in that picture, (n, 2); needs ``pictures``."""
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
-
-    def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The row and column of the agent's centre in an observation, (n, 2); needs ``sees_agent``."""
-        raise UserError("this domain does not say where in an observation the agent is", self.name, "Set view=full.")
 
 
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:

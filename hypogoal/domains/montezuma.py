@@ -20,7 +20,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
-from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observed_pixel, picture, pixel
+from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, picture, pixel
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import BEGINNINGS, MAX_STEPS, beginning_named
 from hypogoal.domains.montezuma_ladders import GROUPS, distance_to, distance_to_base
@@ -137,11 +137,10 @@ class MontezumaDomain(Domain):
     starts = tuple(BEGINNINGS)
     many_starts = True
     kinds = KINDS
-    resumes = measures = pictures = sees_agent = True
+    resumes = measures = pictures = True
     near = 12
     distance = staticmethod(distance_to_base)
     pixel = staticmethod(pixel)
-    agent_pixels = staticmethod(observed_pixel)
     sources = MappingProxyType({"train-ensemble": "paper, appendix (Table 1)"})
     defaults = MappingProxyType(
         {

@@ -66,8 +66,7 @@ def member_of(ensemble: Ensemble, member: int) -> Classifier:
         raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(ensemble) - 1}.")
 
     def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
-        positions = engine.positions(ids) if ensemble.needs_positions else None
-        return ensemble.log_odds(engine.images(ids), positions)[:, member]
+        return ensemble.log_odds(engine.images(ids))[:, member]
 
     return classify
 

@@ -449,7 +449,7 @@ class Line:
 
 def titled(name: str) -> str:
     """An agent's name for people: 'options (learned members), ensemble=dbat, K=3' is 'D-BAT, 3 members'."""
-    of_ensemble = re.search(r"ensemble=(single CNN|[^,]+, K=\d+)(, position oracle)?", name)
+    of_ensemble = re.search(r"ensemble=(single CNN|[^,]+, K=\d+)", name)
     if of_ensemble:
         name = name.replace(of_ensemble[0], ensemble_title(of_ensemble[0].removeprefix("ensemble=")))
         return name.removeprefix(f"{LEARNED}, ")

@@ -33,14 +33,6 @@ BASELINE = "the mean of what members see of the unlabelled states"  # that attri
 WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"}  # values of the origin ``seen``
 
 
-@dataclass(frozen=True)
-class Unlabelled:
-    """Unlabelled states: observations (M, *obs), positions int64 (M, 3) where they are known."""
-
-    observations: Observations
-    positions: NDArray[np.int64] | None
-
-
 class Case(NamedTuple):
     """One sub-goal's ensemble and the data file that it is judged on."""
 
@@ -72,18 +64,17 @@ class Judgement:
     number: int  # the ensemble's, among those of the run
     case: Case  # the sub-goal's ensemble and its data
     split: States  # N held-out states
-    unlabelled: Unlabelled  # M states
+    unlabelled: Observations  # of M states
     domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
 
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
         """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
         from hypogoal.hypotheses.deep_lift import mean_state
-        from hypogoal.hypotheses.views import positions_of
 
-        ensemble, positions = self.case.read(), positions_of(self.split.origins)
-        seen = ensemble.see(self.split.observations[states], None if positions is None else positions[states])
-        return ensemble, seen, mean_state(ensemble.see(self.unlabelled.observations, self.unlabelled.positions))
+        ensemble = self.case.read()
+        seen = ensemble.see(self.split.observations[states])
+        return ensemble, seen, mean_state(ensemble.see(self.unlabelled))
 
     def write_states(self, group: Any, picked: Sequence[tuple[int, str]]) -> None:
         """Held-out states, what members say of them, and where they are from.
@@ -212,21 +203,18 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
 def judge(case: Case) -> Judged:
     """What the members of one case say."""
     from hypogoal.core.compute import prepare
-    from hypogoal.hypotheses.views import positions_of
 
     prepare()
     split, unlabelled = states_of(case.data, case.sub_goal)
     ensemble = case.read()
     thresholds = ensemble.thresholds.numpy()
-    probabilities = ensemble.predict(split.observations, positions_of(split.origins))
-    unlabelled_predictions = ensemble.predict(unlabelled.observations, unlabelled.positions)
+    probabilities = ensemble.predict(split.observations)
+    unlabelled_predictions = ensemble.predict(unlabelled)
     return Judged(probabilities, probabilities > thresholds, unlabelled_predictions > thresholds, thresholds)
 
 
 @lru_cache(maxsize=1)
-def states_of(data: Path, sub_goal: str) -> tuple[States, Unlabelled]:
+def states_of(data: Path, sub_goal: str) -> tuple[States, Observations]:
     """A sub-goal's held-out states and the unlabelled ones: the largest things here, read once for all ensembles."""
-    from hypogoal.hypotheses.views import positions_of
-
     dataset = open_dataset(data)
-    return dataset.heldout(sub_goal), Unlabelled(dataset.unlabelled(), positions_of(dataset.unlabelled_origins()))
+    return dataset.heldout(sub_goal), dataset.unlabelled()

@@ -241,14 +241,9 @@ def _text(value: Any) -> str:
 
 
 def ensemble_name(config: Mapping[str, Any]) -> str:
-    """How an ensemble is called in tables: its objective and its number of members.
-
-    One that is told where the agent is, which no observation says, is called what it is: an oracle.
-    """
+    """How an ensemble is called in tables: its objective and its number of members."""
     objective = "no diversity" if config["diversity"] == "none" else config["diversity"]
-    name = "single CNN" if config["members"] == 1 else f"{objective}, K={config['members']}"
-    oracle = config.get("view") == "agent-crop" and config.get("localiser") == "ram"
-    return f"{name}, position oracle" if oracle else name
+    return "single CNN" if config["members"] == 1 else f"{objective}, K={config['members']}"
 
 
 def ensemble_title(name: str) -> str:

@@ -138,7 +138,7 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
     counts = np.zeros(len(match), np.int64)
     for index, sub_goal in enumerate(source.config["sub_goals"]):
         ensemble = read_ensemble(source.path, source.config, sub_goal)
-        verdicts = ensemble.predictions(images, engine.positions(ids) if ensemble.needs_positions else None)
+        verdicts = ensemble.predictions(images)
         options = range(index * members, (index + 1) * members)
         if sub_goal in labels:
             match[options] = member_scores(verdicts, labels[sub_goal])["balanced_accuracy"]

@@ -13,28 +13,26 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Observations, Standard, require_classes, values_in
+from hypogoal.dataset import Observations, require_classes, values_in
 from hypogoal.hypotheses import patches
-from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
+from hypogoal.hypotheses.views import Origins, View
 
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
-LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
+PLAIN = View()
 
 
 class TrainingStates:
     """Labelled states followed by unlabelled ones, numbered in that order.
 
     Args:
-        observations, labels: the members' view of the labelled states, (N, h, w, C) or (N, *shape), and labels (N,).
+        observations, labels: of the labelled states what :meth:`View.to_change` keeps, (N, ...), and labels (N,).
         unlabelled: the same of the unlabelled states. On a CPU these arrays are kept and not copied.
         network: any of the networks that will see them (their layers decide how images are stored).
-        ladders: (N,), each labelled state's ladder, if batches are drawn by ladder.
-        grey: whether a random function maps the shades of each state of a training batch.
-        context: whether most states' surroundings are replaced before that: :func:`.changes.other_context`.
-        jitter: the most pixels by which each state is moved at random; images have this margin on every side.
-        standard: mean and deviation (D,) of mixed observations' numbers, to standardise these in each batch.
+        view: changes training batches at random, says how labelled ones are drawn, and has the standard of mixed
+            observations' numbers, which are standardised in each batch.
+        origins: of the labelled states, (N,) by name.
 
     Raises:
         UserError: shapes that do not fit, or labels of one class only.
@@ -48,23 +46,19 @@ class TrainingStates:
         network: nn.Sequential,
         device: torch.device,
         *,
-        ladders: NDArray[np.int64] | None = None,
-        grey: bool = False,
-        context: bool = False,
-        jitter: int = 0,
-        standard: Standard | None = None,
+        view: View = PLAIN,
+        origins: Origins | None = None,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
             raise UserError("the states do not fit together", shapes, "Collect them again.")
         require_classes(labels[:, None], ["the sub-goal"], None, "Collect others.")
         self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
-        self.ladders, self.device = ladders, device
-        self._grey, self._jitter, self._context = grey, jitter, context
+        self.device, self._view, self._origins = device, view, origins or {}
         self._dtype, self._shape = observations.dtype, (values_in(observations.shape[1:], observations.dtype),)
-        self._standard = [torch.from_numpy(values).to(device) for values in standard or ()]
+        self._standard = [torch.from_numpy(values).to(device) for values in view.standard or ()]
         images = [np.require(some, requirements=["C", "W"]) for some in (observations, unlabelled)]
-        tables = device.type == "cpu" and not (grey or jitter)  # changed images have changed patches
+        tables = device.type == "cpu" and not view.changes  # changed images have changed patches
         self._tables = patches.make_tables(images, network) if tables else None
         self._images = [as_tensor(some).to(device) for some in images] if self._tables is None else []
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
@@ -80,8 +74,8 @@ class TrainingStates:
 
         BatchNorm sees each group on its own; all other layers take them together, which reads the weights once. In
         training mode, BatchNorm's running statistics include the ``counted`` groups, all if that is empty. With
-        ``changes``, a generator per group, states are changed at random, see ``grey`` and ``jitter``; a group's draws
-        do not depend on the others.
+        ``changes``, a generator per group, the view changes states at random; a group's draws do not depend on the
+        others.
         """
         sizes, inputs = [len(group) for group in groups], self._inputs(groups, changes)
         logits = torch.stack([_forward(network, inputs, sizes, counted) for network in networks])
@@ -93,7 +87,7 @@ class TrainingStates:
         """The networks' inputs for groups of states: images, or their patches."""
         if self._tables is not None:
             return patches.take(self._tables, *groups)
-        if changes and (self._grey or self._jitter):
+        if changes and self._view.changes:
             return torch.cat([self._images_of(*group) for group in zip(groups, changes, strict=True)])
         return self._images_of(np.concatenate(groups), None)
 
@@ -114,14 +108,10 @@ class TrainingStates:
         images, first = labelled.new_empty(len(states), *labelled.shape[1:]), numbers < self.n_labelled
         images[first] = labelled[numbers[first]]
         images[~first] = unlabelled[numbers[~first] - self.n_labelled]
-        if self._context and changes is not None:
-            images = torch.from_numpy(other_context(images.cpu().numpy(), changes)).to(self.device)
-        if self._jitter:
-            images = _cut(images, self._jitter, changes)
-        if changes is None or not self._grey:
-            return as_input(images, self._dtype, self._standard)
-        maps = torch.from_numpy(grey_maps(len(states), changes)).to(self.device)
-        return maps.gather(1, images.flatten(start_dim=1).long()).view(images.shape).permute(0, 3, 1, 2)
+        if self._view.changes:
+            seen = self._view.change(images.cpu().numpy(), changes)
+            images = torch.from_numpy(np.ascontiguousarray(seen)).to(self.device)
+        return as_input(images, self._dtype, self._standard)
 
     def targets(self, states: NDArray[np.int64]) -> Tensor:
         """Classes int64 (B,) of labelled states (B,)."""
@@ -140,7 +130,7 @@ class TrainingStates:
         return torch.cat(chunks, dim=1)
 
     def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see ``batch_kind``.
+        """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see :meth:`View.pools`.
 
         Every state of a pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no
         such states.
@@ -152,18 +142,15 @@ class TrainingStates:
 
     def _pools(self, config: EnsembleConfig) -> list[tuple[list[NDArray[np.int64]], int, str]]:
         """The parts of a batch, the unlabelled last: pools of states that take turns, a count, and a name."""
-        positives, negatives = np.flatnonzero(self.labels), np.flatnonzero(~self.labels)
-        if config.batch_kind == "per-ladder":
-            assert self.ladders is not None
-            count = min(max(1, round(LADDER_POSITIVES * config.batch_size)), config.batch_size - 1)
-            ladders = self.ladders[positives]
-            by_ladder = [positives[ladders == ladder] for ladder in np.unique(ladders)]
-            labelled = [(by_ladder, count, "positives"), ([negatives], config.batch_size - count, "negatives")]
-        else:  # half of each, so that the class weights apply (DEV-13)
-            half = config.batch_size // 2
-            labelled = [([positives], half, "positives"), ([negatives], config.batch_size - half, "negatives")]
+        positives, share = self._view.pools(self.labels, self._origins)
+        negatives = np.flatnonzero(~self.labels)
+        count = min(max(1, int(share * config.batch_size)), config.batch_size - 1)
         unlabelled = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
-        return [*labelled, ([unlabelled], config.batch_size if len(unlabelled) else 0, "unlabelled")]
+        return [
+            (positives, count, "positives"),
+            ([negatives], config.batch_size - count, "negatives"),
+            ([unlabelled], config.batch_size if len(unlabelled) else 0, "unlabelled"),
+        ]
 
 
 def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> Iterator[NDArray[np.int64]]:
@@ -175,17 +162,6 @@ def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> I
         drawn = np.array([next(streams[(turn + item) % len(streams)]) for item in range(count)], dtype=np.int64)
         turn = (turn + count) % len(streams)
         yield drawn
-
-
-def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor:
-    """Images (B, H, W, C) without their margin: the middle, or with ``rng`` a random place for each."""
-    count, height, width = images.shape[:3]
-    size = 2 * margin + 1
-    corners = np.full((count, 2), margin) if rng is None else rng.integers(size, size=(count, 2))
-    corner = torch.from_numpy(corners).to(images.device)
-    rows = corner[:, :1] + torch.arange(height - size + 1, device=images.device)
-    columns = corner[:, 1:] + torch.arange(width - size + 1, device=images.device)
-    return images[torch.arange(count)[:, None, None], rows[:, :, None], columns[:, None, :]]
 
 
 def _forward(

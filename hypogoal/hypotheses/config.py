@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from hypogoal.core.config import fixed, setting
 
 BEYOND = "own: beyond the paper"
+FULL = "full"  # the view that shows all of an observation
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class EnsembleConfig:
     )
     network: str = setting(
         "auto",
-        "member network: doorkey, montezuma, montezuma-crop, tiles, mlp, or module:function; auto: doorkey for "
+        "member network: doorkey, montezuma, tiles, mlp, or module:function; auto: doorkey for "
         "pictures, mlp for other observations; of cameras and numbers by key: front=tiles,state=mlp",
         source="the paper's appendix",
     )
@@ -81,46 +82,18 @@ class EnsembleConfig:
         source="the authors' code",
     )
     view: str = setting(
-        "full",
-        "what members see: full, the whole observation; agent-crop, a window around the agent",
+        FULL,
+        "what members see of an observation: full, all of it; or a view of your own, module:Class",
         source=BEYOND,
-        choices=("full", "agent-crop"),
     )
-    crop_height: int = setting(24, "height of the window of view=agent-crop", unit="pixels", source=BEYOND, low=1)
-    crop_width: int = setting(32, "width of the window of view=agent-crop", unit="pixels", source=BEYOND, low=1)
-    localiser: str = setting(
-        "learned",
-        "finds the agent (view=agent-crop): learned, from the observation; ram, from the game's memory (an oracle)",
-        source=BEYOND,
-        choices=("learned", "ram"),
-    )
-    augment: str = setting(
-        "none",
-        "random changes of each state of a training batch: none; grey, an increasing function maps its shades; "
-        "grey-context, in addition the agent's surroundings are often replaced (view=agent-crop)",
-        source=BEYOND,
-        choices=("none", "grey", "grey-context"),
-    )
-    jitter: int = setting(
-        0,
-        "the most by which each window of a training batch is moved at random (view=agent-crop)",
-        unit="pixels",
-        source=BEYOND,
-        low=0,
-        high=20,
-    )
-    batch_kind: str = setting(
-        "plain",
-        "labelled batches: plain, half of them positive; per-ladder, 3/8 positives, equally many from each ladder",
-        source=BEYOND,
-        choices=("plain", "per-ladder"),
+    view_settings: tuple[str, ...] = setting(
+        (), "settings of a view of your own, KEY=VALUE: --set view.KEY=VALUE", source=BEYOND
     )
     threshold: str = setting(
         "0.5",
-        "a prediction is positive above 0.5; for 5 % of the unlabelled states; above the cut that best splits the "
-        "unlabelled states in two; or for half of the labelled positives",
+        "the probability above which a prediction is positive: a number; unlabelled-split, the cut that best splits "
+        "the unlabelled states in two; or module:function",
         source=f"{BEYOND}; unlabelled-split: Otsu 1979",
-        choices=("0.5", "unlabelled-q95", "unlabelled-split", "positives-median"),
     )
 
 

@@ -17,9 +17,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, packed, type_of, type_text, values_in
-from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
-from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
+from hypogoal.hypotheses.config import FULL
 from hypogoal.hypotheses.networks import (
     NETWORKS,
     as_input,
@@ -31,7 +30,7 @@ from hypogoal.hypotheses.networks import (
     network_for,
     reordered,
 )
-from hypogoal.hypotheses.views import AgentView, FullView, standard_shape
+from hypogoal.hypotheses.views import FullView, View, own_view, standard_shape
 
 THRESHOLD = 0.5  # of the probability, unless another is set
 IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many
@@ -69,7 +68,7 @@ class Ensemble(nn.Module):
         observation_shape: tuple[int, ...],
         members: int,
         generator: torch.Generator,
-        view: FullView | AgentView | None = None,
+        view: View | None = None,
     ):
         super().__init__()
         self.observation_shape = tuple(int(size) for size in observation_shape)
@@ -89,11 +88,6 @@ class Ensemble(nn.Module):
         """K, the number of members."""
         return len(self.members)
 
-    @property
-    def needs_positions(self) -> bool:
-        """Whether predictions need the agent's positions (localiser=ram), which makes them an oracle."""
-        return self.view.needs_positions
-
     def thresholds_as_log_odds(self) -> NDArray[np.float32]:
         """The thresholds (K,) as log-odds, with the same predictions up to rounding."""
         probabilities = self.thresholds.cpu().numpy().astype(np.float64)
@@ -104,7 +98,7 @@ class Ensemble(nn.Module):
         """Set the probabilities (K,) above which predictions are positive."""
         self.thresholds.copy_(torch.from_numpy(thresholds))
 
-    def see(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> Any:
+    def see(self, observations: Observations) -> Any:
         """The members' view of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
 
         For observations other than pictures: float32 (N, *shape), standardised; mixed ones (N,), their numbers so.
@@ -125,47 +119,42 @@ class Ensemble(nn.Module):
             kind = f"{observations.dtype} {observations.shape}"
             expected = f"{type_text(self.view.dtype)} (N, {', '.join(map(str, self.observation_shape))})"
             raise UserError(NO_OBSERVATIONS, kind, f"Give {expected}.")
-        if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
-            kind = "none" if positions is None else f"{positions.dtype} {positions.shape}"
-            do = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
-            raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", kind, do)
-        return np.ascontiguousarray(self.view.see(observations, positions))  # torch takes no flipped arrays
+        return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
-    def predictions(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+    def predictions(self, observations: Observations) -> NDArray[np.bool_]:
         """Every member's prediction, whether the sub-goal holds: bool (N, K); see :meth:`predict`.
 
         Within rounding of its threshold, some 1e-6, a prediction may depend on the other states of the call.
         """
-        positive: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
+        positive: NDArray[np.bool_] = self.predict(observations) > self.thresholds.cpu().numpy()
         return positive
 
-    def predict(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+    def predict(self, observations: Observations) -> NDArray[np.float32]:
         """Every member's probability that the sub-goal holds.
 
         Args:
             observations: uint8 (N, H, W, C), or float32 of any shape, as in training; or a list of N. Mixed ones: a
                 dictionary of such arrays.
-            positions: int64 (N, 3) of room, x, y; only if ``needs_positions``.
 
         Returns:
             float32 (N, K). Up to rounding, a state's row does not depend on the others.
 
         Raises:
-            UserError: observations of another shape or type, or missing positions.
+            UserError: observations of another shape or type.
         """
-        both = torch.from_numpy(self.logits(observations, positions))
+        both = torch.from_numpy(self.logits(observations))
         probabilities: NDArray[np.float32] = both.softmax(dim=-1)[..., 1].numpy()
         return probabilities
 
-    def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations) -> NDArray[np.float32]:
         """Every member's log-odds that the sub-goal holds: float32 (N, K); see :meth:`predict`."""
-        both = self.logits(observations, positions)
+        both = self.logits(observations)
         gaps: NDArray[np.float32] = both[..., 1] - both[..., 0]
         return gaps
 
-    def logits(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+    def logits(self, observations: Observations) -> NDArray[np.float32]:
         """Every member's logits of negative and positive: float32 (N, K, 2); see :meth:`predict`."""
-        observations = self.see(observations, positions)
+        observations = self.see(observations)
         was_training = self.training
         if was_training:
             self.eval()
@@ -225,7 +214,7 @@ class Ensemble(nn.Module):
         observation_shape: tuple[int, ...],
         members: int,
         state: Mapping[str, Tensor],
-        view: FullView | AgentView | None = None,
+        view: View | None = None,
     ) -> Ensemble:
         """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit."""
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
@@ -264,9 +253,7 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
 
 
-def _view(
-    observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
-) -> FullView | AgentView:
+def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]) -> View:
     """The view that the settings ask for, without its weights."""
     dtype = type_of(config["observation_dtype"])
     if dtype != PICTURE:
@@ -277,9 +264,6 @@ def _view(
         if mean.shape != size:  # a damaged manifest may ask for terabytes
             raise ValueError(observation_shape)
         return FullView(observation_shape, (mean, deviation), dtype)
-    if config["view"] == "full":
+    if config["view"] == FULL:
         return FullView(observation_shape)
-    localiser: Localiser = LearnedLocaliser(observation_shape)
-    if config["localiser"] == "ram":
-        localiser = RamLocaliser(load_domain(config["domain"]).agent_pixels)
-    return AgentView(observation_shape, config["crop_height"], config["crop_width"], localiser)
+    return own_view(config["view"], config["view_settings"], observation_shape)

@@ -61,17 +61,6 @@ def montezuma(channels: int) -> Parts:
     return [*_convolution(channels, 32, 8, 4), *_convolution(32, 64, 4, 2), *_convolution(64, 64, 3, 1)], (512,)
 
 
-def montezuma_crop(channels: int) -> Parts:
-    """Windows of 24x32 pixels around Montezuma's agent: two convolutions (+ BatchNorm + ReLU), two dense layers.
-
-    Beyond the paper, whose Montezuma network needs 36x36 pixels and has a stride of 4 in its first layer. Here the
-    stride is 2, since the agent is 4 pixels wide and a ladder's rung 1 high; the second layer sees 13x13 pixels, the
-    agent and what it stands on. Positions in the window are left to the dense layers: a ladder's base and its middle
-    differ in nothing else. It has a twentieth of the paper's multiplications.
-    """
-    return [*_convolution(channels, 16, 5, 2), *_convolution(16, 32, 5, 2)], (64,)
-
-
 def tiles(channels: int) -> Parts:
     """Pictures of 8x8 tiles: a layer that reads tiles, one of 3x3 tiles, a hidden dense layer; from 24x24 pixels."""
     return [*_convolution(channels, 16, 8, 8), *_convolution(16, 16, 3, 1)], (64,)
@@ -85,7 +74,6 @@ def mlp(channels: int) -> Parts:
 NETWORKS: dict[str, Callable[[int], Parts]] = {
     "doorkey": doorkey,
     "montezuma": montezuma,
-    "montezuma-crop": montezuma_crop,
     "tiles": tiles,
     "mlp": mlp,
 }

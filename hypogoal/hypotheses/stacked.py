@@ -33,7 +33,6 @@ class StackedMembers:
     def __init__(self, ensembles: Sequence[Ensemble]):
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
-        self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
         plain = [isinstance(ensemble.view, FullView) and ensemble.view.standard is None for ensemble in ensembles]
         self._one_view = all(plain)
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
@@ -43,11 +42,11 @@ class StackedMembers:
         if self.joined:
             self._steps = [(layers[0], _stack(list(layers))) for layers in zip(*networks, strict=True)]
 
-    def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations) -> NDArray[np.float32]:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
         if not self.joined:
-            return np.concatenate([ensemble.log_odds(observations, positions) for ensemble in self.ensembles], axis=1)
-        seen = self._see(observations, positions)
+            return np.concatenate([ensemble.log_odds(observations) for ensemble in self.ensembles], axis=1)
+        seen = self._see(observations)
         rows = [np.empty((0, self.count), dtype=np.float32)]
         with torch.inference_mode():
             chunk = at_once(IMAGES_AT_ONCE, seen.shape[1:])
@@ -56,14 +55,14 @@ class StackedMembers:
                 rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
         return np.concatenate(rows)
 
-    def _see(self, observations: Observations, positions: NDArray[np.int64] | None) -> Any:
+    def _see(self, observations: Observations) -> Any:
         """The ensembles' view, uint8 (N, h, w, C), or (N, h, w, G*C) if their views differ.
 
         For non-image observations, float32 (N, G*n, ...).
         """
         if self._one_view:
             return self.ensembles[0].see(observations)
-        seen = [ensemble.see(observations, positions) for ensemble in self.ensembles]
+        seen = [ensemble.see(observations) for ensemble in self.ensembles]
         return np.concatenate(seen, axis=-1 if observations.ndim == 4 else 1)
 
     def _logits(self, seen: Any) -> Tensor:

@@ -1,21 +1,25 @@
-"""Rules by name that set members' thresholds without labels from other contexts (beyond the paper).
-
-Their results on DoorKey: ``docs/results/thresholds-doorkey.md``.
-"""
+"""Rules that set members' thresholds without labels from other contexts (beyond the paper)."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode, load_own
+
 PAPER = "0.5"
+SPLIT = "unlabelled-split"
+RULES = {SPLIT: f"{__name__}:unlabelled_split"}
+ENTRY_POINTS = "hypogoal.thresholds"  # with which other packages add rules
 CERTAIN = 1e-12  # probabilities are clipped this far from 0 and 1
-ENOUGH, NEXT, LEAST = 0.05, 0.75, 0.5  # of thresholds that fall, see :func:`fallen`
-Probabilities = NDArray[np.float32]  # (states,), one member's
-Rule = Callable[[Probabilities, Probabilities, Probabilities], np.floating]
+BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
+Probabilities = NDArray[np.float32]  # (states, K)
+Rule = Callable[[Probabilities, NDArray[np.bool_], Probabilities], Any]
 
 
 def log_odds_of(probabilities: NDArray[Any]) -> NDArray[np.float64]:
@@ -24,55 +28,36 @@ def log_odds_of(probabilities: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(np.log(exact) - np.log1p(-exact))
 
 
-def fallen(
-    thresholds: NDArray[np.float32], first: NDArray[np.float32], highest: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Thresholds (K,), log-odds, where less than ``ENOUGH`` was reached: ``NEXT`` of the highest log-odds met.
-
-    They never fall below ``LEAST`` of what they were at ``first``, nor rise.
-    """
-    return np.minimum(thresholds, np.maximum(LEAST * first, NEXT * highest))
+def unlabelled_split(labelled: Probabilities, labels: NDArray[np.bool_], unlabelled: Probabilities) -> Any:
+    """Where each member's log-odds of the unlabelled states fall into two classes best, (K,)."""
+    return np.array([_cut(log_odds_of(np.sort(of_member))) for of_member in unlabelled.T])
 
 
-def _unlabelled_q95(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Predict 5 % of the unlabelled states positive.
-
-    In unknown rooms, members that see a window are sure of negatives and unsure of bases.
-    """
-    return np.quantile(unlabelled, 0.95, method="higher")
-
-
-def unlabelled_split(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Otsu (1979): the cut of the unlabelled states' log-odds into two classes with the least variance within."""
-    logits = log_odds_of(np.sort(unlabelled))
+def _cut(logits: NDArray[np.float64]) -> float:
+    """Otsu (1979): the cut of rising log-odds into two classes with the least variance within, as a probability."""
     if len(logits) < 2:
-        return np.float64(0.5)
+        return 0.5
     below = np.arange(1, len(logits))
     sums = logits.cumsum()[:-1]
     apart = sums / below - (logits.sum() - sums) / (len(logits) - below)
     cut = (apart**2 * below * (len(logits) - below)).argmax()
-    return np.float64(1 / (1 + np.exp(-logits[cut : cut + 2].mean())))
+    return float(1 / (1 + np.exp(-logits[cut : cut + 2].mean())))
 
 
-def _positives_median(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Predict half of the labelled positives positive.
-
-    A policy exploits its classifier's false positives, so precision matters more than recall.
-    """
-    return np.median(positives)
-
-
-RULES: dict[str, Rule] = {
-    PAPER: lambda *_: np.float32(0.5),
-    "unlabelled-q95": _unlabelled_q95,
-    "unlabelled-split": unlabelled_split,
-    "positives-median": _positives_median,
-}
-NEED_UNLABELLED = ("unlabelled-q95", "unlabelled-split")
+def threshold_rule(name: str) -> Rule:
+    """The rule of a setting; what is no number between 0 and 1, no rule and no function is a ``UserError``."""
+    with contextlib.suppress(ValueError):
+        number = float(name)
+        if 0 < number < 1:
+            return lambda labelled, *_: np.full(labelled.shape[1], number)
+    rule = load_own(name, "threshold", ENTRY_POINTS, RULES)
+    if not callable(rule):
+        raise UserError("this is no rule for thresholds", name, "Give a function, see docs/extending.md.")
+    return cast(Rule, rule)
 
 
 def thresholds(
-    name: str, labelled: NDArray[np.float32], labels: NDArray[np.bool_], unlabelled: NDArray[np.float32]
+    name: str, labelled: Probabilities, labels: NDArray[np.bool_], unlabelled: Probabilities
 ) -> NDArray[np.float32]:
     """The thresholds float32 (K,) that a rule sets.
 
@@ -81,12 +66,14 @@ def thresholds(
     :meth:`Ensemble.predictions`.
 
     Args:
-        name: of the rule.
+        name: a number, ``unlabelled-split``, or ``module:function`` of the other arguments.
         labelled: float32 (N, K), the members' probabilities of the labelled states.
         labels: bool (N,), which of them are positive.
         unlabelled: float32 (M, K), the members' probabilities of the unlabelled states.
     """
-    rule = RULES[name]
-    members = zip(labelled.T, unlabelled.T, strict=True)
-    rows = [rule(on_labelled[labels], on_labelled[~labels], on_unlabelled) for on_labelled, on_unlabelled in members]
-    return np.minimum(np.array(rows, dtype=np.float32), np.nextafter(np.float32(1), np.float32(0)))
+    rule, members = threshold_rule(name), labelled.shape[1]
+    with UsersCode(f"the threshold {name!r}", rule) as code:
+        chosen = np.asarray(rule(labelled, labels, unlabelled))
+        if chosen.shape != (members,) or not ((chosen >= 0) & (chosen <= 1)).all():
+            code.refuse(f"gave {chosen}", f"Give probabilities ({members},).")
+    return np.minimum(chosen.astype(np.float32), BELOW_ONE)

@@ -22,8 +22,8 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.proposals import Search
-from hypogoal.hypotheses.thresholds import NEED_UNLABELLED, PAPER, thresholds
-from hypogoal.hypotheses.views import NO_ORIGINS, Origins, StateOrigins, positions_of, require_origins, view_of
+from hypogoal.hypotheses.thresholds import PAPER, SPLIT, thresholds
+from hypogoal.hypotheses.views import StateOrigins, view_of
 
 OnStep = Callable[[int, dict[str, float]], None]
 Look = Callable[[int, Ensemble], None]
@@ -64,7 +64,7 @@ def fit(
     seed: int,
     watcher: Watcher | None = None,
     *,
-    origins: StateOrigins = NO_ORIGINS,
+    origins: StateOrigins | None = None,
     device: torch.device | str = "cpu",
     checkpoints: Checkpoints | None = None,
 ) -> Ensemble:
@@ -74,24 +74,24 @@ def fit(
         observations, labels: the labelled states (N, *obs), and whether the sub-goal holds (N,).
         unlabelled: (M, *obs); may be empty if nothing makes members differ.
         watcher: gets the losses and the ensemble during training.
-        origins: the states' origins, for settings that need them.
+        origins: the states' origins, for a view that needs them.
         device: where to train; the ensemble stays there, in evaluation mode.
         checkpoints: spec G1.
 
     Raises:
-        UserError: labels of one class only, no unlabelled states although members or thresholds need them, or data
-            without the origins that the settings need.
+        UserError: labels of one class only, or no unlabelled states although members or thresholds need them.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
     if len(unlabelled) == 0 and (_diverse(config) or config.proposals != "none"):
         do = "Give some, or set diversity=none and proposals=none."
         raise UserError("unlabelled states are needed to make members differ", None, do)
-    if len(unlabelled) == 0 and config.threshold in NEED_UNLABELLED:
+    if len(unlabelled) == 0 and config.threshold == SPLIT:
         do = "Give some, or set threshold=0.5."
         raise UserError("unlabelled states are needed to set thresholds on", None, do)
     checkpoints = checkpoints or Checkpoints(None)
     saved, watcher = checkpoints.load(), watcher or Watcher()
-    view = view_of(observations, unlabelled, config, seed_for(seed, "localiser"), origins, fitted=saved is None)
+    origins = origins or StateOrigins()
+    view = view_of(observations, unlabelled, config, origins, seed, fitted=saved is None)
     generator = torch_generator(seed, "weights")
     ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view).to(device)
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
@@ -112,29 +112,20 @@ def fit(
             ensemble.load_state_dict(saved["ensemble"])
             watcher.restore(saved["watcher"])
     networks = ensemble.networks
-    by_ladder = config.batch_kind == "per-ladder"
-    ladders = require_origins(origins.labelled, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
     mixed = bool(view.dtype.names)  # standardised in each batch: a view of all states would copy their pictures
-
-    def seen(some: Observations, of: Origins | None) -> Observations:
-        return some if mixed else view.see(some, positions_of(of), margin=config.jitter)
-
     states = TrainingStates(
-        seen(observations, origins.labelled),
+        observations if mixed else view.to_change(observations),
         labels,
-        seen(unlabelled, origins.unlabelled),
+        unlabelled if mixed else view.to_change(unlabelled),
         networks[0],
         torch.device(device),
-        ladders=ladders,
-        grey=config.augment != "none",
-        context=config.augment == "grey-context",
-        jitter=config.jitter,
-        standard=view.standard if mixed else None,
+        view=view,
+        origins=origins.labelled,
     )
     search = None
     if config.proposals == "joint":
-        whole, elsewhere = view.see(observations, positions_of(origins.labelled)), positions_of(origins.unlabelled)
-        search = Search(whole, labels, view.see(unlabelled, elsewhere), config, seed_for(seed, "proposals"))
+        proposals = seed_for(seed, "proposals")
+        search = Search(view.see(observations), labels, view.see(unlabelled), config, proposals)
         if saved is not None:
             with checkpoints.restoring():
                 search.restore(saved["search"])
@@ -156,8 +147,7 @@ def fit(
                 checkpoints.offer(partial(state, number, part))
     ensemble.eval()
     if config.threshold != PAPER:
-        on_labelled = ensemble.predict(observations, positions_of(origins.labelled))
-        on_unlabelled = ensemble.predict(unlabelled, positions_of(origins.unlabelled))
+        on_labelled, on_unlabelled = ensemble.predict(observations), ensemble.predict(unlabelled)
         ensemble.set_thresholds(thresholds(config.threshold, on_labelled, labels, on_unlabelled))
     checkpoints.save(state(len(rounds), None))
     return ensemble

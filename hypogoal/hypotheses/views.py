@@ -1,18 +1,21 @@
-"""What members see of an observation: all of it, or the agent's surroundings (beyond the paper)."""
+"""What members see of an observation: all of it, or what a view of one's own shows (beyond the paper)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from math import prod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.core.config import from_values, parse_assignments
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load_own
 from hypogoal.dataset import (
     NUMBERS,
     PICTURE,
@@ -23,41 +26,80 @@ from hypogoal.dataset import (
     standard_of,
     standardised,
 )
-from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.localisers import AgentPixels, LearnedLocaliser, Localiser, RamLocaliser, fit_localiser
+from hypogoal.hypotheses.config import FULL, EnsembleConfig
 
+ENTRY_POINTS = "hypogoal.views"  # with which other packages add views
 Origins = Mapping[str, NDArray[np.int64]]
-POSITION, ACTIONS = ("room", "x", "y"), ("action", "previous_action")  # names of origins
-CUT_AT_ONCE = 1024  # windows cut from whole images at a time
 
 
 @dataclass(frozen=True)
 class StateOrigins:
-    """Where training states come from, as far as it is known.
+    """Where training states come from, as far as it is known: int64 (N,) by name."""
+
+    labelled: Origins = field(default_factory=dict)
+    unlabelled: Origins = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class NoSettings:
+    """Of a view without settings."""
+
+
+class View(nn.Module):
+    """What members see of observations: all of them; ``view=module:Class`` names a subclass of one's own.
+
+    ``__init__`` gets the observations' shape and a ``Settings``. Parameters and buffers are saved and loaded with the
+    ensemble, so it makes them in their final shapes.
 
     Attributes:
-        labelled: int64 (N,) by name, of labelled states: ``ladder`` for batch_kind=per-ladder; ``room``, ``x``, ``y``
-            (and ``dying``) for view=agent-crop.
-        unlabelled: int64 (M,) by name: ``room``, ``x``, ``y`` for localiser=ram, ``action``, ``previous_action`` for
-            localiser=learned.
-        agent_pixels: the domain's function, for view=agent-crop.
+        Settings: a dataclass of :func:`hypogoal.core.config.setting` fields, which ``--set view.KEY=VALUE`` changes.
+        changes: whether batches are changed at random.
+        dtype: of observations, and of what members see.
+        shape: of what members see of one.
     """
 
-    labelled: Origins | None = None
-    unlabelled: Origins | None = None
-    agent_pixels: AgentPixels | None = None
+    Settings: ClassVar[type] = NoSettings
+    changes: ClassVar[bool] = False
+    dtype: np.dtype[Any] = PICTURE
+    shape: tuple[int, ...]
+
+    @property
+    def standard(self) -> Standard | None:
+        """Mean and deviation of numbers, where they are standardised."""
+        return None
+
+    def fit(self, labelled: Any, unlabelled: Any, origins: StateOrigins, seed: int) -> None:
+        """Learn from the training states (N, ...) and (M, ...); by default nothing."""
+
+    def see(self, observations: Any) -> Any:
+        """What members see, (N, *shape), of observations (N, ...)."""
+        return observations
+
+    def to_change(self, observations: Any) -> Any:
+        """What training keeps of observations for :meth:`change`; by default what members see."""
+        return self.see(observations)
+
+    def change(self, batch: Any, rng: np.random.Generator | None) -> Any:
+        """What members see of a batch of :meth:`to_change`: changed at random, or without ``rng`` as it is.
+
+        Pictures (B, *shape) are uint8, or float32 in 0..1.
+        """
+        return batch
+
+    def pools(self, labels: NDArray[np.bool_], origins: Origins) -> tuple[list[NDArray[np.int64]], float]:
+        """The positives in pools that take turns, by number, and their share of labelled batches.
+
+        By default all in one, and half, so that the class weights apply (DEV-13).
+        """
+        return [np.flatnonzero(labels)], 0.5
 
 
-NO_ORIGINS = StateOrigins()
-
-
-class FullView(nn.Module):
+class FullView(View):
     """All of an observation: a picture as it is, the paper's view; numbers standardised by ``standard``.
 
     Of a mixed observation, of type ``dtype``, ``standard`` is that of all its numbers, (D,).
     """
 
-    needs_positions = False
     mean: Tensor
     deviation: Tensor
 
@@ -74,11 +116,8 @@ class FullView(nn.Module):
         """Mean and deviation (*shape) of numbers; None for pictures."""
         return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if "mean" in self._buffers else None
 
-    def see(
-        self, observations: Observations, positions: NDArray[np.int64] | None = None, *, margin: int = 0
-    ) -> Observations:
+    def see(self, observations: Observations) -> Observations:
         """The observations (N, *shape)."""
-        assert not margin, "a full view has no margin"
         if self.standard is None or not self.dtype.names:
             return standardised(observations, *self.standard) if self.standard else observations
         seen, numbers, place = observations.copy(), standardised(numbers_of(observations), *self.standard), 0
@@ -103,115 +142,39 @@ def standard_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, .
     return shape if dtype == NUMBERS else (sum(sizes),)
 
 
-class AgentView(nn.Module):
-    """A window around the agent, found by the localiser; pixels outside the image are 0.
+def own_view(name: str, settings: Sequence[str], observation_shape: tuple[int, ...]) -> View:
+    """The view ``module:Class`` with its settings, ``KEY=VALUE``.
 
-    All frames of a stack share the window around the agent in the last frame. ``shape`` is (height, width, C), in
-    pixels, for pictures (H, W, C). ``needs_positions`` tells whether the localiser is an oracle that reads positions,
-    which no policy may see.
+    No such view or setting, and code that the user did not allow, are a ``UserError``.
     """
-
-    dtype, standard = PICTURE, None
-
-    def __init__(self, observation_shape: tuple[int, ...], height: int, width: int, localiser: Localiser):
-        super().__init__()
-        self.shape = (height, width, *observation_shape[2:])
-        self.localiser = localiser
-        self.needs_positions = localiser.needs_positions
-
-    def see(
-        self, observations: Any, positions: NDArray[np.int64] | None = None, *, margin: int = 0
-    ) -> NDArray[np.uint8]:
-        """Windows uint8 (N, height, width, C) of uint8 (N, H, W, C), with ``margin`` more pixels on every side.
-
-        Positions, if the localiser reads them, are int64 (N, 3) of room, x, y.
-        """
-        height, width, channels = self.shape
-        size = height + 2 * margin, width + 2 * margin
-        seen = np.empty((len(observations), *size, channels), dtype=np.uint8)
-        for start in range(0, len(observations), CUT_AT_ONCE):
-            chunk = slice(start, start + CUT_AT_ONCE)
-            centres = self.localiser.locate(observations[chunk], None if positions is None else positions[chunk])
-            seen[chunk] = cut_windows(observations[chunk], centres, *size)
-        return seen
-
-
-def cut_windows(
-    observations: NDArray[np.uint8], centres: NDArray[np.floating], height: int, width: int
-) -> NDArray[np.uint8]:
-    """Windows uint8 (N, height, width, C) of images uint8 (N, H, W, C); 0 outside the images.
-
-    ``centres`` (N, 2) are the row and column of the middle pixel, or of the second of two middle pixels.
-    """
-    corner = np.floor(centres + 0.5).astype(np.int64) - (height // 2, width // 2)
-    rows, rows_inside = _indices(corner[:, 0], height, observations.shape[1])
-    columns, columns_inside = _indices(corner[:, 1], width, observations.shape[2])
-    cut = observations[np.arange(len(observations))[:, None, None], rows[:, :, None], columns[:, None, :]]
-    cut[~(rows_inside[:, :, None] & columns_inside[:, None, :])] = 0
-    return cut
-
-
-def _indices(first: NDArray[np.int64], count: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """``count`` indices from each ``first`` (N, count), clipped to 0..size-1, and which were inside."""
-    indices = first[:, None] + np.arange(count)
-    return indices.clip(0, size - 1), (indices >= 0) & (indices < size)
-
-
-def positions_of(origins: Origins | None) -> NDArray[np.int64] | None:
-    """Positions int64 (N, 3) of room, x, y from origins; None if these lack them."""
-    if origins is None or not all(name in origins for name in POSITION):
-        return None
-    return np.stack([origins[name] for name in POSITION], axis=1).astype(np.int64)
-
-
-def require_origins(origins: Origins | None, names: tuple[str, ...], setting: str) -> Origins:
-    """The origins of states, with all these names; a ``UserError`` if one is missing."""
-    origins = origins or {}
-    if missing := ", ".join(name for name in names if name not in origins):
-        do = "Collect data that do, or change the setting."
-        raise UserError(f"the data do not say {missing} of each state", setting, do)
-    return origins
+    kind = load_own(name, "view", ENTRY_POINTS, {})
+    if not (inspect.isclass(kind) and issubclass(kind, View)):
+        raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
+    values = parse_assignments(settings)
+    known = [each.name for each in fields(kind.Settings)]
+    for key in values:
+        if key not in known:
+            raise UserError("the view has no such setting", f"view.{key}", f"It has {', '.join(known) or 'none'}.")
+    view: View = kind(observation_shape, from_values(kind.Settings, values, name))
+    return view
 
 
 def view_of(
-    observations: Any,
-    unlabelled: Any,
-    config: EnsembleConfig,
-    seed: int,
-    origins: StateOrigins,
-    *,
-    fitted: bool,
-) -> FullView | AgentView:
-    """The members' view; ``fitted`` trains its localiser and computes its standard, else these are to be loaded."""
-    shape = observations.shape[1:]
-    if observations.dtype != PICTURE:
-        for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0), ("proposals", "none")):
-            if (chosen := getattr(config, name)) != value:
-                raise UserError("these observations are not pictures", f"{name}={chosen}", f"Set {name}={value}.")
+    observations: Any, unlabelled: Any, config: EnsembleConfig, origins: StateOrigins, seed: int, *, fitted: bool
+) -> View:
+    """The members' view; ``fitted``: it has learned from the states, else what it learned is to be loaded."""
+    if observations.dtype != PICTURE and config.proposals != "none":
+        fault = f"proposals={config.proposals}"
+        raise UserError("these observations are not pictures", fault, "Set proposals=none.")
+    if config.view == FULL:
         return full_view(observations, *([observations, unlabelled] if fitted else []))
-    if config.view == "full":
-        if config.jitter:
-            raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
-        if config.augment == "grey-context":
-            do = "Set view=agent-crop or augment=grey."
-            raise UserError("the surroundings of the agent are not known", f"augment={config.augment}", do)
-        return FullView(shape)
-    if origins.agent_pixels is None:
-        raise UserError("the agent's place in these observations is not known", "view=agent-crop", "Set view=full.")
-    labelled = require_origins(origins.labelled, POSITION, "view=agent-crop")
-    names = (POSITION if config.localiser == "ram" else ACTIONS) if len(unlabelled) else ()
-    others = require_origins(origins.unlabelled, names, f"localiser={config.localiser}")
-    if config.localiser == "ram":
-        localiser: Localiser = RamLocaliser(origins.agent_pixels)
-    elif not fitted:
-        localiser = LearnedLocaliser(shape)
-    else:
-        # From labelled states with a living agent (a dying one is drawn elsewhere). Of unlabelled states the localiser
-        # gets the agent's actions, which the agent knows, but not its positions.
-        positions = np.stack([labelled[name] for name in POSITION], axis=1).astype(np.int64)
-        alive = np.flatnonzero(labelled.get("dying", np.zeros(len(positions))) == 0)
-        actions = np.stack([others.get(name, np.zeros(0, dtype=np.int64)) for name in ACTIONS], axis=1)
-        usable = np.flatnonzero((actions >= 0).all(axis=1))
-        pixels = origins.agent_pixels(positions[alive])
-        localiser = fit_localiser(observations[alive], pixels, unlabelled[usable], actions[usable], seed)
-    return AgentView(shape, config.crop_height, config.crop_width, localiser)
+    view = own_view(config.view, config.view_settings, observations.shape[1:])
+    if observations.dtype != view.dtype:
+        raise UserError(f"the view is of {view.dtype}, these observations are {observations.dtype}", config.view)
+    if fitted:
+        view.fit(observations, unlabelled, origins, seed)
+    seen = view.see(observations[:1])
+    if seen.dtype != view.dtype or seen.shape != (1, *view.shape):
+        shown = f"{seen.dtype} {seen.shape}"
+        raise UserError(f"the view shows {shown} of one state", config.view, f"Show {view.dtype} {(1, *view.shape)}.")
+    return view

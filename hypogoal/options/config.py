@@ -40,9 +40,9 @@ class OptionConfig:
     )
     termination: str = setting(
         "learned",
-        "where options end: learned, at the first positive prediction; patience:N, with a threshold that falls after "
-        "N steps of an option that hardly ever gets there; or oracle, at true sub-goals (upper bound)",
-        source="paper: learned; the others ours",
+        "where options end: learned, at the first positive prediction; oracle, at true sub-goals (upper bound); or a "
+        "rule of your own, module:Class or module:Class:NUMBER",
+        source="paper: learned",
     )
     embedding: str = setting(
         "auto",

@@ -6,7 +6,7 @@ what resumes it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -16,12 +16,10 @@ from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import allowed, vouched
 from hypogoal.core.tensors import AGAIN
-from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.thresholds import ENOUGH, fallen
 from hypogoal.options.parts import Part, load_part
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
@@ -40,18 +38,14 @@ class Terminations(Part):
         classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
         thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
         environments: E.
-        length: the number in the rule's name (``patience:10000``).
+        length: the number behind the rule's name.
 
     Attributes:
-        LENGTH: what the number in the rule's name counts; empty where it has none.
+        LENGTH: what the number behind the rule's name counts; empty where it has none.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
     LENGTH: ClassVar[str] = ""
-
-    @staticmethod
-    def set_thresholds(ensembles: Sequence[Ensemble], weights: Mapping[str, torch.Tensor]) -> None:
-        """Give ensembles the thresholds that an artefact's options end at; by default they have them already."""
 
     def __init__(
         self,
@@ -129,63 +123,25 @@ def thresholds_in(state: Mapping[str, torch.Tensor], options: int) -> NDArray[np
     return saved.numpy().copy()
 
 
-class Patience(Terminations):
-    """The threshold of an option that hardly ever reaches its sub-goal falls (ours).
-
-    It falls after every ``length`` steps of the option in which less than ``ENOUGH`` of its executions reached: to
-    ``NEXT`` of the highest log-odds among these steps, never below ``LEAST`` of the first threshold.
-    """
-
-    LENGTH = "STEPS"
-
-    CHANGING = (*Terminations.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
-
-    def __init__(self, *arguments: Any, **more: Any):
-        super().__init__(*arguments, **more)
-        self._first = self.thresholds.copy()
-        self._best = np.full(self.environments, -np.inf, dtype=np.float32)  # of each running execution
-        self._steps, self._executions, self._reaches = np.zeros((3, self.options), dtype=np.int64)
-        self._highest = np.full(self.options, -np.inf, dtype=np.float32)
-
-    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        now = self.log_odds(ids, options)
-        self._best = np.where(age == 0, now, np.maximum(self._best, now))
-        np.add.at(self._steps, options, 1)
-        positive: NDArray[np.bool_] = now > self.thresholds[options]
-        return positive
-
-    @staticmethod
-    def set_thresholds(ensembles: Sequence[Ensemble], weights: Mapping[str, torch.Tensor]) -> None:
-        lowered = thresholds_in(weights, sum(map(len, ensembles))).reshape(len(ensembles), -1)
-        for ensemble, log_odds in zip(ensembles, lowered, strict=True):
-            ensemble.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
-
-    def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
-        """Count them; then lower the thresholds that are due."""
-        np.add.at(self._executions, options, 1)
-        np.add.at(self._reaches, options, reached)
-        np.maximum.at(self._highest, options, self._best[environments])
-        due = self._steps >= self.length
-        content = self._reaches >= ENOUGH * self._executions
-        less = fallen(self.thresholds, self._first, self._highest)
-        self.thresholds = np.where(due & ~content, less, self.thresholds)
-        for counted in (self._steps, self._executions, self._reaches):
-            counted[due] = 0
-        self._highest[due] = -np.inf
+def set_thresholds(ensembles: Sequence[Ensemble], weights: Mapping[str, torch.Tensor]) -> None:
+    """Give ensembles the thresholds at which the options of an artefact with these weights end."""
+    ends = thresholds_in(weights, sum(map(len, ensembles))).reshape(len(ensembles), -1)
+    for ensemble, log_odds in zip(ensembles, ends, strict=True):
+        ensemble.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
 
 
-RULES = {"learned": f"{__name__}:Terminations", "patience": f"{__name__}:Patience"}
+RULES = {"learned": f"{__name__}:Terminations"}
 
 
 def rule_of(termination: str) -> tuple[type[Terminations], int]:
-    """The rule and its number, of ``learned``, ``patience:10000``, ``module:Class``, ``module:Class:3``.
+    """The rule and its number, of ``learned``, ``module:Class``, ``module:Class:3``.
 
     Anything else is a ``UserError``.
     """
     name, _, number = termination.rpartition(":")
     if not number.isdecimal():
         name, number = termination, ""
-    do = "Give learned, patience:STEPS or oracle."
+    do = "Give learned, oracle or module:Class."
     if name not in RULES and (":" not in name or name.partition(":")[0] in RULES):
         raise UserError("unknown termination", f"termination={termination}", do)
     with vouched(*([name] if termination in allowed() else [])):  # who gave the rule with its number gave its name
@@ -212,21 +168,15 @@ def learned_terminations(
     networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
     members = len(ensembles[0])
 
-    def look_at(ids: NDArray[np.int64]) -> tuple[Observations, NDArray[np.int64] | None]:
-        if stacked.needs_positions and not engine.position_names:
-            fault = "the ensemble needs the agent's positions (localiser=ram)"
-            raise UserError(fault, None, "Train it with localiser=learned.")
-        return engine.images(ids), engine.positions(ids) if stacked.needs_positions else None
-
     def classify(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        states = look_at(ids)
+        states = engine.images(ids)
         if len(ids) < MANY:
-            return stacked.log_odds(*states)
-        return np.concatenate([ensemble.log_odds(*states) for ensemble in ensembles], axis=1)
+            return stacked.log_odds(states)
+        return np.concatenate([ensemble.log_odds(states) for ensemble in ensembles], axis=1)
 
     def classify_one(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
         ensemble = ensembles[option // members]
-        views = ensemble.see(*look_at(ids))
+        views = ensemble.see(engine.images(ids))
         with torch.inference_mode():
             logits = networks[option](as_input(tensor(views, ensemble.thresholds.device)))
             log_odds: NDArray[np.float32] = (logits[:, 1] - logits[:, 0]).cpu().numpy()

@@ -82,7 +82,7 @@ def audit(
         write_trained(work.folder, loop, world, ensemble_config, config, seed)
         table, report = read_table(work.folder / exploits.TABLE, exploits.COLUMNS), dict.fromkeys(POLICIES)
         for option, (name, edge) in enumerate(zip(POLICIES, edges.tolist(), strict=False)):
-            ended = float(1 / (1 + np.exp(-loop.terminations.thresholds[option])))  # it may have fallen: patience
+            ended = float(1 / (1 + np.exp(-loop.terminations.thresholds[option])))  # a rule may have changed it
             threshold = edge if math.isclose(ended, edge, rel_tol=1e-6) else ended  # float32 log-odds round it
             numbers = findings(loop, table, option, world.sub_goals, work.folder)
             report[name] = {"threshold": threshold, **numbers}

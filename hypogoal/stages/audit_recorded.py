@@ -93,8 +93,6 @@ def audit_recorded(
 def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
     """The members' predictions of all states of the data file."""
     dataset, ensemble = open_dataset(data), read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
-    if ensemble.needs_positions:
-        raise UserError("members need the agent's positions (localiser=ram)", artefact.path, "Train with another view.")
     parts = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
     known = joined([States(part.observations, part.labels) for part in parts])
     unlabelled = dataset.unlabelled()

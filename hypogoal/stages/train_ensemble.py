@@ -23,14 +23,14 @@ from hypogoal.core.training import training
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, Observations, open_dataset, type_text
 from hypogoal.diversity import load_objective
-from hypogoal.domains.base import installed_domain
-from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, names_in, network_for
 from hypogoal.hypotheses.proposals import agreements, search_steps
 from hypogoal.hypotheses.scores import best_mean_worst, member_scores
+from hypogoal.hypotheses.thresholds import threshold_rule
 from hypogoal.hypotheses.training import Watcher, fit
-from hypogoal.hypotheses.views import StateOrigins, positions_of
+from hypogoal.hypotheses.views import StateOrigins, own_view
 from hypogoal.options.visited import VISITED
 
 HELDOUT, LOOKED_AT = "heldout", 100  # in what the stage returns; states of each class, cheap beside training
@@ -58,8 +58,11 @@ def train_ensemble(
     """
     device = prepare(device)
     load_objective(config.diversity)
+    threshold_rule(config.threshold)
     agreements(config)
     dataset = open_dataset(data)
+    if config.view != FULL:
+        own_view(config.view, config.view_settings, dataset.observation_shape)
     config = replace(config, network=network_for(config.network, dataset.observation_dtype))
     for name in names_in(config.network):
         load_network(name)
@@ -179,7 +182,6 @@ def _train_one(
     if not checkpoints.saved:
         log.restore(0)
     report = _Report(sub_goal, log)
-    domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
     with contextlib.closing(log):
         ensemble = fit(
             split.observations,
@@ -188,7 +190,7 @@ def _train_one(
             config,
             seed_for(seed, "ensemble", sub_goal),
             report,
-            origins=StateOrigins(split.origins, origins, domain.agent_pixels if domain and domain.sees_agent else None),
+            origins=StateOrigins(split.origins, origins),
             device=device,
             checkpoints=checkpoints,
         )
@@ -200,7 +202,7 @@ def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dic
     """Best, mean and worst member's balanced accuracy on some held-out states; NaN without states of both classes."""
     try:
         states = dataset.some_heldout(sub_goal, LOOKED_AT)
-        predictions = ensemble.predictions(states.observations, positions_of(states.origins))
+        predictions = ensemble.predictions(states.observations)
     except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
         return best_mean_worst(np.full(len(ensemble), np.nan))
     return best_mean_worst(member_scores(predictions, states.labels)["balanced_accuracy"])

@@ -49,7 +49,7 @@ from tests.attacks.mutations import (
 
 SECONDS = 60.0  # of the clock: the machine may be busy
 MEMORY = 2**30
-SUB_GOALS, MEMBERS, SHAPE, NETWORK = ("open-red-door", "go-to-goal"), 2, (24, 32, 3), "montezuma-crop"  # small
+SUB_GOALS, MEMBERS, SHAPE, NETWORK = ("open-red-door", "go-to-goal"), 2, (24, 32, 3), "tiles"  # small
 PRESET = {
     "collect": {"door_label": "open", "unlabelled_seeds": [1, 2], "heldout_layouts": 20},
     "train-ensemble": {"members": 3, "sub_goals": ["go-to-goal"], "diversity_weight": 1e-4, "network": "doorkey"},

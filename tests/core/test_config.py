@@ -172,7 +172,7 @@ def test_the_paper_preset_has_the_papers_ladders() -> None:
     assert run.groups == run.option_groups == tuple(range(1, 8))
     assert len(set(run.seeds)) == 10 and run.ladders
     ensemble = resolve(config_class_of("train-ensemble"), stage="train-ensemble", preset="paper", domain="montezuma")
-    beyond = {"view": "full", "augment": "none", "batch_kind": "plain", "threshold": "0.5", "unlabelled_bn": False}
+    beyond = {"view": "full", "threshold": "0.5", "unlabelled_bn": False}
     assert {name: getattr(ensemble, name) for name in beyond} == beyond
 
 

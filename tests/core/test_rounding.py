@@ -11,7 +11,6 @@ import pytest
 from hypogoal.core.rounding import above, at_least
 from hypogoal.domains import montezuma_states
 from hypogoal.evaluation.curves import NEAR, SOLVED
-from hypogoal.hypotheses.thresholds import ENOUGH
 
 
 def test_what_misses_a_bound_by_rounding_meets_it() -> None:
@@ -33,7 +32,6 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
         *(
             NEAR,
             SOLVED,
-            ENOUGH,
             *montezuma_states.KIND_SHARES.values(),
             montezuma_states.SPARE,
         ),

@@ -30,6 +30,7 @@ from hypogoal.domains.montezuma_emulator import (
     Position,
     Snapshot,
     load_ale,
+    observed_pixel,
     row_of,
     stack_frames,
 )
@@ -276,6 +277,22 @@ def test_places_where_nobody_lives(emulator: Emulator) -> None:
     for room in (-1, ROOMS):
         with pytest.raises(UserError, match=r"no such room: -?\d+\. Rooms are 0 to 23"):
             emulator.place(room, 77, 235)
+
+
+def test_positions_are_where_the_emulator_draws_the_agent(emulator: Emulator) -> None:
+    """Spec B4: two observations that differ by where the agent stands differ around both places that its RAM says."""
+    for room, y, places in ((1, 235, (60, 90)), (1, 192, (60, 90)), (1, 148, (21, 133)), (9, 235, (60, 90))):
+        frames, positions = [], []
+        for x in places:
+            assert emulator.place(room, x, y) is not None
+            frames.append(emulator.stack[:, :, 3].astype(int))
+            positions.append(emulator.position())
+        differ = np.abs(frames[0] - frames[1]) > 15
+        for where in observed_pixel(np.array(positions)):
+            top, left = np.floor(where - (8, 6)).astype(int)
+            rows, columns = np.nonzero(differ[top : top + 17, left : left + 13])
+            middle = np.array([rows.min() + rows.max(), columns.min() + columns.max()]) / 2 + (top, left)
+            assert np.abs(middle - where).max() <= 1.5
 
 
 def test_ram_names_are_addresses_of_the_console() -> None:

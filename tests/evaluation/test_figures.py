@@ -67,7 +67,7 @@ def test_the_curve_is_the_mean_of_runs_that_have_a_value():
 
 
 LONG = [
-    "options (learned members), ensemble=dbat, K=3, termination=patience:10000, option_gamma=0.99",
+    "options (learned members), ensemble=dbat, K=3, termination=one_room:Patience:10000, option_gamma=0.99",
     "options (learned members), ensemble=no diversity, K=3",
     "PPO tuned, COST=$a_1$ b$^$",
     "RANDOM CHOICE WHILE OPTIONS LEARN, ENSEMBLE=NO DIVERSITY, AND MORE",

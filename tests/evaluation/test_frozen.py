@@ -18,7 +18,7 @@ from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
-from hypogoal.options.termination import Patience, oracle_terminations
+from hypogoal.options.termination import Terminations, oracle_terminations
 
 LAYOUT, DONE = 70010, 6  # 'done' does nothing
 
@@ -116,17 +116,24 @@ def test_decisions_are_those_of_the_episodes_that_count() -> None:
     assert len(episodes.choices.options) == sum(math.ceil(length / timeout) for length in episodes.length.ravel())
 
 
+class Falling(Terminations):
+    """Each execution lowers all thresholds."""
+
+    def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
+        self.thresholds = self.thresholds - 1
+
+
 def test_play_teaches_nothing() -> None:
     """Thresholds and counters are after it what they were before."""
     engine = harsh(220, 16)
     config = TrainMetaConfig(network="planned")
     truth = planted(engine)
-    patience = Patience(truth.classify, 15, None, None, engine.count, 3)
+    ends = Falling(truth.classify, 15)
     learner = PlannedLearner(engine, truth, config, seed=0)
     chooser = RandomChooser(np.random.default_rng(0))
-    patience.thresholds = np.full(15, 0.5, np.float32)
-    before = patience.thresholds.copy()
-    loop = OptionLoop(engine, patience, learner, chooser, Recorder(15, engine), config, config.gamma)
+    ends.thresholds = np.full(15, 0.5, np.float32)
+    before = ends.thresholds.copy()
+    loop = OptionLoop(engine, ends, learner, chooser, Recorder(15, engine), config, config.gamma)
     play(loop, chooser, 3)
-    np.testing.assert_array_equal(patience.thresholds, before)
+    np.testing.assert_array_equal(ends.thresholds, before)
     assert not learner.option_steps.any() and not learner.positives.any()

@@ -99,14 +99,6 @@ def test_ensembles_are_named_after_their_objective():
     assert ensemble_names([base, {**base, "steps": 600}]) == ["dbat, K=3, steps=300", "dbat, K=3, steps=600"]
 
 
-def test_an_ensemble_that_is_told_positions_is_called_an_oracle():
-    """Spec C1, F1: wherever it is shown; the same view without being told is not."""
-    crop = {"members": 6, "diversity": "dbat", "view": "agent-crop"}
-    names = ensemble_names([{**crop, "localiser": "ram"}, {**crop, "localiser": "learned"}])
-    assert names == ["dbat, K=6, position oracle", "dbat, K=6"]
-    assert ensemble_names([{**crop, "view": "full", "localiser": "ram"}]) == ["dbat, K=6"]
-
-
 def test_selection_of_a_run_by_hand():
     """Spec F6: two sub-goals of two members, two windows; one member is never offered."""
     rows = [

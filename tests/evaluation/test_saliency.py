@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from hypogoal.dataset import States
-from hypogoal.evaluation.judging import Case, Judged, Judgement, Unlabelled, Work
+from hypogoal.evaluation.judging import Case, Judged, Judgement, Work
 from hypogoal.evaluation.pictures import attribution_image, image_png
 from hypogoal.evaluation.run import Contents
 from hypogoal.evaluation.saliency import look, pick_to_explain
@@ -197,33 +197,28 @@ def test_attributions_are_to_what_members_see(tmp_path):
     """Spec F2: of an ensemble that sees a window, what is attributed to, drawn and averaged is the window."""
 
     class Windowed(Members):
-        def see(self, observations, positions=None):
-            seen_at.append(positions)
+        def see(self, observations):
             return observations[:, :, 1:]
 
     class Here(Case):
         def read(self):
             return ensemble
 
-    seen_at = []
     ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
     observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
-    where = {name: np.arange(3) for name in ("room", "x", "y")}
-    split = States(observations, np.array([True, False, False]), where)
+    split = States(observations, np.array([True, False, False]))
     yes = np.array([[True], [True], [False]])
     judged = Judged(np.array([[0.9], [0.8], [0.1]], np.float32), yes, yes[2:], np.array([0.5], np.float32))
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
         here = Here(tmp_path, "down", tmp_path, {})
         work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None, shown=0)
-        look(work, Judgement(0, here, split, Unlabelled(observations[2:], None), None, judged))
+        look(work, Judgement(0, here, split, observations[2:], None, judged))
         (found,) = work.looked["saliency"]
         group = arrays["saliency/down"]
         assert group["observations"].shape == (2, 1, 3, 1)
         assert group["seen"].shape == (2, 1, 2, 1)
         np.testing.assert_allclose(group["attributions"][:, 0, 0, :, 0], [[0, 2], [1, 0]])
     assert [state["kind"] for state in found["states"]] == ["true positive", "false positive"]
-    assert seen_at[0].tolist() == [[0, 0, 0], [1, 1, 1]]
-    assert seen_at[1] is None
 
 
 def test_the_check_is_reported():

@@ -161,7 +161,6 @@ def test_baselines_stand_beside_what_they_were_given() -> None:
         ("dbat, K=3", "D-BAT, 3 members"),
         ("no diversity, K=3", "no diversity, 3 members"),
         ("single CNN", ONE),
-        ("dbat, K=3, position oracle", "D-BAT, 3 members, position oracle"),
         ("oracle termination", "oracle termination"),
     ],
 )

@@ -73,14 +73,14 @@ def test_choosing_has_cells_of_its_own_and_a_preset_of_its_worlds() -> None:
 
 def test_each_variant_gives_one_more_ensemble_per_method_and_seed() -> None:
     """Spec F1: the settings that are compared stand in the commands, and what has none of them stays."""
-    changes = ["groups=1", "seeds=0,1", "methods=dbat,none", "variants=localiser=ram,view=full network=montezuma"]
+    changes = ["groups=1", "seeds=0,1", "methods=dbat,none", "variants=unlabelled_bn=false,steps=9 network=montezuma"]
     cells = plan("montezuma-ladders", OUT, assignments=changes).cells
     trained = [cell for cell in cells if cell.arguments[0] == "train-ensemble"]
     assert len(trained) == 3 * 2 * 2
-    assert sum("localiser=ram" in cell.arguments for cell in trained) == 4
+    assert sum("unlabelled_bn=false" in cell.arguments for cell in trained) == 4
     assert {len(cell.out.relative_to(OUT).parts) for cell in trained} == {3}  # evaluate looks no deeper
-    full = [cell for cell in trained if "view=full" in cell.arguments]
-    assert len(full) == 4 and all("network=montezuma" in cell.arguments for cell in full)
+    short = [cell for cell in trained if "steps=9" in cell.arguments]
+    assert len(short) == 4 and all("network=montezuma" in cell.arguments for cell in short)
 
 
 def settings(cell: Cell) -> dict[str, str]:
@@ -91,15 +91,15 @@ def settings(cell: Cell) -> dict[str, str]:
 
 def test_what_all_cells_are_given_undoes_no_variant_and_no_method() -> None:
     """Spec F1: the single CNN has one member and a variant its own setting, whatever --set train-ensemble.KEY says."""
-    common = [f"train-ensemble.{pair}" for pair in ("members=3", "diversity=none", "localiser=learned")]
-    changes = ["groups=1", "variants=localiser=ram", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
+    common = [f"train-ensemble.{pair}" for pair in ("members=3", "diversity=none", "batch_size=8")]
+    changes = ["groups=1", "variants=batch_size=16", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
     cells = plan("montezuma-ladders", OUT, assignments=[*changes, *common, "train-options.termination=learned"]).cells
     trained = [cell for cell in cells if cell.stage == "train-ensemble"]
     for cell in trained:
         axes, has = dict(cell.axes), settings(cell)
         assert has["diversity"] == ("dbat" if axes["method"] == "dbat" else "none")
         assert has["members"] == ("1" if axes["method"] == "cnn" else "3")
-        assert has["localiser"] == ("ram" if axes["variant"] else "learned")
+        assert has["batch_size"] == ("16" if axes["variant"] else "8")
         assert not {"--members", "--diversity"} & {*cell.arguments}  # before which any --set would go
     options = [cell for cell in cells if cell.stage == "train-options"]
     assert {settings(cell)["start"] for cell in options} == {"1L"}
@@ -194,7 +194,7 @@ def test_a_value_that_is_given_twice_is_told_in_one_line(experiment: str, change
 
 def test_every_cell_of_a_named_experiment_has_a_place() -> None:
     """Spec G4: axes that tell all cells of a stage apart."""
-    for experiment, changes in (("figure6", []), ("montezuma-ladders", ["ladders=1L", "variants=jitter=1"])):
+    for experiment, changes in (("figure6", []), ("montezuma-ladders", ["ladders=1L", "variants=batch_size=16"])):
         cells = plan(experiment, OUT, assignments=changes).cells
         trained = [(cell.stage, cell.axes) for cell in cells if cell.stage.startswith("train")]
         assert len(set(trained)) == len(trained)

@@ -12,12 +12,9 @@ from safetensors.torch import load_file, save_file
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.domains.montezuma_emulator import observed_pixel
-from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
-from hypogoal.hypotheses.localisers import LearnedLocaliser, RamLocaliser
+from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.views import AgentView
 
 SHAPE = (48, 48, 3)
 
@@ -127,36 +124,3 @@ def test_verdicts_are_above_each_members_threshold() -> None:
     assert (taus[len(chosen) :] == 0).all()
     above = stacked.log_odds(observations) > taus
     assert (above == expected).mean() > 0.95  # up to rounding, at the median itself
-
-
-@pytest.mark.parametrize("localiser", ["ram", "learned"])
-def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path) -> None:
-    """Spec A8, G2: a localiser's weights and the thresholds lie beside the members' weights, no pickle."""
-    shape = (84, 84, 4)
-    torch.manual_seed(0)  # for the localiser's weights
-    where = RamLocaliser(observed_pixel) if localiser == "ram" else LearnedLocaliser(shape)
-    view = AgentView(shape, 24, 32, where)
-    ensemble = Ensemble("montezuma-crop", shape, 2, torch_generator(1, "weights"), view).eval()
-    ensemble.set_thresholds(np.array([0.25, 0.75], dtype=np.float32))
-    write_ensemble(tmp_path, "goal", ensemble)
-    config = {
-        "network": "montezuma-crop",
-        "observation_shape": list(shape),
-        "observation_dtype": "uint8",
-        "members": 2,
-        "sub_goals": ["goal"],
-        "domain": "montezuma",
-        "view": "agent-crop",
-        "localiser": localiser,
-        "crop_height": 24,
-        "crop_width": 32,
-    }
-    back = read_ensemble(tmp_path, config, "goal")
-    observations = np.random.default_rng(0).integers(256, size=(5, *shape), dtype=np.uint8)
-    positions = np.array([[1, 20 * x, 235] for x in range(1, 6)])
-    np.testing.assert_array_equal(back.predict(observations, positions), ensemble.predict(observations, positions))
-    np.testing.assert_array_equal(
-        back.predictions(observations, positions), ensemble.predictions(observations, positions)
-    )
-    with pytest.raises(UserError, match="the weights do not fit the"):
-        read_ensemble(tmp_path, config | {"crop_width": 40}, "goal")

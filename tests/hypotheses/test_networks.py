@@ -21,7 +21,6 @@ from hypogoal.hypotheses.networks import (
 SHAPES = {
     "doorkey": (64, 64, 3),
     "montezuma": (84, 84, 4),
-    "montezuma-crop": (24, 32, 4),
     "tiles": (48, 48, 3),
     "mlp": (6, 7, 3),
 }
@@ -46,8 +45,6 @@ def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -
         ("doorkey", 2, 3, 2400 + 64 + 18432 + 128 + 192750 + 75100 + 202),
         # 32x4x64 + 64 + 64x32x16 + 128 + 64x64x9 + 128, 64 x 7 x 7 features: 3136x512 + 512 + 512x2 + 2
         ("montezuma", 3, 2, 8192 + 64 + 32768 + 128 + 36864 + 128 + 1606144 + 1026),
-        # 16x4x25 + 32 + 32x16x25 + 64, 32 x 3 x 5 features: 480x64 + 64 + 64x2 + 2
-        ("montezuma-crop", 2, 2, 1600 + 32 + 12800 + 64 + 30784 + 130),
         # 16x3x64 + 32 + 16x16x9 + 32, 16 x 4 x 4 features: 256x64 + 64 + 64x2 + 2
         ("tiles", 2, 2, 3072 + 32 + 2304 + 32 + 16448 + 130),
         # 126x256 + 256 + 256x256 + 256 + 256x2 + 2
@@ -75,9 +72,7 @@ def test_logits_of_each_state(name: str) -> None:
     torch.testing.assert_close(network(images[3:4]), logits[3:4])
 
 
-@pytest.mark.parametrize(
-    ("name", "smallest"), [("doorkey", 41), ("montezuma", 36), ("montezuma-crop", 13), ("tiles", 24)]
-)
+@pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36), ("tiles", 24)])
 def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     """Spec C5, G2: dense layers take what the convolutions leave; too small an image is one clear line."""
     shape = (smallest, smallest + 9, 1)
@@ -98,8 +93,8 @@ def test_images_too_small_are_told_where_to_go() -> None:
         told.append(caught.value.do)
     own = "--set network=mlp, larger pictures, or a network of your own (--set network=module:function)."
     assert told == [
-        f"Give --set network=montezuma, --set network=montezuma-crop, --set network=tiles, {own}",
-        f"Give --set network=montezuma-crop, --set network=tiles, {own}",
+        f"Give --set network=montezuma, --set network=tiles, {own}",
+        f"Give --set network=tiles, {own}",
         f"Give {own}",
     ]
 

@@ -77,14 +77,6 @@ def test_attributions_to_numbers_are_complete(shape: tuple[int, ...]) -> None:
     assert (mean.argmax(1) == 2).all() and (mean[:, 3] == 0).all()
 
 
-@pytest.mark.parametrize("settings", [{"view": "agent-crop"}, {"augment": "grey"}, {"jitter": 2}])
-def test_what_needs_pictures_is_refused(settings: dict[str, Any]) -> None:
-    """Spec G2."""
-    [name] = settings
-    with pytest.raises(UserError, match=f"these observations are not pictures: {name}=.* Set {name}="):
-        trained(**settings)
-
-
 def test_a_network_for_pictures_is_refused() -> None:
     """Spec G2."""
     with pytest.raises(UserError, match=r"'montezuma' does not take these observations: .* Give --set network=mlp"):

@@ -21,15 +21,16 @@ CASES = {
     "divdis, one after another, threshold": {
         "diversity": "divdis",
         "schedule": "sequential",
-        "threshold": "unlabelled-q95",
+        "threshold": "unlabelled-split",
     },
-    "changed shades": {"diversity": "none", "augment": "grey"},
+    "a view that changes states": {"diversity": "none", "view": "own_view:Moved", "view_settings": ("jitter=0",)},
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """Spec C, G1: images without repeated patches, which only the CPU looks for: the same bytes."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "own_view:Moved")
     rng = np.random.default_rng(0)
     images = rng.integers(256, size=(90, *SHAPE), dtype=np.uint8)
     labels = np.arange(60) < 20

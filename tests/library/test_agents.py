@@ -16,6 +16,7 @@ from corridor_env import LENGTH, CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
+from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -32,6 +33,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import RewardedEnv
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.env import Options
+from hypogoal.options.termination import Terminations
 
 TESTS = Path(__file__).parents[1]
 MEMBERS = 2
@@ -144,15 +146,32 @@ def test_what_a_session_shows_is_one_useful_line(options: Options) -> None:
     assert repr(ensemble) == f"Ensemble(2 members, network 'doorkey', observations uint8 {ensemble.observation_shape})"
 
 
+class Falling(Terminations):
+    """After so many executions in all the thresholds of all options fall."""
+
+    LENGTH = "EXECUTIONS"
+    CHANGING = (*Terminations.CHANGING, "ended")
+
+    def __init__(self, *arguments: Any, **more: Any):
+        super().__init__(*arguments, **more)
+        self.ended = 0
+
+    def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
+        self.ended += len(options)
+        if self.ended >= self.length:
+            self.ended = 0
+            self.thresholds = self.thresholds - np.float32(0.01)
+
+
 def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
     """Spec H4: lowered thresholds go with the artefact, into train-meta, to agents and to other people's code."""
     play = settings("environments=4", "warm_up=100", "layout_seed=0", "max_episode_steps=30", "random_episodes=0")
-    ends = settings("termination=patience:20", "option_timeout=2", "option_batch=32")
+    ends = settings(f"termination={__name__}:Falling:20", "option_timeout=2", "option_batch=32")
     out, meta = run / "patient", run / "patient-meta"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))
-        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
-        sure = settings("steps=100", f"members={MEMBERS}", "workers=1", "threshold=positives-median")
+        patch.setenv("HYPOGOAL_TRUST", f"corridor_env:DOMAIN,{__name__}:Falling")
+        sure = settings("steps=100", f"members={MEMBERS}", "workers=1", "threshold=0.9")
         ensemble = str(run / "sure")
         assert main(["train-ensemble", str(run / "data.h5"), "--out", ensemble, "-q", *sure]) == 0
         few = settings("steps=400")
@@ -171,13 +190,15 @@ def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
             *play,
             *settings("decisions=16"),
         ]
-        assert main([*agent, *ends, *settings("steps=40", "termination=patience:1000")]) == 2  # another rule
+        assert main([*agent, *ends, *settings("steps=40", f"termination={__name__}:Falling:1000")]) == 2  # another rule
         assert main([*agent, *ends, *settings("steps=40")]) == 0
         later = load_tensors(meta / "options.safetensors")["thresholds"].numpy()
         assert (later <= lowered).all()
         np.testing.assert_array_equal(agent_of(open_artefact(meta), 0).terminations.thresholds, later)
-    loaded = [ensemble.thresholds_as_log_odds() for ensemble in hypogoal.load_options(out).ensembles]
-    np.testing.assert_allclose(np.concatenate(loaded), lowered, atol=1e-4)
+        loaded = [ensemble.thresholds_as_log_odds() for ensemble in hypogoal.load_options(out).ensembles]
+        np.testing.assert_allclose(np.concatenate(loaded), lowered, atol=1e-4)
+    with pytest.raises(UserError, match="names code of its own as its termination rule"):
+        hypogoal.load_options(out)
 
 
 def test_options_are_masked_as_they_were_trained(run: Path, options: Options) -> None:
@@ -336,32 +357,6 @@ def test_a_reward_is_shared_by_environments_side_by_side(ensemble: Ensemble, vec
     held = info["subgoal"] if isinstance(info, dict) else [each["subgoal"] for each in info]
     assert np.array(held).tolist() == [False, True]
     envs.close()
-
-
-def test_thresholds_fall_where_nothing_is_rewarded(run: Path) -> None:
-    """Spec H4: after ``patience`` steps without a reward to .75 of the highest log-odds met, at least to half; not
-    where episodes are rewarded, and the ensemble's own stay.
-    """
-    ensemble = hypogoal.load_ensemble(run / "ensemble", "left-end")
-    ensemble.set_thresholds(np.full(MEMBERS, 0.9999999, np.float32))
-    high = ensemble.thresholds_as_log_odds()
-    env = hypogoal.SubgoalReward(ensemble, by="any", patience=10).wrap(SameLayout(corridor()))
-    for _ in range(3):  # three steps to the right end, where the task ends
-        env.reset()
-        assert [env.step(1)[1] for _ in range(3)] == [0, 0, 0]
-        assert (env.thresholds == high).all(), "not before ten steps"
-    env.reset()
-    seen = [env.step(action)[0] for action in (0, 0, 1, 1, 1, 1, 1)]
-    highest = ensemble.log_odds(np.stack(seen)).max(0)
-    np.testing.assert_allclose(env.thresholds, np.maximum(high / 2, 0.75 * highest), rtol=1e-5)
-    assert (env.thresholds < high).all() and (ensemble.thresholds_as_log_odds() == high).all()
-    before, paid = env.thresholds, 0
-    for _ in range(8):
-        env.reset()
-        paid += env.step(0)[1] + env.step(0)[1]
-    assert paid and (env.thresholds == before).all(), "episodes are rewarded: they stay"
-    with pytest.raises(UserError, match="the mean has no threshold that can fall"):
-        hypogoal.SubgoalReward(ensemble, by="mean", patience=10)
 
 
 def test_mistakes_are_one_line(run: Path, options: Options, ensemble: Ensemble) -> None:

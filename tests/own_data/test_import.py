@@ -71,8 +71,8 @@ def test_images_too_small_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["import", str(tmp_path / "small.npz"), "--out", data, "-q"]) == 0
     told = capsys.readouterr().err
     assert "the network 'doorkey' does not take these observations: observation shape (24, 24, 3). Give --set" in told
-    few = [word for pair in ("steps=2", "members=1", "network=montezuma-crop") for word in ("--set", pair)]
-    assert "--set network=montezuma-crop" in told
+    few = [word for pair in ("steps=2", "members=1", "network=tiles") for word in ("--set", pair)]
+    assert "--set network=tiles" in told
     assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
     assert main(["import", str(tmp_path / "small.npz"), "--out", str(tmp_path / "m.h5"), "--domain", "montezuma"]) == 0
     assert "the network 'montezuma' does not take these observations" in capsys.readouterr().err

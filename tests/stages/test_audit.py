@@ -24,6 +24,7 @@ from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS, lines_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.options.termination import Terminations
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 
@@ -153,10 +154,18 @@ def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> Non
     assert truth["before"]["there"] >= 50
 
 
-def test_a_threshold_that_falls_is_told_as_it_ends(tmp_path: Path) -> None:
-    """From .9, which this classifier never says, to half of its log-odds: with patience, and not without."""
+class Falling(Terminations):
+    """An execution that ends lowers all thresholds to a probability of three quarters."""
+
+    def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
+        self.thresholds = np.full_like(self.thresholds, np.log(3))
+
+
+def test_a_threshold_that_falls_is_told_as_it_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From .9, which this classifier never says: where the rule lowers it, and not where it does not."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", f"{__name__}:Falling")
     where = [*CORRIDOR, *settings("steps=400", "mend=0", "warm_up=400", "threshold=0.9")]
-    for rule, told in (("learned", 0.9), ("patience:100", 0.75)):
+    for rule, told in (("learned", 0.9), (f"{__name__}:Falling", 0.75)):
         report, _ = audited(tmp_path / rule.partition(":")[0], "too_soon", *where, *settings(f"termination={rule}"))
         assert report["before"]["threshold"] == pytest.approx(told)
 
@@ -202,7 +211,7 @@ def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("member")
     config = DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,), wrong_key="ends")
     collect(DOMAIN, config, folder / "d.h5", quiet=True)
-    rule = "positives-median"
+    rule = "0.6"
     few = TrainEnsembleConfig(steps=10, members=2, workers=1, sub_goals=("open-red-door",), threshold=rule)
     train_ensemble(folder / "d.h5", few, folder / "ensemble", quiet=True)
     return folder / "ensemble"

@@ -51,7 +51,7 @@ def run(tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "tiny"
     collect(DOMAIN, DoorKeyConfig(heldout_layouts=2, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
     train_ensemble(run / "data.h5", TrainEnsembleConfig(steps=20, **SMALL), run / "ensemble", **QUIET)
-    rule = {"diversity": "none", "threshold": "positives-median"}
+    rule = {"diversity": "none", "threshold": "0.6"}
     other = TrainEnsembleConfig(steps=20, sub_goals=("collect-red-key",), **rule, **SMALL)
     train_ensemble(run / "data.h5", other, run / "ensemble-none", **QUIET)
     source = run / "ensemble"

@@ -1,0 +1,151 @@
+"""A view of one's own: what members see, how training states are changed and drawn (beyond the paper; Spec G1, G2)."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from own_view import Moved, Settings
+from test_training import TOY, toy
+
+from hypogoal.core.config import as_dict
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import torch_generator
+from hypogoal.hypotheses.batches import TrainingStates
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.training import fit
+
+OWN = dataclasses.replace(TOY, steps=3, view="own_view:Moved", view_settings=("jitter=3",))
+CPU = torch.device("cpu")
+AS_THEY_ARE = torch.nn.Sequential(torch.nn.Flatten())  # a network whose outputs are its inputs
+
+
+@pytest.fixture(autouse=True)
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYPOGOAL_TRUST", "own_view:Moved,own_view:Wrong,own_view:OfNumbers,own_view:Settings")
+
+
+def test_it_learns_and_comes_back_from_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A8: what it learned lies beside the members' weights; nobody's code runs because a file names it."""
+    observations, labels, unlabelled = toy()
+    ensemble = fit(observations, labels, unlabelled, OWN, seed=0)
+    seen = ensemble.see(observations)
+    shade = int(observations.mean())
+    assert seen.shape == (64, 42, 42, 3)
+    np.testing.assert_array_equal(seen, np.maximum(observations[:, 3:-3, 3:-3], shade) - shade)
+    ensemble.set_thresholds(np.array([0.25, 0.75], dtype=np.float32))
+    write_ensemble(tmp_path, "goal", ensemble)
+    config = as_dict(OWN) | {"sub_goals": ["goal"], "observation_shape": [48, 48, 3], "observation_dtype": "uint8"}
+    back = read_ensemble(tmp_path, config, "goal")
+    np.testing.assert_array_equal(back.predict(observations), ensemble.predict(observations))
+    np.testing.assert_array_equal(back.predictions(observations), ensemble.predictions(observations))
+    with pytest.raises(UserError, match="the weights do not fit the"):
+        read_ensemble(tmp_path, config | {"view": "full"}, "goal")
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    with pytest.raises(UserError, match="a file names code of its own as its view: own_view:Moved"):
+        read_ensemble(tmp_path, config, "goal")
+
+
+def test_stacked_members_of_several_views() -> None:
+    """Spec D1: each ensemble sees by its own view, also where all members are one network."""
+    ensembles = []
+    for seed in range(2):
+        view = Moved((48, 48, 4), Settings())
+        view.shade.fill_(40 * seed)
+        ensembles.append(Ensemble("doorkey", (48, 48, 4), 2, torch_generator(seed, "weights"), view).eval())
+    observations = np.random.default_rng(0).integers(256, size=(5, 48, 48, 4), dtype=np.uint8)
+    expected = np.concatenate([ensemble.log_odds(observations) for ensemble in ensembles], axis=1)
+    np.testing.assert_allclose(StackedMembers(ensembles).log_odds(observations), expected, atol=1e-5)
+    assert np.ptp(expected) > 1e-3
+
+
+def test_changes_are_made_in_training_alone() -> None:
+    """Without a generator states are what members see; with one each is changed on its own, as the view says."""
+    images = np.arange(48 * 48, dtype=np.uint32).astype(np.uint8).reshape(1, 48, 48, 1).repeat(40, axis=0)
+    view = Moved((48, 48, 1), Settings())
+    kept = view.to_change(images)
+    states = TrainingStates(kept, np.arange(40) < 3, kept, AS_THEY_ARE, CPU, view=view)
+    plain = states.forward([AS_THEY_ARE], np.arange(40))[0][0].view(40, 44, 44, 1).numpy()
+    np.testing.assert_allclose(plain, view.see(images) / 255, atol=1e-7)
+    changed = states.forward([AS_THEY_ARE], np.arange(40), changes=[np.random.default_rng(0)])[0][0]
+    expected = view.change(kept, np.random.default_rng(0))
+    np.testing.assert_array_equal(changed.view(40, 44, 44, 1).numpy(), expected)
+    assert len(np.unique(expected[:, 0, 0])) > 30
+
+
+def test_changes_decide_what_is_learned() -> None:
+    """Another ensemble than from unchanged states, the same one again with the same seed."""
+    observations, labels, unlabelled = toy()
+    first, second = (fit(observations, labels, unlabelled, OWN, seed=0).state() for _ in range(2))
+    plain = dataclasses.replace(OWN, view_settings=("jitter=0",))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    other = fit(observations, labels, unlabelled, plain, seed=0).state()
+    assert not torch.equal(first["members.0.0.weight"], other["members.0.0.weight"])
+
+
+def test_methods_see_the_same_labelled_states_changed_the_same_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decision 38: methods of one seed share what is random, whatever each does with unlabelled states."""
+    observations, labels, unlabelled = toy()
+    seen: list[list[torch.Tensor]] = []
+
+    def recorded(self: TrainingStates, states: np.ndarray, changes: np.random.Generator | None) -> torch.Tensor:
+        images = inputs(self, states, changes)
+        if states.max() < self.n_labelled and changes is not None:
+            seen[-1].append(images)
+        return images
+
+    inputs = TrainingStates._images_of
+    monkeypatch.setattr(TrainingStates, "_images_of", recorded)
+    for changes in ({}, {"diversity": "none"}, {"diversity": "none", "unlabelled_bn": False}):
+        seen.append([])
+        fit(observations, labels, unlabelled, dataclasses.replace(OWN, **changes), seed=0)
+    assert [len(method) for method in seen] == [3, 3, 3]
+    assert all(torch.equal(one, other) for method in seen[1:] for one, other in zip(seen[0], method, strict=True))
+    assert not torch.equal(seen[0][0], seen[0][1])
+
+
+@pytest.mark.parametrize(("kinds", "each"), [([0, 1, 2], (8, 8)), ([4], (24, 24)), ([0, 1, 2, 4, 8], (4, 5))])
+def test_pools_of_positives_take_turns(kinds: list[int], each: tuple[int, int]) -> None:
+    """8 positives of each of three kinds and 40 negatives in 64; other numbers spread evenly."""
+    labels = np.arange(400) < 100
+    of = np.where(labels, np.resize(kinds, 400), -1)
+    of[:50] = kinds[0]  # more of the first kind than of the others
+    images = np.zeros((400, 48, 48, 3), dtype=np.uint8)
+    view = Moved((48, 48, 3), Settings())
+    states = TrainingStates(images, labels, images[:100], AS_THEY_ARE, CPU, view=view, origins={"kind": of})
+    total = np.zeros(len(kinds), dtype=int)
+    for labelled, unlabelled in states.batches(EnsembleConfig(batch_size=64, steps=20), 0):
+        assert len(labelled) == len(unlabelled) == 64
+        assert labels[labelled].sum() == 24
+        counts = np.array([(of[labelled] == kind).sum() for kind in kinds])
+        assert (counts.min(), counts.max()) == each
+        assert len(set(labelled.tolist())) > 50
+        total += counts
+    assert np.ptp(total) <= 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"view": "own_view:Missing"}, "a file names code of its own as its view"),
+        ({"view": "window"}, "unknown view: window"),
+        ({"view": "own_view:Settings"}, "this is no view: own_view:Settings"),
+        ({"view_settings": ("jiter=3",)}, "the view has no such setting: view.jiter. It has jitter"),
+        ({"view_settings": ("jitter=9",)}, "value out of range: jitter='9' in own_view:Moved. Allowed: 0 .. 8"),
+        (
+            {"view": "own_view:Wrong"},
+            r"the view shows uint8 \(1, 41, 42, 3\) of one state: .* Show uint8 \(1, 42, 42",
+        ),
+        ({"view": "own_view:OfNumbers", "view_settings": ()}, "the view is of float32, these observations are uint8"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(changes: dict[str, object], line: str) -> None:
+    """Spec G2."""
+    observations, labels, unlabelled = toy()
+    with pytest.raises(UserError, match=line):
+        fit(observations, labels, unlabelled, dataclasses.replace(OWN, **changes), seed=0)
