@@ -105,7 +105,8 @@ def load_own(name: str, role: str, group: str, built_in: Mapping[str, str]) -> A
         target = name
     if target is None:
         names = ", ".join(sorted({*built_in, *entries}))
-        raise UserError(f"unknown {role}", name, f"Choose one of {names}, or give module:object.")
+        do = f"Choose one of {names}, or give module:object." if names else "Give module:object."
+        raise UserError(f"unknown {role}", name, do)
     module, _, attribute = target.partition(":")
     if name not in built_in and not target.startswith("hypogoal."):
         _own.add(module.partition(".")[0])

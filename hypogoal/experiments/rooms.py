@@ -15,7 +15,7 @@ METHODS = {  # one member more than features, and two for joint
     "divdis": "--diversity divdis --members 3",
     "none": "--diversity none --members 3",
     "one": "--diversity none --members 1",
-    "joint": "--diversity none --members 2 --set proposals=joint --set agreement=0",
+    "joint": "--diversity none --members 2 --set teacher=joint:independent",
 }
 Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles, rooms and agents of its own")]
 Truths = Annotated[tuple[str, ...], explained("what the reward asks for", choices=("shape", "place"))]

@@ -19,29 +19,11 @@ class EnsembleConfig:
         "dbat", "diversity objective: dbat, none, another of docs/concepts.md, or module:function", source="Eq. (1)"
     )
     diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
-    proposals: str = setting(
-        "none",
-        "joint: linear classifiers of patterns in pictures, one for each member, searched for jointly so that all fit "
-        "the labels and are independent on unlabelled states; a member also learns what its proposal predicts there",
-        source=f"{BEYOND}: docs/results/which-feature.md",
-        choices=("none", "joint"),
-    )
-    agreement: str = setting(
-        "auto",
-        "share of unlabelled states in which all features agree as in labelled ones (proposals=joint): a number from 0 "
-        "to below 1; auto: 0, or .25, .5, .75 where that halves the least loss of proposals",
-        source=BEYOND,
-    )
-    pattern_stride: int = setting(
-        8,
-        "pixels between two patterns of 8 x 8 (proposals=joint): 8 where pictures are made of such tiles, else 2",
-        unit="pixels",
-        source=BEYOND,
-        low=1,
-        high=64,
-    )
-    restarts: int = setting(
-        96, "starts of a search, one for each agreement (proposals=joint)", source=BEYOND, low=1, high=10_000
+    teacher: str = setting(
+        "",
+        "own code, module:function, that gives scores of the unlabelled states, which members learn beside the labels; "
+        "empty: none",
+        source=f"{BEYOND}: docs/extending.md",
     )
     schedule: str = setting(
         "simultaneous",

@@ -21,7 +21,7 @@ from hypogoal.diversity import Context, load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.proposals import Search
+from hypogoal.hypotheses.teacher import taught_by
 from hypogoal.hypotheses.thresholds import PAPER, SPLIT, thresholds
 from hypogoal.hypotheses.views import StateOrigins, view_of
 
@@ -36,8 +36,7 @@ class Watcher(Resumable):
     Args:
         on_step: called every ``REPORT_EVERY`` steps and at the last one (of each member, where sequential) with the
             number of steps done and with that step's ``loss``, ``labelled`` (mean over the members in training) and
-            ``diversity`` (the inner sums of Eq. (1), before their weight). First come the steps of a search for
-            proposals, if any, with ``loss`` and ``agreement``.
+            ``diversity`` (the inner sums of Eq. (1), before their weight).
         look, look_at: after these steps of the members' training, ``look`` gets their number and the ensemble, to
             predict with; the training goes on as if it had not.
     """
@@ -82,8 +81,8 @@ def fit(
         UserError: labels of one class only, or no unlabelled states although members or thresholds need them.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
-    if len(unlabelled) == 0 and (_diverse(config) or config.proposals != "none"):
-        do = "Give some, or set diversity=none and proposals=none."
+    if len(unlabelled) == 0 and (_diverse(config) or config.teacher):
+        do = "Give some, or set diversity=none and no teacher."
         raise UserError("unlabelled states are needed to make members differ", None, do)
     if len(unlabelled) == 0 and config.threshold == SPLIT:
         do = "Give some, or set threshold=0.5."
@@ -98,19 +97,24 @@ def fit(
 
     def state(number: int, part: Round | None) -> State:
         return {
-            **({"search": search.snapshot()} if search else {}),
+            "taught": taught,
             "round": number,
             "part": part.snapshot() if part else {},
             "ensemble": ensemble.state_dict(),
             "watcher": watcher.snapshot(),
         }
 
+    taught: Tensor | None = None
     if saved is not None:
         with checkpoints.restoring():
             if not 0 <= saved["round"] <= len(rounds) or (saved["round"] == len(rounds) and saved["part"]):
                 raise ValueError("no such round")
             ensemble.load_state_dict(saved["ensemble"])
             watcher.restore(saved["watcher"])
+            taught = saved["taught"]
+    elif config.teacher:
+        drawn = seed_for(seed, "proposals")
+        taught = taught_by(config.teacher, observations, labels, unlabelled, config.members, drawn)
     networks = ensemble.networks
     mixed = bool(view.dtype.names)  # standardised in each batch: a view of all states would copy their pictures
     states = TrainingStates(
@@ -122,28 +126,17 @@ def fit(
         view=view,
         origins=origins.labelled,
     )
-    search = None
-    if config.proposals == "joint":
-        proposals = seed_for(seed, "proposals")
-        search = Search(view.see(observations), labels, view.see(unlabelled), config, proposals)
-        if saved is not None:
-            with checkpoints.restoring():
-                search.restore(saved["search"])
     first = saved["round"] if saved else 0
     forked = [states.device] if states.device.type == "cuda" else []
     with checkpoints, torch.random.fork_rng(devices=forked):  # Dropout and similar layers draw there
-        for _ in search.steps(watcher.report, REPORT_EVERY) if search else ():
-            checkpoints.offer(partial(state, 0, None))
-        searched, taught = (search.total, search.scores().to(device)) if search else (0, None)
         for number, members in enumerate(rounds[first:], start=first):
-            before = searched + number * config.steps
+            before = number * config.steps
             part = Round(networks, members, states, config, seed_for(seed, "batches", number), before, taught)
             if saved and number == first:
                 with checkpoints.restoring():
-                    if saved["part"] or not search:  # broken in the search, no part had begun
-                        part.restore(saved["part"])
+                    part.restore(saved["part"])
             for step in part.steps(watcher.report):
-                watcher.look(step - searched, ensemble)
+                watcher.look(step, ensemble)
                 checkpoints.offer(partial(state, number, part))
     ensemble.eval()
     if config.threshold != PAPER:
@@ -161,7 +154,8 @@ def _diverse(config: EnsembleConfig) -> bool:
 class Round(Resumable):
     """The training of ``members`` against each other and against the frozen members before them.
 
-    ``taught``, if any, are scores (K, M) of the unlabelled states, one row for each network, see ``proposals``.
+    ``taught``, if any, are a teacher's scores (K, M) of the unlabelled states, one row for each network: positive
+    predictions above 0, which weigh as much as a label from 1 on, in proportion below.
     Checks every ``REPORT_EVERY`` steps for a loss, and at the end for a weight, that is NaN or Inf.
     """
 
@@ -181,7 +175,7 @@ class Round(Resumable):
         self.networks = [networks[member].train() for member in members]
         self.objective = load_objective(config.diversity) if _diverse(config) else None
         self.frozen = states.unlabelled_logits(networks[: members[0]] if self.objective else [])
-        self.taught = None if taught is None else taught[list(members)]
+        self.taught = None if taught is None else taught[list(members)].to(states.device)
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
         self.optimiser = torch.optim.Adam(
@@ -227,7 +221,7 @@ class Round(Resumable):
                 raise NumericalError(f"a weight of member {member} is NaN or Inf after step {self.before + self.done}")
 
     def _losses(self, labelled: NDArray[np.int64], unlabelled: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
-        """Each member's loss on labelled states and its proposal's predictions (K,), those of diversity (P,)."""
+        """Each member's loss on labelled states and on what it is taught (K,), those of diversity (P,)."""
         states, config = self.states, self.config
         targets = states.targets(labelled)
         diversity_losses = torch.zeros(0, device=states.device)

@@ -163,9 +163,6 @@ def view_of(
     observations: Any, unlabelled: Any, config: EnsembleConfig, origins: StateOrigins, seed: int, *, fitted: bool
 ) -> View:
     """The members' view; ``fitted``: it has learned from the states, else what it learned is to be loaded."""
-    if observations.dtype != PICTURE and config.proposals != "none":
-        fault = f"proposals={config.proposals}"
-        raise UserError("these observations are not pictures", fault, "Set proposals=none.")
     if config.view == FULL:
         return full_view(observations, *([observations, unlabelled] if fitted else []))
     view = own_view(config.view, config.view_settings, observations.shape[1:])

@@ -26,8 +26,8 @@ from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, names_in, network_for
-from hypogoal.hypotheses.proposals import agreements, search_steps
 from hypogoal.hypotheses.scores import best_mean_worst, member_scores
+from hypogoal.hypotheses.teacher import load_teacher
 from hypogoal.hypotheses.thresholds import threshold_rule
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.hypotheses.views import StateOrigins, own_view
@@ -59,7 +59,8 @@ def train_ensemble(
     device = prepare(device)
     load_objective(config.diversity)
     threshold_rule(config.threshold)
-    agreements(config)
+    if config.teacher:
+        load_teacher(config.teacher)
     dataset = open_dataset(data)
     if config.view != FULL:
         own_view(config.view, config.view_settings, dataset.observation_shape)
@@ -79,7 +80,7 @@ def train_ensemble(
     settings |= {"observation_dtype": type_text(dataset.observation_dtype)}
     settings |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
-    steps = len(sub_goals) * (steps_of(config) + search_steps(config))
+    steps = len(sub_goals) * steps_of(config)
     artefact: dict[str, Any] = {"kind": "ensemble", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     with training("train-ensemble", out, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
         folder, parts = work.folder, work.folder.parent / FOLDER

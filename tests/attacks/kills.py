@@ -65,15 +65,6 @@ _ALL = (
         ("train-ensemble", "{data}", *_set("steps=6", "workers=2", "members=2", "schedule=sequential", GOALS)),
         ("data",),
     ),
-    Stage(
-        "joint",
-        (
-            *("train-ensemble", "{data}"),
-            *_set("steps=12", "workers=1", "members=2", "diversity=none", GOALS),
-            *_set("proposals=joint", "restarts=4", "agreement=0"),
-        ),
-        ("data",),
-    ),
     Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=4", "workers=1", "members=2")), ("rooms",)),
     Stage(
         "options",

@@ -1,0 +1,29 @@
+"""A teacher: own code that says what members should predict in unlabelled states, beside the labels."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hypogoal.core.own_code import UsersCode, load_own
+
+
+def load_teacher(name: str) -> Callable[..., Any]:
+    """The function ``module:function``, or of an entry point; any other name is a ``UserError``."""
+    teacher: Callable[..., Any] = load_own(name, "teacher", "hypogoal.teachers", {})
+    return teacher
+
+
+def taught_by(name: str, observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Tensor:
+    """A teacher's scores of unlabelled states, float32 (K, M); others than finite ones are a ``UserError``.
+
+    It gets labelled observations (N, *obs), labels bool (N,), unlabelled observations (M, *obs), K and a seed.
+    """
+    teacher, shape = load_teacher(name), (members, len(unlabelled))
+    with UsersCode(f"the teacher {name!r}", teacher) as code:
+        scores = np.array(teacher(observations, labels, unlabelled, members, seed), dtype=np.float32)
+        if scores.shape != shape or not np.isfinite(scores).all():
+            code.refuse(f"gave scores {scores.shape}", f"Give finite ones, {shape}.")
+    return torch.from_numpy(scores)
