@@ -232,7 +232,7 @@ class TurnEngine(Engine):
         room: the number of states, besides start states, of which it keeps what it saw.
     """
 
-    restarts = resumes = alike = True
+    restarts = resumes = True
     room: int
     _ring: list[Any]
 

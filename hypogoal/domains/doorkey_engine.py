@@ -94,7 +94,7 @@ class DoorKeyEngine(Engine):
 
     n_actions = N_ACTIONS
     observation_shape = OBSERVATION_SHAPE
-    restarts = resumes = alike = True
+    restarts = resumes = True
     n_states = 0
 
     def __init__(
