@@ -80,6 +80,8 @@ def part(
 def command(*words: str) -> None:
     """Run ``hypogoal`` with these words, quietly."""
     code = main([*words, "--quiet"])
+    if code > 128:
+        raise SystemExit(code)  # a signal: no further part is begun
     if code:
         raise RuntimeError(f"hypogoal {' '.join(words)} ended with exit code {code}")
 
@@ -452,7 +454,7 @@ def train_meta(work: Path) -> Table:
 def train_options_ladder(work: Path) -> Table:
     few = settings(members=2, steps=40, batch_size=16, workers=1)
     ensemble = made(work / "montezuma-ensemble", "train-ensemble", str(montezuma_data(work)), *few)
-    words = settings(start="1L", steps=2_000, steps_for="all", random_episodes=0)
+    words = settings(start="1L", steps=1_000, random_episodes=0)  # of each option
     return trace(made(work / "ladder-options", "train-options", str(ensemble), *words))
 
 
@@ -492,8 +494,8 @@ def evaluation_rooms(work: Path) -> Table:
 def evaluation_demo(work: Path) -> Table:
     """The demo of DoorKey with shorter trainings."""
     run = work / "demo"
-    shorter = settings_of("collect", heldout_layouts=4) + settings_of("train-ensemble", steps=60)
-    shorter += settings_of("train-options", steps=20_000) + settings_of("train-meta", steps=10_000)
-    shorter += settings_of("train-baseline", steps=10_000)
+    shorter = settings_of("collect", heldout_layouts=2) + settings_of("train-ensemble", steps=40, batch_size=32)
+    shorter += settings_of("train-options", steps=8_000) + settings_of("train-meta", steps=6_000)
+    shorter += settings_of("train-baseline", steps=6_000)
     command("run", "doorkey", "--preset", "demo", *settings(workers=1), *shorter, "--out", str(run))
     return evaluated(run)
