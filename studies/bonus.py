@@ -7,6 +7,8 @@ python -m studies.bonus runs/figure6 docs/results/figure6-doorkey.csv
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,8 +27,7 @@ from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.meta.training import judged
 from hypogoal.options.tables import Episodes
 from hypogoal.options.termination import Terminations
-from studies.cells import parser_of
-from studies.figure6 import read_agents, tables, training_rows, write_agents
+from studies.figure6 import read_agents, rows_of, training_numbers, write_agents
 
 BONUS = 0.2  # the best of .02, .05, .1 and .2 on three other layouts
 METHOD = "ppo-bonus"
@@ -73,9 +74,8 @@ def paid(ensemble: Artefact, layout: int, steps: int) -> Run:
     """PPO in its tuned setting, with the ensemble's seed, in the world of the ensemble's states."""
     device = prepare("cpu")
     chosen = HYPERPARAMETERS["ppo", "tuned"]
-    config = BaselineConfig(layout_seed=layout, steps=steps)
     world = DOMAIN.world(ensemble.config["domain_config"])
-    engine = DOMAIN.make_engine(layout, chosen.environments, config.max_episode_steps, **world)
+    engine = DOMAIN.make_engine(layout, chosen.environments, BaselineConfig.max_episode_steps, **world)
     env = PaidEnv(engine, judged(engine, ensemble.path, ensemble.config, device))
     train(env, chosen, steps, ensemble.seed)
     place = {"layout_seed": layout, "shortest_path": engine.shortest_path()}
@@ -83,17 +83,20 @@ def paid(ensemble: Artefact, layout: int, steps: int) -> Run:
 
 
 def main() -> None:
-    """Train those that are missing, print the tables."""
-    arguments = parser_of(__doc__, run="the folder of the sweep").parse_args()
-    if not arguments.tables:
-        agents = read_agents(arguments.csv)
-        for layout, seed in zip(LAYOUTS, SEEDS, strict=True):
-            agent = (METHOD, str(layout))
-            if agent not in agents:
-                ensemble = open_artefact(arguments.run / f"ensemble/method-dbat-k3-seed-{seed}", "ensemble")
-                agents[agent] = training_rows(METHOD, paid(ensemble, layout, STEPS))
-                write_agents(arguments.csv, agents)
-    print("\n".join(tables(arguments.csv)))
+    """Train those that are missing; ``studies.figure6`` prints the tables."""
+    parser = argparse.ArgumentParser(description="PPO that is paid for what an ensemble's members know.")
+    parser.add_argument("run", type=Path, help="the folder of the sweep")
+    parser.add_argument("csv", type=Path, help="the file of all agents' numbers")
+    arguments = parser.parse_args()
+    agents = read_agents(arguments.csv)
+    for layout, seed in zip(LAYOUTS, SEEDS, strict=True):
+        agent = (METHOD, str(layout))
+        if agent in agents:
+            continue
+        ensemble = open_artefact(arguments.run / f"ensemble/method-dbat-k3-seed-{seed}", "ensemble")
+        run = paid(ensemble, layout, STEPS)
+        agents[agent] = rows_of(METHOD, run, training_numbers(run))
+        write_agents(arguments.csv, agents)
 
 
 if __name__ == "__main__":

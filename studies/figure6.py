@@ -67,9 +67,9 @@ def collect(run: Path, path: Path) -> None:
             agent = (method, str(read.layout["layout_seed"]))
             if agent in agents:
                 continue
-            agents[agent] = training_rows(method, read)
+            agents[agent] = rows_of(method, read, training_numbers(read))
             if kind == "meta":
-                agents[agent] += _rows(method, read, _frozen_numbers(artefact, read))
+                agents[agent] += rows_of(method, read, _frozen_numbers(artefact, read))
     write_agents(path, agents)
 
 
@@ -98,17 +98,13 @@ def method_of(config: Mapping[str, Any], place: str) -> str:
     return next(name for name in METHODS if f"-{name}-" in f"-{place}-")
 
 
-def training_rows(method: str, run: Run) -> list[dict[str, str]]:
-    """The rows of one agent's training."""
-    return _rows(method, run, _training_numbers(run))
-
-
-def _rows(method: str, run: Run, numbers: Iterable[tuple[str, str, float]]) -> list[dict[str, str]]:
+def rows_of(method: str, run: Run, numbers: Iterable[tuple[str, str, float]]) -> list[dict[str, str]]:
+    """The rows of an agent with these numbers: chooser, quantity and value."""
     agent = {"method": method, "layout": str(run.layout["layout_seed"]), "seed": str(run.seed)}
     return [agent | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"} for chooser, name, value in numbers]
 
 
-def _training_numbers(run: Run) -> Iterator[tuple[str, str, float]]:
+def training_numbers(run: Run) -> Iterator[tuple[str, str, float]]:
     """Chooser, quantity and value of one agent's training."""
     shortest = run.layout["shortest_path"]
     numbers = run_numbers(run.episodes, shortest)
