@@ -22,7 +22,7 @@ VISITED = "--set save_visited=20"
 # is neither the only one nor the first.
 DOORKEY_RUN = {
     "data.h5": "collect doorkey --set heldout_layouts=2 --set unlabelled_seeds=1",
-    "another": f"train-ensemble {{run}}/data.h5 --set members=2 --set workers=1 {GOALS} --set steps=2 --seed 1",
+    "another": f"train-ensemble {{run}}/data.h5 {FEW} {GOALS} --seed 1",
     "ensemble": f"train-ensemble {{run}}/data.h5 {FEW} {GOALS}",
     "ensemble-none": f"train-ensemble {{run}}/data.h5 {FEW} --set sub_goals=open-red-door --set diversity=none"
     " --set threshold=unlabelled-split",

@@ -8,6 +8,8 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from command_line import refuses, run
+from shared_runs import DOORKEY_RUN, command
 from toy_data import reseal
 
 import hypogoal
@@ -17,107 +19,64 @@ from hypogoal.dataset import open_dataset
 from hypogoal.settings import CONFIGS
 from hypogoal.stages.sweep import config_class_of
 
-SMALL = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1"]
-QUICK = [
-    "--set",
-    "environments=8",
-    "--set",
-    "warm_up=100",
-    "--set",
-    "max_episode_steps=60",
-    "--set",
-    "random_episodes=5",
-]
 
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of every stage, a few steps each."""
-    run = tmp_path_factory.mktemp("run")
-    assert main(["collect", "doorkey", "--out", str(run / "data.h5"), *SMALL, "-q"]) == 0
-    ensemble = f"train-ensemble {run}/data.h5 --out {run}/ensemble --set steps=4 --set workers=1 -q"
-    options = f"train-options {run}/ensemble --out {run}/options --set steps=600 -q"
-    meta = f"train-meta {run}/ensemble --options {run}/options --out {run}/meta --set steps=800 --set decisions=32 -q"
-    assert main(ensemble.split()) == 0
-    assert main([*options.split(), *QUICK]) == 0
-    assert main([*meta.split(), *QUICK]) == 0
-    return run
-
-
-def one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
-    """Run a command that must fail with code 2 and a single line on stderr; returns the line."""
-    capsys.readouterr()
-    assert main(arguments) == 2
-    captured = capsys.readouterr()
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("hypogoal: "), captured.err
-    assert captured.out == ""
-    return lines[0]
-
-
-def test_steps_of_both_stages_count(made: Path) -> None:
+def test_steps_of_both_stages_count(tiny_run: Path) -> None:
     """Spec A3, A4, F5: train-meta continues; its curve begins with the episodes of train-options."""
-    rows = [line.split(",") for line in (made / "meta" / "episodes.csv").read_text().splitlines()[1:]]
-    assert int(rows[0][0]) <= 600 < int(rows[-1][0]) <= 1400 + 8
-    manifest = json.loads((made / "meta" / "manifest.json").read_text())
-    assert manifest["config"]["options_steps"] == 600
+    rows = [line.split(",") for line in (tiny_run / "meta" / "episodes.csv").read_text().splitlines()[1:]]
+    assert int(rows[0][0]) <= 1024 < int(rows[-1][0]) <= 3072 + 8
+    manifest = json.loads((tiny_run / "meta" / "manifest.json").read_text())
+    assert manifest["config"]["options_steps"] == 1024
     assert {entry["kind"] for entry in manifest["inputs"]} == {"ensemble", "options"}
-    layout = json.loads((made / "meta" / "layout.json").read_text())
+    layout = json.loads((tiny_run / "meta" / "layout.json").read_text())
     assert layout["layout_seed"] == 100 and layout["shortest_path"] >= 9
 
 
-def test_collected_states_and_members_are_files(made: Path) -> None:
+def test_collected_states_and_members_are_files(tiny_run: Path) -> None:
     """Spec A1, A2, B3: all states in one file, with their origin; a file of weights per sub-goal."""
-    dataset = open_dataset(made / "data.h5")
+    dataset = open_dataset(tiny_run / "data.h5")
     counts = dataset.counts()
     assert counts["labelled"]["go-to-goal"] == {"states": 1640, "positives": 8}
     assert len(dataset.unlabelled()) == counts["unlabelled"] > 500
     assert set(dataset.heldout("go-to-goal").origins["layout_seed"]).isdisjoint({0, 1, 2})
-    assert {path.stem for path in (made / "ensemble").glob("*.safetensors")} == set(dataset.sub_goals)
+    assert {path.stem for path in (tiny_run / "ensemble").glob("*.safetensors")} == {"collect-red-key", "open-red-door"}
 
 
-def test_show_and_verify(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_and_verify(tiny_run: Path) -> None:
     """Spec A8: what is this, is it whole."""
     for part, kind in (("data.h5", "data"), ("ensemble", "ensemble"), ("meta", "meta"), ("", "run")):
-        capsys.readouterr()
-        assert main(["show", str(made / part), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["kind"] == kind
-        assert main(["show", str(made / part)]) == 0
-        assert main(["verify", str(made / part)]) == 0
-        assert "whole" in capsys.readouterr().out
+        assert json.loads(run("show", tiny_run / part, "--json").out)["kind"] == kind
+        run("show", tiny_run / part)
+        assert "whole" in run("verify", tiny_run / part).out
 
 
-def test_pictures_do_not_spoil_json(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_do_not_spoil_json(tiny_run: Path, tmp_path: Path) -> None:
     """Spec A6: what a machine is to read is JSON and nothing else."""
-    assert main(["show", str(made / "data.h5"), "--json", "--pictures", str(tmp_path)]) == 0
-    said = capsys.readouterr()
+    said = run("show", tiny_run / "data.h5", "--json", "--pictures", tmp_path)
     assert json.loads(said.out)["kind"] == "data" and str(tmp_path) in said.err
 
 
-def test_verify_finds_damage(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_finds_damage(tiny_copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G2."""
-    copy = tmp_path / "ensemble"
-    shutil.copytree(made / "ensemble", copy)
-    weights = copy / "go-to-goal.safetensors"
+    weights = tiny_copy / "ensemble" / "open-red-door.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
-    assert main(["verify", str(copy), "--json"]) == 2
-    assert "go-to-goal.safetensors: changed" in json.loads(capsys.readouterr().out)["faults"][0]
+    assert main(["verify", str(tiny_copy / "ensemble"), "--json"]) == 2
+    assert "open-red-door.safetensors: changed" in json.loads(capsys.readouterr().out)["faults"][0]
 
 
-def test_python_interface(made: Path) -> None:
+def test_python_interface(tiny_run: Path) -> None:
     """The contract of the Python interface; Spec E1."""
-    ensemble = hypogoal.load_ensemble(made / "ensemble", "open-red-door")
+    ensemble = hypogoal.load_ensemble(tiny_run / "ensemble", "open-red-door")
     probabilities = ensemble.predict(np.zeros((2, 64, 64, 3), dtype=np.uint8))
-    assert probabilities.shape == (2, 3) and probabilities.dtype == np.float32
+    assert probabilities.shape == (2, 2) and probabilities.dtype == np.float32
     for part in ("options", "meta"):
-        options = hypogoal.load_options(made / part)
+        options = hypogoal.load_options(tiny_run / part)
         env = hypogoal.OptionEnv(gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=100), options)
-        assert env.action_space == gymnasium.spaces.Discrete(15)
+        assert env.action_space == gymnasium.spaces.Discrete(4)
         env.reset(seed=0)
         rng = np.random.default_rng(0)
         for _ in range(5):
             masks = env.action_masks()
-            assert masks.shape == (15,) and masks.any()
+            assert masks.shape == (4,) and masks.any()
             observation, _reward, terminated, truncated, info = env.step(int(rng.choice(np.flatnonzero(masks))))
             assert env.observation_space.contains(observation)
             assert 1 <= info["duration"] <= 10
@@ -125,69 +84,71 @@ def test_python_interface(made: Path) -> None:
                 env.reset()
 
 
-def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec A6, G1: what was made with the same settings, seed and inputs; else it is one line."""
-    made = Path(shutil.copytree(made, tmp_path / "run"))
-    assert main(["evaluate", str(made), "-q"]) == main(["report", str(made), "-q"]) == 0
-    capsys.readouterr()
-    data, ensemble, meta = (str(made / name) for name in ("data.h5", "ensemble", "meta"))
-    collect = ["collect", "doorkey", "--out", data, *SMALL, "--resume", "-q"]
-    train = ["train-ensemble", data, "--out", ensemble, "--set", "steps=4", "--set", "workers=1", "--resume", "-q"]
-    fewer = [*train[:-2], "--set", "workers=2", *train[-2:]]  # of which no result depends
-    evaluate, report = ["evaluate", str(made), "--resume", "-q"], ["report", str(made), "--resume", "-q"]
-    files = [path for path in sorted(made.rglob("*")) if path.is_file()]
-    before = [path.read_bytes() for path in files]
-    outs = (data, ensemble, ensemble, str(made / "evaluation"), str(made / "report" / "index.html"))
-    for arguments, out in zip((collect, train, fewer, evaluate, report), outs, strict=True):
-        assert main(arguments) == 0
-        said = capsys.readouterr()
+def resumed(folder: Path, name: str, *more: str) -> list[str]:
+    """The command of one of the shared run's outputs, to be continued."""
+    return [*command(DOORKEY_RUN, folder, name), "--resume", *more]
+
+
+def test_what_is_complete_is_kept(tiny_run: Path) -> None:
+    """Spec A6, G1: what was made with the same settings, seed and inputs is neither made again nor changed."""
+    commands = {
+        tiny_run / "data.h5": resumed(tiny_run, "data.h5"),
+        tiny_run / "ensemble": resumed(tiny_run, "ensemble", "--set", "workers=2"),  # of which no result depends
+        tiny_run / "meta": resumed(tiny_run, "meta"),
+        tiny_run / "evaluation": ["evaluate", tiny_run, "--resume", "-q"],
+        tiny_run / "report" / "index.html": ["report", tiny_run, "--resume", "-q"],
+    }
+    for out, words in commands.items():
+        said = run(*words)
         assert said.out == f"{out}\n" and f"{out} is complete already" in said.err
+
+
+def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
+    """Spec A6, G1: other settings, seeds, inputs and kinds are one line."""
     made_with = "the complete output was made with"
-    cases = [
-        ([*collect, "--seed", "1"], f"{made_with} seed=0, not 1"),
-        ([*train, "--diversity", "none"], f"{made_with} diversity=dbat, not none"),
-        ([*train, "--seed", "3"], f"{made_with} seed=0, not 3"),
-        ([*train, "--unlabelled", data], f"{made_with} other inputs"),
-        ([train[0], str(made / "none.h5"), *train[2:]], "no such data file"),
-        (["train-meta", ensemble, "--out", str(made / "options"), "--resume"], "not of kind 'meta': it is of kind"),
-        (["collect", "montezuma", "--out", data, "--resume"], f"{made_with} domain=doorkey, not montezuma"),
-        (["train-baseline", "montezuma", "--out", meta, "--resume"], "not of kind 'baseline'"),
-        ([*report, "--videos", "2"], f"{made_with} videos=1, not 2"),
-    ]
-    for arguments, words in cases:
-        assert words in one_line(capsys, arguments)
-    assert [path for path in sorted(made.rglob("*")) if path.is_file()] == files
-    assert [path.read_bytes() for path in files] == before
+    data, ensemble, meta = (tiny_run / name for name in ("data.h5", "ensemble", "meta"))
+    refuses(f"{made_with} seed=0, not 1", *resumed(tiny_run, "data.h5", "--seed", "1"))
+    refuses(f"{made_with} domain=doorkey, not montezuma", "collect", "montezuma", "--out", data, "--resume")
+    refuses(f"{made_with} diversity=dbat, not none", *resumed(tiny_run, "ensemble", "--diversity", "none"))
+    refuses(f"{made_with} seed=0, not 3", *resumed(tiny_run, "ensemble", "--seed", "3"))
+    refuses(f"{made_with} other inputs", *resumed(tiny_run, "ensemble", "--unlabelled", str(data)))
+    refuses("no such data file", "train-ensemble", tiny_run / "none.h5", "--out", ensemble, "--resume")
+    refuses("not of kind 'meta': it is of kind", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
+    refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", meta, "--resume")
+    refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
 
 
-def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:
-    """Same seed, same machine, same bytes: every stage, whether TensorBoard gets the logs or not."""
-    assert main(["collect", "doorkey", "--out", str(tmp_path / "data.h5"), *SMALL, "-q"]) == 0
-    arguments = ["--set", "steps=4", "--set", "workers=2", "-q", "--tensorboard", str(tmp_path / "boards")]
-    assert main(["train-ensemble", str(made / "data.h5"), "--out", str(tmp_path / "ensemble"), *arguments]) == 0
-    meta = f"train-meta {made}/ensemble --options {made}/options --out {tmp_path}/meta --set steps=800 -q"
-    meta += f" --tensorboard {tmp_path}/boards/meta"
-    assert main([*meta.split(), "--set", "decisions=32", *QUICK]) == 0
-    files = ("meta.safetensors", "options.safetensors", "episodes.csv", "choices.csv", "metrics.jsonl")
-    for name in ("ensemble/open-red-door.safetensors", "ensemble/metrics.jsonl", *(f"meta/{file}" for file in files)):
-        assert (made / name).read_bytes() == (tmp_path / name).read_bytes(), name
+def test_same_seed_same_bytes(tiny_run: Path, tiny_copy: Path, tmp_path: Path) -> None:
+    """Same seed, same machine, same bytes: every stage, in any number of processes, logs in TensorBoard or not."""
+    boards = tmp_path / "boards"
+    more = {
+        "ensemble": ["--set", "workers=2", "--tensorboard", boards],
+        "meta": ["--tensorboard", boards / "meta"],
+    }
+    for name in ("data.h5", "ensemble", "options", "meta", "ppo"):
+        run(*command(DOORKEY_RUN, tiny_copy, name), *more.get(name, []), "--force")
+        made = tiny_run / name
+        for path in [made, *made.rglob("*")]:
+            if path.is_file() and path.name != "manifest.json":
+                assert path.read_bytes() == (tiny_copy / path.relative_to(tiny_run)).read_bytes(), path
     for name in ("open-red-door", "meta"):
-        assert any((tmp_path / "boards" / name).iterdir()), name
+        assert any((boards / name).iterdir()), name
 
 
 @pytest.fixture(scope="module")
-def places(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Where things are that commands are told of: what was made, a damaged file, an artefact to come, nothing."""
     folder = tmp_path_factory.mktemp("mistakes")
-    (folder / "cut.h5").write_bytes((made / "data.h5").read_bytes()[:5000])
-    shutil.copytree(made / "ensemble", folder / "newer")
+    (folder / "cut.h5").write_bytes((tiny_run / "data.h5").read_bytes()[:5000])
+    shutil.copytree(tiny_run / "ensemble", folder / "newer")
     reseal(folder / "newer", format=3)
     own = {name: folder / name for name in ("newer", "none", "out")}
-    return {"made": made, "data": made / "data.h5", "ensemble": made / "ensemble", "cut": folder / "cut.h5", **own}
+    made = {"made": tiny_run, "data": tiny_run / "data.h5", "ensemble": tiny_run / "ensemble"}
+    return {**made, **own, "cut": folder / "cut.h5"}
 
 
 @pytest.mark.parametrize(
-    ("command", "words"),
+    ("line", "words"),
     [
         ("train-ensemble {none}.h5 --out {out}", "no such data file"),
         ("train-ensemble {ensemble} --out {out}", "a folder where a data file is needed"),
@@ -202,7 +163,7 @@ def places(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
         ("collect doorkey --out {ensemble} --force", "not of kind 'data'"),
         ("evaluate {ensemble} --out {ensemble} --force", "not of kind 'evaluation'"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
-        ("train-ensemble {data} --out {out} --set sub_goals=go-to-goal,go-to-goal", "a sub-goal is named twice"),
+        ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
         ("train-ensemble {data} --out {out} --seed 9007199254740992", "--seed"),
         ("collect doorkey --out {out} --seed 36893488147419103232", "--seed"),
         ("train-meta {ensemble} --out {out} --layout-seed 9007199254740993", "out of range: layout_seed"),
@@ -233,18 +194,16 @@ def places(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
         ("frobnicate", "--help"),
     ],
 )
-def test_mistakes(places: dict[str, Path], capsys: pytest.CaptureFixture[str], command: str, words: str) -> None:
+def test_mistakes(places: dict[str, Path], line: str, words: str) -> None:
     """Spec G2: missing input, wrong kind, unknown names, values out of range: one line, nothing written."""
-    assert words in one_line(capsys, command.format(**places).split())
-    assert sorted(path.name for path in places["out"].parent.iterdir()) == ["cut.h5", "newer"]
+    refuses(words, *line.format(**places).split())
 
 
-def test_a_failed_force_keeps_the_old_artefact(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_force_keeps_the_old_artefact(tiny_copy: Path) -> None:
     """Spec G2: nothing lost."""
-    copy = tmp_path / "ensemble"
-    shutil.copytree(made / "ensemble", copy)
-    one_line(capsys, ["train-ensemble", str(tmp_path / "none.h5"), "--out", str(copy), "--force"])
-    assert main(["verify", str(copy)]) == 0
+    out = tiny_copy / "ensemble"
+    refuses("no such data file", "train-ensemble", tiny_copy / "none.h5", "--out", out, "--force")
+    run("verify", out)
 
 
 @pytest.mark.parametrize("stage", ["collect", *CONFIGS, "run"])
@@ -256,20 +215,17 @@ def test_sources_of_settings_are_those_that_a_reader_can_look_up(stage: str, dom
     assert not [row["source"] for row in rows if re.search(r"\bSpec\b|\b[A-H][1-9]\b", row["source"])]
 
 
-def test_config_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_lists_every_setting() -> None:
     """'hypogoal config STAGE': default, unit, meaning, source."""
-    assert main(["config", "train-meta"]) == 0
-    text = capsys.readouterr().out
+    text = run("config", "train-meta").out
     assert "gae_lambda = 0.95" in text and "paper: 0.97" in text
-    assert main(["config", "train-meta", "--json"]) == 0
-    assert any(row["name"] == "steps" for row in json.loads(capsys.readouterr().out))
+    assert any(row["name"] == "steps" for row in json.loads(run("config", "train-meta", "--json").out))
 
 
-def test_dry_run_lists_commands_and_runs_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_lists_commands_and_runs_none(tmp_path: Path) -> None:
     """Spec A6: a run is ordinary commands. Spec D5, E4: in the paper's, policies start fresh, a layout per agent."""
     out = tmp_path / "run"
-    assert main(["run", "doorkey", "--preset", "paper", "--out", str(out), "--dry-run"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = run("run", "doorkey", "--preset", "paper", "--out", out, "--dry-run").out.splitlines()
     assert sum("train-meta" in line and "chooser" not in line and "termination" not in line for line in lines) == 10
     assert len({line.split("--layout-seed ")[1].split()[0] for line in lines if "--layout-seed" in line}) == 10
     assert not any("train-options" in line for line in lines)

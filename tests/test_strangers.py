@@ -17,13 +17,12 @@ from hypogoal.core.artefacts import create_artefact, find_input, open_artefact, 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, parse_json, read_bytes, read_json
 from hypogoal.core.own_code import given
-from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.core.tensors import save_tensors
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.records import LOGS, PLAN, log_of, open_log, read_plan, write_plan
 from hypogoal.experiments.toml_file import read_toml
 from hypogoal.hypotheses.networks import load_network
-from hypogoal.inspection import faults_of
 
 ENDLESS = ("/proc/self/pagemap", "/proc/cpuinfo", "/sys/fs/cgroup/cgroup.procs")
 SMALL = {"sub_goals": ["one"], "members": 1}
@@ -205,28 +204,6 @@ def test_toml_has_the_same_bounds(tmp_path: Path, number: str) -> None:
         (tmp_path / "own.toml").write_text(text)
         with pytest.raises(UserError, match="not valid TOML"):
             read_toml(tmp_path / "own.toml")
-
-
-TYPES = {"F4": 4, "F8_E4M3": 8, "F8_E5M2": 8, "F8_E4M3FNUZ": 8, "F8_E5M2FNUZ": 8, "F8_E8M0": 8, "F6_E2M3": 6,
-         "BF16": 16, "F16": 16, "C64": 64, "I8": 8, "I16": 16, "U16": 16, "U32": 32, "U64": 64, "XX": 8}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", TYPES)
-def test_weights_of_a_type_that_nobody_writes(tmp_path: Path, kind: str) -> None:
-    """Spec G2: in one line, and ``verify`` goes on to what else is wrong."""
-    header = {"x": {"dtype": kind, "shape": [8], "data_offsets": [0, TYPES[kind]]}}
-    text = json.dumps(header).encode()
-    out = tmp_path / "ensemble"
-    with create_artefact(out, kind="ensemble", config=SMALL, seed=0) as folder:
-        fill(folder, "ensemble", SMALL)
-        (folder / "one.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + bytes(TYPES[kind]))
-        (folder / "metrics.jsonl").write_text(DEEP)
-        (folder / "z.json").write_text("{")
-    faults = faults_of(out)
-    assert len(faults) == 3 and all(fault.isprintable() for fault in faults), faults
-    assert "of type torch." in faults[0] + faults[1] or "are damaged" in faults[0] + faults[1]
-    with pytest.raises(UserError, match=r"are not kept|are damaged"):
-        load_tensors(out / "one.safetensors")
 
 
 def test_a_type_that_is_not_kept_is_not_written(tmp_path: Path) -> None:

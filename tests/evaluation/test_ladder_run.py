@@ -9,15 +9,15 @@ import shutil
 import h5py
 import numpy as np
 import pytest
-from ladder_run import ROOMS, SUB_GOAL, executions, write_data, write_members, write_options, write_run
+from command_line import refuses
+from ladder_run import ROOMS, SUB_GOAL, LadderDomain, executions, write_options
 from openings import agrees
 from rich.console import Console
 from toy_data import reseal
 
 from hypogoal.core.artefacts import find_artefacts, open_artefact
-from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
-from hypogoal.evaluation import explorer, judging
+from hypogoal.evaluation import judging
 from hypogoal.evaluation.questions import summary_table
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
@@ -27,54 +27,28 @@ from hypogoal.stages.report import draw_figures, report
 QUIET = {"quiet": True}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def trusted():
-    """Spec B6, G2: the data name ladder_run:DOMAIN, code that the user must allow; few states are explained."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HYPOGOAL_TRUST", "ladder_run:DOMAIN")
-        for name, value in {"MOST_STATES": 48, "MOST_EXPLAINED": 8}.items():
-            patch.setattr(explorer, name, value)
-        yield
+@pytest.fixture
+def metrics(ladders):
+    return json.loads((ladders / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """N of 1, 2, 3 (3: every ladder), two seeds, three methods; options at N=2 on two ladders, oracles beside."""
-    run = tmp_path_factory.mktemp("runs") / "ladders"
-    write_run(run)
-    return run
+@pytest.fixture
+def page(ladders):
+    return (ladders / "report" / "index.html").read_text(encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """What most tests that change something need of it: N of 2, one seed, two methods, the oracle."""
-    run = tmp_path_factory.mktemp("runs") / "small"
-    write_run(run, numbers=(2,), seeds=(0,), methods=("cnn", "dbat"))
-    return run
-
-
-@pytest.fixture(scope="module")
-def metrics(run):
-    return evaluate(run, run / "evaluation", **QUIET)
-
-
-@pytest.fixture(scope="module")
-def page(run, metrics):
-    return report(run).read_text(encoding="utf-8")
-
-
-def test_the_page_opens_with_a_verdict_of_its_numbers(run, page):
+def test_the_page_opens_with_a_verdict_of_its_numbers(ladders):
     """Spec I1: options of several members against those of one classifier, recomputed from ``numbers.csv``."""
     task = "The reward and the end of an episode are those of the domain 'ladder_run:DOMAIN'"
-    agrees(run, task, "Several hypotheses made no difference over 2 ladders: options", "Two runs are not evidence")
+    agrees(ladders, task, "Several hypotheses made no difference over 2 ladders: options", "Two runs are not evidence")
 
 
-def test_members_are_judged_room_by_room(run, metrics):
+def test_members_are_judged_room_by_room(ladders, metrics):
     """Spec F1: recomputed here from the file and the weights: unseen rooms, all rooms, and the validated member."""
     ensemble = next(one for one in metrics["ensembles"] if one["path"] == "ensemble/dbat/groups-2-seed-1")
     assert (ensemble["method"], ensemble["groups"], ensemble["name"]) == ("dbat, K=2", 2, "dbat, K=2, groups=2")
-    source = open_artefact(run / ensemble["path"])
-    split = open_dataset(run / "data/groups-2.h5").heldout(SUB_GOAL)
+    source = open_artefact(ladders / ensemble["path"])
+    split = open_dataset(ladders / "data/groups-2.h5").heldout(SUB_GOAL)
     probabilities = read_ensemble(source.path, source.config, SUB_GOAL).predict(split.observations)
     yes = probabilities > 0.5
     (scopes,) = ensemble["sub_goals"]
@@ -92,15 +66,15 @@ def test_members_are_judged_room_by_room(run, metrics):
             assert scopes[name]["validated_member"] == int(scores["balanced_accuracy"].argmax())
 
 
-def test_any_number_of_processes_gives_the_same_evaluation(small, tmp_path, monkeypatch):
+def test_any_number_of_processes_gives_the_same_evaluation(small_ladders, tmp_path, monkeypatch):
     """Spec G1, G5: judged in two processes: the same numbers and arrays; this run is too small for more than one."""
-    metrics = evaluate(small, tmp_path / "alone", **QUIET)
-    cases = [case for _, case in judging.cases_of(find_artefacts(small, "ensemble"))]
+    metrics = evaluate(small_ladders, tmp_path / "alone", **QUIET)
+    cases = [case for _, case in judging.cases_of(find_artefacts(small_ladders, "ensemble"))]
     assert judging.processes_for(cases, 2) == 1
     monkeypatch.setattr(judging, "SPREAD_FROM", 0)
     monkeypatch.setenv("HYPOGOAL_CORES", "2")
     assert judging.processes_for(cases, 2) == 2
-    assert evaluate(small, tmp_path / "again", **QUIET) == metrics
+    assert evaluate(small_ladders, tmp_path / "again", **QUIET) == metrics
     with h5py.File(tmp_path / "again/arrays.h5") as spread, h5py.File(tmp_path / "alone/arrays.h5") as alone:
         found = []
         alone.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
@@ -163,9 +137,9 @@ def test_distances_are_those_of_the_tables(metrics):
     assert metrics["missing"] == []
 
 
-def test_every_number_is_a_row_of_one_table(run, metrics):
+def test_every_number_is_a_row_of_one_table(ladders, metrics):
     """Spec A5: numbers.csv says of each number what it is of, and has those of metrics.json."""
-    with (run / "evaluation/numbers.csv").open(encoding="utf-8", newline="") as file:
+    with (ladders / "evaluation/numbers.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     place = {"method": "dbat, K=2", "sub_goal": SUB_GOAL, "member": "1", "seed": "1", "N": "2"}
 
@@ -185,7 +159,7 @@ def test_every_number_is_a_row_of_one_table(run, metrics):
     }
 
 
-def test_stops_are_kept_to_be_drawn(run, metrics):
+def test_stops_are_kept_to_be_drawn(ladders, metrics):
     """Spec F4: of the first seed's best members, in the room's picture, by what became of them."""
     one, other = metrics["distance"]["shown"]
     assert (one["ladder"], one["groups"], one["seed"], one["rooms"]) == ("1L", 2, 0, [1, 6])
@@ -193,7 +167,7 @@ def test_stops_are_kept_to_be_drawn(run, metrics):
     assert [column["method"] for column in one["columns"]] == [
         "dbat, K=2", "no diversity, K=2", "single CNN", "oracle termination",
     ]  # fmt: skip
-    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+    with h5py.File(ladders / "evaluation" / "arrays.h5") as arrays:
         assert set(arrays["pictures"]) == {"1", "2", "6"}
         assert arrays["pictures/6"][0, 0, 0] == 30
         path = "stops/options/oracle/ladder-1L-seed-0/0"
@@ -202,7 +176,7 @@ def test_stops_are_kept_to_be_drawn(run, metrics):
         assert arrays[f"{path}/fates"][()].tolist() == [0, 0, 0, 1]
 
 
-def test_attributions_are_of_an_ensemble_that_can_disagree(run, metrics):
+def test_attributions_are_of_an_ensemble_that_can_disagree(ladders, metrics):
     """Spec F2: of the smallest N with the most members, on states in unseen rooms, each complete."""
     found = metrics["saliency"]
     assert found["ensemble"] == "ensemble/dbat/groups-1-seed-0"
@@ -210,7 +184,7 @@ def test_attributions_are_of_an_ensemble_that_can_disagree(run, metrics):
     errors = [member["completeness_error"] for state in goal["states"] for member in state["members"]]
     assert len(errors) == 2 * len(goal["states"]) > 0
     assert max(errors) < 1e-9
-    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+    with h5py.File(ladders / "evaluation" / "arrays.h5") as arrays:
         group = arrays[f"saliency/{SUB_GOAL}"]
         assert group["attributions"].shape == (len(goal["states"]), 2, 36, 36, 4)
         places = json.loads(group["places"][()])
@@ -262,7 +236,7 @@ def test_the_terminal_summary_fits(metrics):
     assert re.search(r"oracle termination +│ – │ +3\.0 │ +– │ +3\.0 │ +3\.0 │ +75 % ", text)
 
 
-def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
+def test_the_page_shows_ladders_and_nothing_of_agents(ladders, page):
     """Spec F7: its sections, Figures 3 to 5 with seeds, intervals, and what the paper claims; no empty section."""
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
@@ -279,7 +253,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     assert "Ladders: 1L and 2-6; seeds: 0 and 1." in page
     assert "not drawn" not in re.sub(r"rooms that are not drawn none", "", page)
     assert "Missing in this run" not in page
-    names = {path.stem for path in (run / "report" / "figures").iterdir()}
+    names = {path.stem for path in (ladders / "report" / "figures").iterdir()}
     assert names == {"figure3", "figure4", "figure5-1L-N2", "figure5-2-6-N2"}
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
@@ -287,23 +261,21 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     assert all(link.startswith("data:image/png;base64,") or link[1:] in ids for link in links)
 
 
-def test_the_report_is_the_same_each_time(run, page):
-    """Spec G1, F7: pictures and all."""
-    assert report(run, force=True).read_text(encoding="utf-8") == page
-
-
-def test_the_papers_figures_as_files(run, metrics, tmp_path):
+def test_the_papers_figures_as_files(ladders, tmp_path):
     """Spec F1-F4: Figures 2 to 5 and 9 of one sub-goal; what the agents' figures would need."""
-    written, missing = draw_figures(run, tmp_path, "png")
+    written, missing = draw_figures(ladders, tmp_path, "png")
     assert [path.stem for path in written] == [
         "figure2", "figure3", "figure4", "figure5-1L-N2", "figure5-2-6-N2", "figure9", "captions",
     ]  # fmt: skip
     assert [line.partition(":")[0] for line in missing] == ["Figure 6", "Figure 7", "Figure 8"]
 
 
-def test_ensembles_alone(tmp_path):
+def test_ensembles_alone(ladders, tmp_path):
     """Spec F1, F7: without options the page has Figure 3 and says what Figures 4 and 5 lack."""
-    write_run(tmp_path, numbers=(1,), seeds=(0,), methods=("dbat",), ladders=())
+    for name in ("data/groups-1.h5", "ensemble/dbat/groups-1-seed-0"):
+        (tmp_path / name).parent.mkdir(parents=True)
+    shutil.copy(ladders / "data/groups-1.h5", tmp_path / "data")
+    shutil.copytree(ladders / "ensemble/dbat/groups-1-seed-0", tmp_path / "ensemble/dbat/groups-1-seed-0")
     metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
     assert metrics["missing"] == [
         "no ensemble artefact of an ensemble without diversity (Figure 3)",
@@ -317,53 +289,41 @@ def test_ensembles_alone(tmp_path):
     Console(width=80, file=io.StringIO()).print(summary_table(metrics))
 
 
-def test_options_without_their_ensembles_evaluation(tmp_path):
+def test_options_without_their_ensembles_evaluation(ladders, tmp_path):
     """Spec F3: options may be made from an ensemble that is not in the run; N and method come from its manifest."""
-    write_data(tmp_path / "data.h5", 2)
-    source = tmp_path / "elsewhere/ensemble"
-    write_members(source, tmp_path / "data.h5", 2, "none", 0)
-    run = tmp_path / "run"
-    write_options(run / "options", source, "2-6", 3, executions(0, [7]) + executions(1, [5]), 2)
-    metrics = evaluate(run, run / "evaluation", **QUIET)
+    source = ladders / "ensemble/none/groups-2-seed-0"
+    write_options(tmp_path / "options", source, "2-6", 3, executions(0, [7]) + executions(1, [5]), 2)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
     (row,) = metrics["distance"]["over_ladders"]
     assert (row["method"], row["groups"], row["best"]["mean"]) == ("no diversity, K=2", 2, 5)
     assert row["validated"]["mean"] is None
     assert metrics["missing"][0] == "no ensemble"
-    page = report(run).read_text(encoding="utf-8")
+    page = report(tmp_path).read_text(encoding="utf-8")
     assert "<li>no ensemble</li>" in page
     assert "Figure 5 of the paper: ladder 2-6, N=2, seed 3" in page
 
 
-def test_a_table_of_executions_that_is_not_there(small, tmp_path):
+def test_a_table_of_executions_that_is_not_there(small_ladders):
     """Spec F, G2: options of a start without the table are named; a damaged table is one line."""
-    shutil.copytree(small, tmp_path / "copy", ignore=shutil.ignore_patterns("cnn"))
-    table = tmp_path / "copy/options/dbat/groups-2-ladder-1L-seed-0/executions.csv"
-    table.write_text("step\n1\n", encoding="utf-8")
-    with pytest.raises(UserError, match=r"executions\.csv"):
-        evaluate(tmp_path / "copy", tmp_path / "copy/evaluation", **QUIET)
-    shutil.rmtree(table.parent)
-    source = tmp_path / "copy/ensemble/dbat/groups-2-seed-0"
-    silent = tmp_path / "copy/options/dbat/groups-2-ladder-1L-seed-0"
-    write_options(silent, source, "1L", 0, [], 2)
-    files = open_artefact(silent).manifest["files"]
-    reseal(silent, files={name: digest for name, digest in files.items() if name != "executions.csv"})
-    metrics = evaluate(tmp_path / "copy", tmp_path / "copy/evaluation", **QUIET)
-    assert (
-        "no executions.csv in options/dbat/groups-2-ladder-1L-seed-0: its domain tells no distance"
-        in metrics["missing"]
-    )
+    options = small_ladders / "options/dbat/groups-2-ladder-1L-seed-0"
+    (options / "executions.csv").write_text("step\n1\n", encoding="utf-8")
+    refuses("executions.csv", "evaluate", small_ladders, "-q")
+    shutil.rmtree(options)
+    write_options(options, small_ladders / "ensemble/dbat/groups-2-seed-0", "1L", 0, [], 2)
+    files = open_artefact(options).manifest["files"]
+    reseal(options, files={name: digest for name, digest in files.items() if name != "executions.csv"})
+    metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET)
+    silent = "no executions.csv in options/dbat/groups-2-ladder-1L-seed-0: its domain tells no distance"
+    assert silent in metrics["missing"]
     (row,) = (row for row in metrics["distance"]["over_ladders"] if row["method"].startswith("dbat"))
     assert (row["seeds"], row["incomplete_seeds"]) == (0, [0])
-    assert "Seeds that lack a ladder are left out: dbat, K=2, N=2" in report(tmp_path / "copy").read_text()
+    assert "Seeds that lack a ladder are left out: dbat, K=2, N=2" in report(small_ladders).read_text()
 
 
-def test_a_domain_without_pictures(small, tmp_path, monkeypatch):
+def test_a_domain_without_pictures(small_ladders, monkeypatch):
     """Spec F4: what is missing is the pictures, not the numbers."""
-    from ladder_run import LadderDomain
-
     monkeypatch.setattr(LadderDomain, "pictures", False)
-    metrics = evaluate(small, tmp_path / "evaluation", **QUIET)
+    metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET)
     assert metrics["distance"]["shown"] == []
     assert metrics["distance"]["over_ladders"][0]["best"]["mean"] is not None
-    shutil.copytree(tmp_path / "evaluation", tmp_path / "run/evaluation")
-    assert "The domain has no pictures of its rooms" in report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "The domain has no pictures of its rooms" in report(small_ladders).read_text(encoding="utf-8")

@@ -3,13 +3,14 @@
 import json
 import re
 import shutil
+from functools import partial
 from html.parser import HTMLParser
 
 import h5py
 import numpy as np
 import pytest
-import toy_data
 from browser import loaded, needs_browser, title_of
+from command_line import refuses
 from ladder_run import (
     DOMAIN,
     SHAPE,
@@ -21,11 +22,9 @@ from ladder_run import (
     write_members,
     write_options,
 )
-from toy_data import fill
+from toy_data import fill, reseal
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import MANIFEST, create_artefact, sha256_of
-from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5, fixed, set_attribute
 from hypogoal.core.manifests import digest_of, sealed
@@ -137,15 +136,20 @@ def run(tmp_path_factory):
 @pytest.fixture
 def changed(run, tmp_path):
     """A copy of the run, to be changed."""
-    shutil.copytree(run, tmp_path / "runs" / run.name)
-    return tmp_path / "runs" / run.name
+    return shutil.copytree(run, tmp_path / "runs" / run.name)
 
 
-def reseal(path, text):
-    """Another text in a file of an artefact, whose manifest says that it was written so."""
-    path.write_text(text, encoding="utf-8")
+def metrics_of(run):
+    """What ``metrics.json`` of an evaluated run says."""
+    return json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+
+
+def write_metrics(run, metrics):
+    """Have the evaluation say something else, as if it had been written so."""
+    path = run / "evaluation" / "metrics.json"
+    path.write_text(json.dumps(metrics), encoding="utf-8")
     files = json.loads((path.parent / MANIFEST).read_text(encoding="utf-8"))["files"]
-    toy_data.reseal(path.parent, files=files | {path.name: sha256_of(path)})
+    reseal(path.parent, files=files | {path.name: sha256_of(path)})
 
 
 class Parsed(HTMLParser):
@@ -201,47 +205,26 @@ def replaced(value, numbers, place=()):
     }
 
 
-def walk(value, draw, goes_by):
-    """Payloads in place of every text: each that the page goes by alone, then all that are not refused at once.
-
-    Each is refused in one line, or the page has no more tags, attributes and scripts than it had.
+def with_payloads(value, draw, goes_by):
+    """The page with a payload in place of every text, which has no more tags, attributes and scripts than before.
 
     Args:
         value: all texts, as JSON.
-        draw: the page of such a value, or a refusal.
-        goes_by: what is tried one by one, a regular expression.
+        draw: the page of such a value.
+        goes_by: names of places at which another text may well be refused, a regular expression; they stay.
 
     Returns:
-        The page with payloads in place of all others, and the names of those places that it does not show.
+        The page, and the names of those places that it does not show.
     """
     honest = Parsed(draw(value))
-    numbers = {place: number for number, place in enumerate(places_of(value))}
-    alone = [place for place in numbers if re.search(goes_by, name_of(place))]
-    together = {place: number for place, number in numbers.items() if place not in alone}
-
-    def drawn(part):
-        page = draw(replaced(value, part))
-        found = Parsed(page)
-        assert found.tags <= honest.tags and found.scripts == honest.scripts, (part, found.tags - honest.tags)
-        shown = {int(number) for number in re.findall(r"ran(\d+)\.", "\n".join(found.texts))}
-        return page, {name_of(place) for place, number in part.items() if number not in shown}
-
-    accepted = {}
-    with pytest.MonkeyPatch.context() as patch:  # whether it is refused is said before its figures are drawn
-        patch.setattr("hypogoal.evaluation.page.to_svg", lambda figure, name: "")
-        for place in alone:
-            try:
-                draw(replaced(value, {place: numbers[place]}))
-            except UserError:
-                continue
-            accepted[place] = numbers[place]
-    try:
-        drawn(accepted)
-    except UserError:  # each alone was none
-        for place, number in accepted.items():
-            drawn({place: number})
-    assert len(together) > 100
-    return drawn(together)
+    every = enumerate(places_of(value))
+    numbers = {place: number for number, place in every if not re.search(goes_by, name_of(place))}
+    assert len(numbers) > 100
+    page = draw(replaced(value, numbers))
+    found = Parsed(page)
+    assert found.tags <= honest.tags and found.scripts == honest.scripts, found.tags - honest.tags
+    shown = {int(number) for number in re.findall(r"ran(\d+)\.", "\n".join(found.texts))}
+    return page, {name_of(place) for place, number in numbers.items() if number not in shown}
 
 
 def drawn(run, texts=None):
@@ -257,7 +240,7 @@ def everything(run):
     arrays = read_evaluation(run).arrays
     lists = {name: json.loads(arrays[name].item()) for name in arrays if name.endswith(("/kinds", "/places"))}
     assert len(lists) == 4
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    metrics = metrics_of(run)
     metrics["distance"]["shown"][0]["groups"] = "a text in place of a number"
     return {"metrics": metrics, "arrays": lists}
 
@@ -268,10 +251,10 @@ def walked(run, tmp_path_factory):
     changed = shutil.copytree(run, tmp_path_factory.mktemp("walked") / run.name)
 
     def draw(value):
-        reseal(changed / "evaluation" / "metrics.json", json.dumps(value["metrics"]))
+        write_metrics(changed, value["metrics"])
         return drawn(changed, value["arrays"])
 
-    return walk(everything(changed), draw, GOES_BY)
+    return with_payloads(everything(changed), draw, GOES_BY)
 
 
 def test_every_text_of_an_evaluation_is_escaped(walked):
@@ -303,7 +286,7 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
         evaluate(changed, changed / "evaluation", quiet=True, force=True)
         return drawn(changed)
 
-    _, unseen = walk(value, draw, MADE_BY)
+    _, unseen = with_payloads(value, draw, MADE_BY)
     assert not {name for name in unseen if not UNSEEN.search(name)}
 
 
@@ -311,21 +294,20 @@ def test_every_text_of_compared_runs_is_escaped(changed, run, tmp_path):
     """Spec G2: an evaluation of a stranger's beside one's own."""
 
     def draw(value):
-        reseal(changed / "evaluation" / "metrics.json", json.dumps(value["metrics"]))
+        write_metrics(changed, value["metrics"])
         return compare([changed, run], tmp_path / "both", force=True).read_text(encoding="utf-8")
 
-    _, unseen = walk({"metrics": everything(changed)["metrics"]}, draw, COMPARED_BY)
+    _, unseen = with_payloads({"metrics": everything(changed)["metrics"]}, draw, COMPARED_BY)
     assert unseen.isdisjoint({"metrics.agents.*.name", "metrics.rooms.*.method", "metrics.provenance.artefacts.*.kind"})
 
 
 def test_ids_and_files_are_named_by_no_stranger(changed):
     """Spec G2: figures have names that are slugs, whatever a ladder is called; two that differ stay two."""
     names = ["a/b", "a b", "\\q", "../../x", payload(1), "$\\frac$", "x" * 300, ".", "\0"]
-    path = changed / "evaluation" / "metrics.json"
-    metrics = json.loads(path.read_text(encoding="utf-8"))
+    metrics = metrics_of(changed)
     (shown,) = metrics["distance"]["shown"]
     metrics["distance"]["shown"] = [{**shown, "ladder": name, "groups": name} for name in names]
-    reseal(path, json.dumps(metrics))
+    write_metrics(changed, metrics)
     page = report(changed).read_text(encoding="utf-8")
     assert "<img src=x" not in page and "<script>document" not in page
     ids = re.findall(r'<figure id="([^"]*)"', page)
@@ -335,45 +317,51 @@ def test_ids_and_files_are_named_by_no_stranger(changed):
     assert "<img" not in (changed / "figures" / "captions.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("command", ["report", "report --figures", "compare"])
-@pytest.mark.parametrize("name", [r"\q", "a/b", "<b>", "=1+1", 3])
-def test_names_that_are_none_are_refused(changed, run, name, command, tmp_path, capsys):
-    """Spec G2: the rule for names of sub-goals holds for those in an evaluation, too: one line."""
-    path = changed / "evaluation" / "metrics.json"
-    metrics = json.loads(path.read_text(encoding="utf-8"))
-    metrics["selection"][0]["runs"][0]["sub_goals"][0]["sub_goal"] = name
-    reseal(path, json.dumps(metrics))
-    out = str(tmp_path / "out")
-    more = {"report": [], "report --figures": ["--figures", out], "compare": [str(run), "--out", out]}[command]
-    assert main([command.split()[0], str(changed), *more]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "has an invalid name" in line
-
-
-@pytest.mark.parametrize("part", ["ensembles", "explorer"])
-def test_paths_that_fit_nothing_are_one_line(changed, part, capsys):
-    """Spec G2: an evaluation that is not of one piece is damaged, whichever of its parts says so first."""
-    path = changed / "evaluation" / "metrics.json"
-    metrics = json.loads(path.read_text(encoding="utf-8"))
-    for one in metrics[part] if part == "ensembles" else [metrics[part]]:
-        one["path" if part == "ensembles" else "ensemble"] += "-other"
+def other_paths(metrics):
+    """An evaluation that is not of one piece."""
+    for one in metrics["ensembles"]:
+        one["path"] += "-other"
     metrics["agents"] = metrics["rooms"] = metrics["hypotheses"] = []
-    reseal(path, json.dumps(metrics))
-    assert main(["report", str(changed)]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "does not fit this hypogoal, or is damaged" in line
 
 
-def test_more_members_than_there_are_is_one_line(changed, capsys):
-    """Spec G2: a billion of them would be a billion choices on the page."""
-    path = changed / "evaluation" / "metrics.json"
-    metrics = json.loads(path.read_text(encoding="utf-8"))
+def another_ensemble(metrics):
+    metrics["explorer"]["ensemble"] += "-other"
+    metrics["agents"] = metrics["rooms"] = metrics["hypotheses"] = []
+
+
+def many_members(metrics):
+    """A billion of them would be a billion choices on the page."""
     for one in metrics["ensembles"]:
         one["members"] = 10**7
-    reseal(path, json.dumps(metrics))
-    assert main(["report", str(changed)]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "does not fit this hypogoal, or is damaged" in line
+
+
+def name_that_is_none(name, metrics):
+    metrics["selection"][0]["runs"][0]["sub_goals"][0]["sub_goal"] = name
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        *((change, "does not fit this hypogoal, or is damaged") for change in (other_paths, another_ensemble)),
+        (many_members, "does not fit this hypogoal, or is damaged"),
+        *((partial(name_that_is_none, name), "has an invalid name") for name in (r"\q", "a/b", "<b>", "=1+1", 3)),
+    ],
+)
+def test_an_evaluation_that_cannot_be_is_refused(changed, change, words):
+    """Spec G2: one line, whichever of its parts says so first."""
+    metrics = metrics_of(changed)
+    change(metrics)
+    write_metrics(changed, metrics)
+    refuses(words, "report", changed)
+
+
+def test_every_command_that_reads_an_evaluation_refuses_it(changed, run, tmp_path):
+    """Spec G2: the rule for names of sub-goals holds wherever they are read."""
+    metrics = metrics_of(changed)
+    name_that_is_none("<b>", metrics)
+    write_metrics(changed, metrics)
+    refuses("has an invalid name", "report", changed, "--figures", tmp_path / "out")
+    refuses("has an invalid name", "compare", changed, run, "--out", tmp_path / "out")
 
 
 OWN = {
@@ -388,12 +376,11 @@ OWN = {
 
 
 @pytest.mark.parametrize(("name", "given", "words"), [(name, *pair) for name, pairs in OWN.items() for pair in pairs])
-def test_own_rooms(changed, name, given, words, monkeypatch, capsys):
+def test_own_rooms(changed, name, given, words, monkeypatch):
     """Spec G2: a domain's own pictures of its rooms: whose code, what and where."""
     monkeypatch.setattr(LadderDomain, name, given)
-    assert main(["evaluate", str(changed), "--force", "-q"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert words in line and "test_strange_texts.py, line" in line
+    line = refuses(words, "evaluate", changed, "--force", "-q")
+    assert "test_strange_texts.py, line" in line
 
 
 SCRIPT, IMAGE = "<script>document.title = 'ran'</script>", "<img src=x onerror=\"document.title = 'ran'\">"

@@ -9,41 +9,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
-from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.episodes import agent_of, play_episode
-from hypogoal.stages.collect import collect
+from hypogoal.meta.episodes import Frame, agent_of, play_episode
 from hypogoal.stages.report import agents_of, play_films
-from hypogoal.stages.train_ensemble import train_ensemble
-from hypogoal.stages.train_meta import train_meta
 
-QUIET = {"quiet": True}
-CAP, TIMEOUT, MEMBERS = 30, 7, 2
+CAP, TIMEOUT, MEMBERS = 64, 10, 2
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """An agent, barely trained, and the random chooser beside it."""
-    run = tmp_path_factory.mktemp("runs") / "watched"
-    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
-    few = TrainEnsembleConfig(steps=10, members=MEMBERS, workers=1)
-    train_ensemble(run / "data.h5", few, run / "ensemble", **QUIET)
-    short = TrainMetaConfig(
-        steps=640, max_episode_steps=CAP, option_timeout=TIMEOUT, random_episodes=1, layout_seed=100, warm_up=100
-    )
-    train_meta(run / "ensemble", short, run / "meta", **QUIET)
-    train_meta(run / "ensemble", replace(short, chooser="random"), run / "meta-random", **QUIET)
-    return run
-
-
-@pytest.fixture(scope="module")
-def frames(run):
-    played = [play_episode(agent_of(open_artefact(run / "meta"), seed=3), MEMBERS) for _ in range(2)]
+def frames(tiny_run):
+    played = [play_episode(agent_of(open_artefact(tiny_run / "meta"), seed=3), MEMBERS) for _ in range(2)]
     for first, second in zip(*played, strict=True):
         assert (first.option, first.step, first.ended) == (second.option, second.step, second.ended)
     return played[0]
@@ -68,9 +47,9 @@ def test_an_episode_is_whole(frames):
             assert frame.predictions[frame.option % MEMBERS]
 
 
-def test_predictions_are_those_of_the_sub_goals_members(run, frames):
+def test_predictions_are_those_of_the_sub_goals_members(tiny_run, frames):
     """Spec D1, D6: recomputed here from the pictures and the weights."""
-    source = open_artefact(run / "ensemble")
+    source = open_artefact(tiny_run / "ensemble")
     for goal in {frame.option // MEMBERS for frame in frames}:
         alike = [frame for frame in frames if frame.option // MEMBERS == goal]
         ensemble = read_ensemble(source.path, source.config, source.config["sub_goals"][goal])
@@ -78,11 +57,11 @@ def test_predictions_are_those_of_the_sub_goals_members(run, frames):
         assert says.tolist() == [list(frame.predictions) for frame in alike]
 
 
-def test_videos_are_of_the_agents_that_choose(run):
+def test_videos_are_of_the_agents_that_choose(tiny_run):
     """Spec E1, F7: of the one that learned to choose, not of the random chooser; a frame for each of the episode's."""
-    agents = agents_of(run)
+    agents = agents_of(tiny_run)
     assert [artefact.path.name for artefact in agents] == ["meta"]
-    films = play_films(agents, run, 2)
+    films = play_films(agents, tiny_run, 2)
     assert [film.name for film in films] == ["meta-episode-0.gif", "meta-episode-1.gif"]
     with Image.open(io.BytesIO(films[0].gif)) as video:
         assert video.format == "GIF"
@@ -90,11 +69,57 @@ def test_videos_are_of_the_agents_that_choose(run):
         assert video.size[0] == 320
 
 
-def test_weights_of_another_policy_are_one_line(run, tmp_path):
+def test_weights_of_another_policy_are_one_line(tiny_run, tmp_path):
     """Spec G2: weights of a meta-policy that do not fit."""
-    artefact = open_artefact(run / "meta")
+    artefact = open_artefact(tiny_run / "meta")
     meta = load_tensors(artefact.path / "meta.safetensors")
     copied = shutil.copytree(artefact.path, tmp_path / "meta")
     save_tensors(copied / "meta.safetensors", dict(list(meta.items())[1:]))
     with pytest.raises(UserError, match="do not fit"):
         agent_of(replace(artefact, path=copied), seed=0)
+
+
+def test_a_run_without_such_an_agent_is_one_line(tmp_path):
+    """Spec G2: what is missing is named."""
+    with create_artefact(
+        tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0
+    ):
+        pass
+    with pytest.raises(UserError, match="Videos need a meta artefact with learned terminations"):
+        agents_of(tmp_path)
+
+
+def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch):
+    """Spec E1, F7: the first of a few that the right one of two members solves; where there is none, the first."""
+    from hypogoal.meta import episodes
+
+    frame = Frame(np.zeros((8, 8, 3), np.uint8), 0, 0, (True, True), 5, "solved")
+    differ = replace(frame, predictions=(True, False))
+    wrong = [replace(frame, ended="the episode, unsolved"), replace(frame, predictions=(False, True))]
+    plays = [[frame], *([differ, last] for last in wrong), [differ, frame], [frame]]
+    monkeypatch.setattr(episodes, "play_episode", lambda loop, members: plays.pop(0))
+    (film,) = play_films(agents_of(tiny_run), tiny_run, None)
+    assert film.name == "meta-episode-3.gif" and len(plays) == 1
+    monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
+    assert play_films(agents_of(tiny_run), tiny_run, None)[0].name == "meta-episode-0.gif"
+
+
+def test_what_is_drawn_of_a_frame():
+    """Spec F7: option, member, predictions and steps left in words; the bar is as long as the steps that are left."""
+    stack = np.zeros((84, 84, 4), np.uint8)
+    stack[..., 3] = 200
+    frame = Frame(stack, 12, 3, (True, False), 5, "")
+    assert frame_lines(frame, ["red", "door"], 2, 10) == ["option: door, member 1", "5 of 10 steps left", "step 12"]
+    ended = replace(frame, ended="its time is up")
+    assert frame_lines(ended, ["red", "door"], 2, 10)[2] == "step 12, ends: its time is up"
+    picture = draw_frame(frame, ["red", "door"], 2, timeout=10)
+    assert picture.shape[1] == 336 and (picture[:336] == 200).all()
+    bar = picture[336 + MARGIN + LINE + BAR, MARGIN : 336 // 2]
+    assert (bar[:80] == bar[0]).all() and (bar[82:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
+    boxes = picture[336 + MARGIN + 2 * LINE + BAR // 2 + BOX // 2]
+    framed = [(boxes[MARGIN + member * 164] == bar[0]).all() for member in (0, 1)]
+    assert framed == [False, True], "the box of the member that runs has the colour of the bar"
+    differ = draw_frame(replace(frame, predictions=(False, False)), ["red", "door"], 2, timeout=10) != picture
+    assert differ[:, :168].any() and not differ[:, 168:].any(), "the other member's box alone"
+    video = Image.open(io.BytesIO(episode_gif([frame, replace(frame, left=0, ended="x")], ["red", "door"], 2, 10)))
+    assert video.n_frames == 2

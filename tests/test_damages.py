@@ -1,0 +1,298 @@
+"""One table of damages: what is wrong with a file is one line, for ``verify`` and for the stage that reads it."""
+
+from __future__ import annotations
+
+import json
+import resource
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from command_line import refuses, run
+from safetensors.torch import save_file
+from toy_data import SHAPE, fill, reseal, write
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import create_artefact, sha256_of
+from hypogoal.core.errors import UserError
+from hypogoal.core.hdf5 import set_attribute
+from hypogoal.core.manifests import MANIFEST
+from hypogoal.dataset import open_dataset
+from hypogoal.inspection import faults_of
+
+OBSERVATIONS, LABELS, ORIGIN = (f"labelled/one/{name}" for name in ("observations", "labels", "origin"))
+STATES = (7, *SHAPE)
+Damage = Callable[[h5py.File], Any]
+
+
+def faults_told(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What ``verify`` prints of something that is not whole."""
+    capsys.readouterr()
+    assert main(["verify", str(path)]) == 2
+    said = capsys.readouterr()
+    assert said.err == ""
+    return said.out
+
+
+def attribute(name: str, value: Any) -> Damage:
+    def damage(file: h5py.File) -> None:
+        file.attrs.pop(name, None)
+        if value is not None:
+            set_attribute(file, name, value)
+
+    return damage
+
+
+def dataset(make: Damage, place: str = OBSERVATIONS) -> Damage:
+    """Something else in place of one of the file's datasets or groups."""
+
+    def damage(file: h5py.File) -> None:
+        del file[place]
+        make(file)
+
+    return damage
+
+
+def observations(**about: Any) -> Damage:
+    """Other observations; of the shape that they had unless another is given."""
+    return dataset(lambda file: file.create_dataset(OBSERVATIONS, **{"shape": STATES, "dtype": "u1", **about}))
+
+
+def virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout(shape=STATES, dtype="u1")
+    layout[...] = h5py.VirtualSource("secret.h5", "x", shape=STATES)
+    file.create_virtual_dataset(OBSERVATIONS, layout)
+
+
+def small_lie(file: h5py.File) -> None:
+    """200,000 chunks, one of them written; its size in the file's index says that all are."""
+    made = file.create_dataset(OBSERVATIONS, shape=(200_000, 1, 1, 1), dtype="u1", chunks=(1, 1, 1, 1), shuffle=True)
+    made.id.write_direct_chunk((0, 0, 0, 0), bytes(200_000))
+
+
+def many_chunks(file: h5py.File) -> None:
+    about = {"shape": (7000, *SHAPE), "dtype": "u1", "chunks": (1, 1, 1, 1), "compression": "gzip"}
+    file.create_dataset(OBSERVATIONS, **about)[:50] = 1
+
+
+def single_label(file: h5py.File) -> None:
+    file[LABELS] = True
+
+
+def no_group(file: h5py.File) -> None:
+    file.create_dataset(ORIGIN, shape=(2**40,), dtype="u1")
+
+
+def linked(link: Any) -> Damage:
+    return dataset(lambda file: file.__setitem__(OBSERVATIONS, link))
+
+
+# What is wrong with a data file -> how it came to that, and the words for it: what ``show`` sees, and what it does not.
+SHOWN: dict[str, tuple[Damage, str]] = {
+    "newer": (attribute("format", 99), "newer"),
+    "no format": (attribute("format", "x"), "not a hypogoal data file"),
+    "older": (attribute("format", 1), "earlier"),
+    "not complete": (attribute("complete", False), "not complete"),
+    "no domain": (attribute("domain", None), "not a hypogoal data file"),
+    "sub-goals that are no JSON": (attribute("sub_goals", "{"), "not a hypogoal data file"),
+    "a shape that is none": (attribute("observation_shape", '"x"'), "not a hypogoal data file"),
+    "no config": (attribute("config", None), "not a hypogoal data file"),
+    # These lie in a heap that the HDF5 library, where it is damaged, may read for ever.
+    "texts of variable length": (
+        lambda file: file.attrs.__setitem__("domain", "toy"),
+        "neither a text of fixed length",
+    ),
+}
+PARTS: dict[str, tuple[Damage, str]] = {
+    "external link": (linked(h5py.ExternalLink("secret.h5", "/x")), "is a link"),
+    "soft link": (linked(h5py.SoftLink("/heldout/one/observations")), "is a link"),
+    "external storage": (observations(external=[("secret.h5", 0, h5py.h5f.UNLIMITED)]), "lie in another file"),
+    "virtual": (dataset(virtual), "lie in another file"),
+    "references": (observations(dtype=h5py.ref_dtype), "type"),
+    "floats": (observations(dtype="f8"), "is float64"),
+    "texts": (observations(dtype=h5py.string_dtype()), "type"),
+    "a filter": (observations(chunks=True, scaleoffset=0), "filter"),
+    "terabytes": (observations(shape=(2**40, *SHAPE)), "declares"),
+    "packed terabytes": (observations(shape=(2**40, *SHAPE), chunks=(64, *SHAPE), compression="gzip"), "declares"),
+    "a chunk for each byte": (dataset(many_chunks), "in 420000 chunks"),
+    "chunks that say that they are stored": (dataset(small_lie), "in 200000 chunks"),
+    "another shape": (observations(shape=(7, 9)), "not uint8"),
+    "a dataset in place of a group": (dataset(no_group, ORIGIN), "a group should be"),
+    "no labels": (lambda file: file.__delitem__(LABELS), f"no readable '{LABELS}'"),
+}
+
+
+@pytest.mark.parametrize("case", [*SHOWN, *PARTS])
+def test_data_files(tmp_path: Path, case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A8, G2: found by ``verify``, refused by the stage, by ``show`` where it reads it; no memory for a claim."""
+    damage, words = (SHOWN | PARTS)[case]
+    path = write(tmp_path / "data.h5", domain="doorkey")
+    with h5py.File(path, "a") as file:
+        damage(file)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert words in faults_told(path, capsys)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    line = refuses(words, "train-ensemble", path, "--out", tmp_path / "out" / "ensemble", "-q")
+    assert str(path) in line
+    if case in SHOWN:
+        refuses(words, "show", path)
+
+
+def test_data_files_that_were_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: wherever it ends, one line says to collect it again."""
+    path = write(tmp_path / "data.h5")
+    data = path.read_bytes()
+    for length in [*np.random.default_rng(0).integers(0, len(data), size=20), 0]:
+        path.write_bytes(data[:length])
+        assert faults_told(path, capsys).endswith(f"is truncated or not HDF5: {path}. Collect it again.\n")
+
+
+@pytest.mark.parametrize("name", ["labelled/two/labels", "labelled/one/origin/layout_seed", "heldout/one/observations"])
+def test_a_changed_byte_of_a_data_file(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A8, G2: a label or origin, too, though any byte may stand there; what has no checksum is read."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path, "r+") as file:
+        plain = file["unlabelled/origin/layout_seed"][()]
+        del file["unlabelled/origin/layout_seed"]
+        file["unlabelled/origin/layout_seed"] = plain
+        chunk = file[name].id.get_chunk_info(0)
+    run("verify", path)
+    whole = path.read_bytes()
+    place = chunk.byte_offset + chunk.size // 2
+    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    assert name in faults_told(path, capsys)
+
+
+# Keys of a manifest, or all of its text, and the words for what is wrong with it.
+MANIFESTS: list[tuple[dict[str, Any] | str, str]] = [
+    ({"format": 99}, "newer"),
+    ({"files": 3}, "'files'"),
+    ({"files": {"a": 3}}, "'files'"),
+    ({"kind": None}, "'kind'"),
+    ({"inputs": [{"path": 3}]}, "'inputs'"),
+    ({"inputs": [{"path": "\0", "relative": "", "kind": "", "sha256": ""}]}, "'inputs'"),
+    ({"config": {"members": 10**9}}, "'members'"),
+    ({"config": {"sub_goals": ["../x"]}}, "'sub_goals'"),
+    ({"config": {"observation_shape": [10**9, 2, 3]}}, "'observation_shape'"),
+    ({"seed": -1}, "'seed'"),
+    ({"seed": True}, "'seed'"),
+    ("", "not valid JSON"),
+    ("[]", "not a JSON object"),
+    ("{", "not valid JSON"),
+    ('{"a": NaN}', "not valid JSON"),
+    ("[" * 10**6, "not valid JSON"),
+    ('{"a": ' * 40 + "1" + "}" * 40, "not valid JSON"),
+    ('{"a": "\\ud800"}', "not valid JSON"),
+    ("9" * 10_000, "not valid JSON"),
+    ("\xff", "UTF-8"),
+]
+ENSEMBLE = {"sub_goals": ["one"], "members": 1}
+
+
+def ensemble(out: Path) -> Path:
+    """An ensemble with all its files and nothing in them."""
+    with create_artefact(out, kind="ensemble", config=ENSEMBLE, seed=0) as folder:
+        fill(folder, "ensemble", ENSEMBLE)
+    return out
+
+
+@pytest.mark.parametrize(("change", "words"), MANIFESTS)
+def test_manifests(
+    tmp_path: Path, change: dict[str, Any] | str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec A8, G2."""
+    out = ensemble(tmp_path / "ensemble")
+    if isinstance(change, dict):
+        reseal(out, **change)
+    else:
+        (out / MANIFEST).write_text(change, encoding="latin-1")
+    assert words in faults_told(out, capsys)
+    refuses(words, "show", out)
+    refuses(words, "train-options", out, "--out", tmp_path / "out" / "options", "-q")
+
+
+def header(length: int) -> bytes:
+    """Weights whose header says that it is so long."""
+    return struct.pack("<Q", length)
+
+
+def typed(kind: str, bits: int) -> bytes:
+    """Weights of one type."""
+    text = json.dumps({"x": {"dtype": kind, "shape": [8], "data_offsets": [0, bits]}}).encode()
+    return header(len(text)) + text + bytes(bits)
+
+
+# Bits of the eight numbers of each type that nobody writes.
+TYPES = {"F4": 4, "F8_E4M3": 8, "F8_E5M2": 8, "F8_E4M3FNUZ": 8, "F8_E5M2FNUZ": 8, "F8_E8M0": 8, "F6_E2M3": 6,
+         "BF16": 16, "F16": 16, "C64": 64, "I8": 8, "I16": 16, "U16": 16, "U32": 32, "U64": 64, "XX": 8}  # fmt: skip
+WEIGHTS = [typed(kind, bits) for kind, bits in TYPES.items()]
+WEIGHTS += [header(length) for length in (0, 10, 2**31, 2**63, 2**64 - 1)]
+
+
+@pytest.mark.parametrize("start", WEIGHTS)
+def test_weights(tmp_path: Path, start: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: lengths are claims, types are those that we write; ``verify`` goes on to what else is wrong."""
+    save_file({"a": torch.zeros(4)}, tmp_path / "a.safetensors")
+    rest = (tmp_path / "a.safetensors").read_bytes()[8:] if len(start) == 8 else b""
+    out = tmp_path / "ensemble"
+    with create_artefact(out, kind="ensemble", config=ENSEMBLE, seed=0) as folder:
+        fill(folder, "ensemble", ENSEMBLE)
+        (folder / "one.safetensors").write_bytes(start + rest)
+        (folder / "metrics.jsonl").write_text("[" * 100_000)
+    told = faults_told(out, capsys).splitlines()
+    assert len(told) == 2 and all(line.isprintable() for line in told)
+    assert sum("one.safetensors" in line and ("of type torch." in line or "are damaged" in line) for line in told) == 1
+    refuses("one.safetensors", "train-options", out, "--out", tmp_path / "out" / "options", "-q")
+
+
+def cut(data: bytes) -> bytes:
+    return data[:-40]
+
+
+def garbled(data: bytes) -> bytes:
+    return b"step,wrong\n1\n"
+
+
+# File of a run -> what is done to it, and the command that reads it; every one is in a manifest.
+FILES: list[tuple[str, Callable[[bytes], bytes], str]] = [
+    ("ensemble/left-end.safetensors", cut, "train-options {run}/ensemble --out {out}"),
+    ("options/options.safetensors", cut, "train-meta {run}/ensemble --options {run}/options --out {out}"),
+    ("meta/meta.safetensors", cut, "report {run} --force --videos 1"),
+    ("meta/episodes.csv", garbled, "evaluate {run} --out {out}"),
+    ("meta/choices.csv", garbled, "evaluate {run} --out {out}"),
+    ("meta/exploits.csv", garbled, "evaluate {run} --out {out}"),
+    ("meta/layout.json", garbled, "evaluate {run} --out {out}"),
+    ("meta/terminations.h5", cut, "evaluate {run} --out {out}"),
+    ("options-more/visited.h5", cut, "train-ensemble {run}/data.h5 --unlabelled {run}/options-more --out {out}"),
+    ("evaluation/metrics.json", garbled, "report {run} --force"),
+    ("evaluation/arrays.h5", cut, "report {run} --force"),
+]
+
+
+@pytest.mark.parametrize(("name", "damage", "command"), FILES)
+def test_files_of_a_run(
+    corridor_copy: Path, name: str, damage: Callable[[bytes], bytes], command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec A8, G2: both where the manifest tells that it is changed and where it does not; nothing is left behind."""
+    path = corridor_copy / name
+    path.write_bytes(damage(path.read_bytes()))
+    artefact = path.parent
+    assert f"{path.name}: changed since it was written" in faults_told(artefact, capsys)
+    words = command.format(run=corridor_copy, out=corridor_copy.parent / "out" / "made").split()
+    refuses(path.name, *words, "-q")
+    files = json.loads((artefact / MANIFEST).read_bytes())["files"]
+    reseal(artefact, files=files | {path.name: sha256_of(path)})
+    assert path.name in faults_told(artefact, capsys)
+    refuses(path.name, *words, "-q")
+
+
+def test_labels_of_what_is_not_there(tmp_path: Path) -> None:
+    """Spec A1: another sub-goal's."""
+    with pytest.raises(UserError, match="unknown sub-goal"):
+        open_dataset(write(tmp_path / "data.h5")).labelled("three")
+    assert faults_of(tmp_path / "data.h5") == []
