@@ -40,6 +40,13 @@ def run(*words: object) -> Printed:
     return printed
 
 
+def fails(*words: object) -> Printed:
+    """What a command prints that must end with exit code 2, since something of the user's is wrong."""
+    code, printed = _called(words)
+    assert code == 2, (words, code, printed)
+    return printed
+
+
 def refuses(wanted: str, *words: object) -> str:
     """The one line in which a command refuses: exit code 2, ``wanted`` in it, and nothing else printed or written."""
     out = _output_of(words)

@@ -31,11 +31,7 @@ LONGEST = (
     "test_docs",
     "test_loop",
     "test_strange_texts",
-    "test_verification",
-    "test_exploits",
     "test_rooms_domain",
-    "test_explorer",
-    "test_videos",
     "test_terminal",
 )
 

@@ -16,7 +16,7 @@ GOALS = "--set sub_goals=collect-red-key,open-red-door"
 DOORKEY = "--set max_episode_steps=64 --set random_episodes=20 --set layout_seed=100"
 PLAY = f"--set steps=2048 {DOORKEY}"
 SHORT = "--set environments=4 --set warm_up=50 --set steps=400"
-VISITED = "--set save_visited=20"
+VISITED = "--set save_visited=5"
 
 # Output -> the command that makes it; what stages need comes before them. The ensemble with which agents are learned
 # is neither the only one nor the first.

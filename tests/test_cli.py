@@ -8,12 +8,11 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from command_line import refuses, run
+from command_line import fails, refuses, run
 from shared_runs import DOORKEY_RUN, command
 from toy_data import reseal
 
 import hypogoal
-from hypogoal.cli import main
 from hypogoal.core.config import describe
 from hypogoal.dataset import open_dataset
 from hypogoal.settings import CONFIGS
@@ -55,12 +54,12 @@ def test_pictures_do_not_spoil_json(tiny_run: Path, tmp_path: Path) -> None:
     assert json.loads(said.out)["kind"] == "data" and str(tmp_path) in said.err
 
 
-def test_verify_finds_damage(tiny_copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_finds_damage(tiny_copy: Path) -> None:
     """Spec G2."""
     weights = tiny_copy / "ensemble" / "open-red-door.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
-    assert main(["verify", str(tiny_copy / "ensemble"), "--json"]) == 2
-    assert "open-red-door.safetensors: changed" in json.loads(capsys.readouterr().out)["faults"][0]
+    told = json.loads(fails("verify", tiny_copy / "ensemble", "--json").out)
+    assert "open-red-door.safetensors: changed" in told["faults"][0]
 
 
 def test_python_interface(tiny_run: Path) -> None:

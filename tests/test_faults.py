@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command_line import refuses, run
 from corridor import Corridor
 
 import hypogoal
@@ -166,16 +167,16 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(tmp_path: Path) -> Non
 
 def test_a_command_without_room_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G2: one line, and neither a draft nor a hidden file; ``tests.attacks.attacks`` tries each write of each."""
-    run, there = tmp_path / "run", tmp_path / "there"
-    run.mkdir()
+    folder, there = tmp_path / "run", tmp_path / "there"
+    folder.mkdir()
     there.mkdir()
-    make_seeds(run)
+    make_seeds(folder)
     for agent in ("options", "meta"):  # made up: they cannot be played
-        shutil.rmtree(run / agent)
-    data, arrays = str(run / "data.h5"), str(run / "arrays.npz")
-    for command in (["export", data, "--out", arrays], ["evaluate", str(run)], ["report", str(run)]):
-        assert main([*command, *["-q"][: command[0] != "export"]]) == 0
-    shutil.copytree(run, tmp_path / "other")
+        shutil.rmtree(folder / agent)
+    data, arrays = str(folder / "data.h5"), str(folder / "arrays.npz")
+    for command in (["export", data, "--out", arrays], ["evaluate", str(folder)], ["report", str(folder)]):
+        run(*command, *["-q"][: command[0] != "export"])
+    shutil.copytree(folder, tmp_path / "other")
     commands = {
         "collect": ["collect", "own_domain:DOMAIN", "--out", str(there / "data.h5")],
         "import": ["import", arrays, "--out", str(there / "data.h5")],
@@ -190,10 +191,10 @@ def test_a_command_without_room_leaves_nothing(tmp_path: Path, capsys: pytest.Ca
             "--out",
             str(there / "ensemble"),
         ],
-        "evaluate": ["evaluate", str(run), "--force"],
-        "report": ["report", str(run), "--force"],
-        "figures": ["report", str(run), "--figures", str(there / "figures")],
-        "compare": ["compare", str(run), str(tmp_path / "other"), "--out", str(there / "compared")],
+        "evaluate": ["evaluate", str(folder), "--force"],
+        "report": ["report", str(folder), "--force"],
+        "figures": ["report", str(folder), "--figures", str(there / "figures")],
+        "compare": ["compare", str(folder), str(tmp_path / "other"), "--out", str(there / "compared")],
         "pictures": ["show", data, "--pictures", str(there / "pictures")],
     }
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
@@ -229,7 +230,7 @@ def test_a_file_has_its_name_when_it_is_on_the_disk(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_folders_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_that_may_not_be_written(tmp_path: Path) -> None:
     """Spec G2: --out is refused; data in a read-only folder are read."""
     from toy_data import write
 
@@ -237,16 +238,13 @@ def test_folders_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureF
     path.chmod(0o444)
     tmp_path.chmod(0o555)
     try:
-        assert main(["verify", str(path)]) == 0
-        assert main(["collect", "doorkey", "--out", str(tmp_path / "new.h5")]) == 2
-        assert "no permission to write" in capsys.readouterr().err
+        run("verify", path)
+        refuses("no permission to write", "collect", "doorkey", "--out", tmp_path / "new.h5")
     finally:
         tmp_path.chmod(0o755)
 
 
-def test_what_may_not_be_read_is_no_matter_of_the_output(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_may_not_be_read_is_no_matter_of_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2: the advice is for the file that the system refused."""
     path = tmp_path / "sealed"
     path.write_text("x")
@@ -256,14 +254,12 @@ def test_what_may_not_be_read_is_no_matter_of_the_output(
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     monkeypatch.setattr("hypogoal.inspection.faults_of", sealed)
-    assert main(["verify", str(path)]) == 2
-    line = capsys.readouterr().err
-    assert f"Permission denied: {path}. Ask for permission to read it." in line and "--out" not in line
+    line = refuses(f"Permission denied: {path}. Ask for permission to read it.", "verify", path)
+    assert "--out" not in line
     path.unlink()
     monkeypatch.undo()
     monkeypatch.setattr("hypogoal.inspection.faults_of", sealed)
-    assert main(["verify", str(path)]) == 2
-    assert "--out" in capsys.readouterr().err
+    refuses("--out", "verify", path)
 
 
 def test_nothing_depends_on_the_clock() -> None:
@@ -294,7 +290,7 @@ def test_nothing_depends_on_the_clock() -> None:
     ],
 )
 def test_limits_of_the_system_are_the_users_to_mend(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, words: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
 ) -> None:
     """Spec G2: one line that says which; ``tests/attacks/limits.py`` sets them in earnest."""
 
@@ -302,6 +298,5 @@ def test_limits_of_the_system_are_the_users_to_mend(
         raise error
 
     monkeypatch.setattr("hypogoal.inspection.faults_of", refused)
-    assert main(["verify", str(tmp_path)]) == 2
-    line = capsys.readouterr().err
-    assert words in line and line.count("\n") == 1 and "internal" not in line
+    line = refuses(words, "verify", tmp_path)
+    assert "internal" not in line

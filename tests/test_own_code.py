@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from command_line import run
 from corridor_env import SUB_GOALS, CorridorEnv
 from own_domain import CorridorDomain, TallCorridor
 from torch import Tensor, nn
@@ -193,7 +194,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """States of the corridor."""
     path = tmp_path_factory.mktemp("data") / "data.h5"
     few = ["--set", "steps=80", "--set", "heldout_seeds=4,5", "-q"]
-    assert main(["collect", "corridor_env:DOMAIN", *few, "--out", str(path)]) == 0
+    run("collect", "corridor_env:DOMAIN", *few, "--out", path)
     return path
 
 
@@ -273,7 +274,7 @@ def test_numbers_of_any_library_are_numbers(tmp_path: Path, monkeypatch: pytest.
             sys.modules[__name__], "LIAR", GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=policy), raising=False
         )
         out = tmp_path / f"{number}.h5"
-        assert main(["collect", NAME, "--set", "steps=200", "--set", "heldout_seeds=4,5", "-q", "--out", str(out)]) == 0
+        run("collect", NAME, "--set", "steps=200", "--set", "heldout_seeds=4,5", "-q", "--out", out)
         written.append(open_dataset(out).unlabelled())
     for other in written[1:]:
         np.testing.assert_array_equal(written[0], other)

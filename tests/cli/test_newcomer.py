@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_line import refuses, run
 from typer.main import get_command
 
 from hypogoal.cli import app, main
@@ -65,7 +66,7 @@ def test_settings_are_options(stage: str) -> None:
     assert not {"--out", "--set", "--seed", "--resume"} & {*options_of(stage)}
 
 
-def test_an_option_is_a_setting(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_option_is_a_setting(tmp_path: Path) -> None:
     """--steps 640 and --set steps=640 are one; --set goes before; what it may not be is one line, code 2."""
     train = ["train-baseline", "doorkey", "--set", "max_episode_steps=20", "--set", "random_episodes=1", "-q"]
     found = {}
@@ -74,14 +75,12 @@ def test_an_option_is_a_setting(tmp_path: Path, capsys: pytest.CaptureFixture[st
         ("set", ["--set", "steps=640", "--set", "setting=paper"]),
         ("both", ["--steps", "64", "--set", "steps=640", "--setting", "paper"]),
     ):
-        assert main([*train, *given, "--out", str(tmp_path / name)]) == 0
+        run(*train, *given, "--out", tmp_path / name)
         config = json.loads((tmp_path / name / "manifest.json").read_text())["config"]
         found[name] = (config["steps"], config["setting"])
     assert {*found.values()} == {(640, "paper")}
-    capsys.readouterr()
     for wrong, words in (("0", "out of range"), ("many", "wrong type of value")):
-        assert main([*train, "--steps", wrong, "--out", str(tmp_path / "none")]) == 2
-        assert words in capsys.readouterr().err
+        refuses(words, *train, "--steps", wrong, "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
@@ -101,25 +100,21 @@ def test_unknown_options_lead_on(command: str, words: list[str], capsys: pytest.
     assert all(word in line for word in words), line
 
 
-def test_run_without_out_and_with_a_seed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_without_out_and_with_a_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec A6: a dry run needs no --out and writes nothing; the seed is that of every cell; --set goes before."""
     monkeypatch.chdir(tmp_path)
     for given, seed in ((["--seed", "7"], "7"), (["--seed", "7", "--set", "seeds=8"], "8")):
-        assert main(["run", "doorkey", "--preset", "demo", "--dry-run", *given]) == 0
-        lines = capsys.readouterr().out.splitlines()
+        lines = run("run", "doorkey", "--preset", "demo", "--dry-run", *given).out.splitlines()
         assert lines[0].endswith("--out runs/doorkey/data.h5")
         assert {match[1] for line in lines if (match := re.search(r"--seed (\d+)", line))} == {seed}
     assert not [*tmp_path.iterdir()]
 
 
-def test_config_lists_stages_and_the_most_changed_first(capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_lists_stages_and_the_most_changed_first() -> None:
     """In groups, wrapped at words; --json has the same rows as ever."""
-    assert main(["config"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*STAGES, "run"]
-    assert main(["config", "train-meta"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    printed = run("config")
+    assert [line.split()[0] for line in printed.out.splitlines()] == [*STAGES, "run"]
+    lines = run("config", "train-meta").out.splitlines()
     named = [line.split()[0] for line in lines if re.match(r"  \w", line)]
     assert {*named[: len(OFTEN["train-meta"])]} == {*OFTEN["train-meta"]}
     assert len(named) == len({*named}) > 40
@@ -128,24 +123,20 @@ def test_config_lists_stages_and_the_most_changed_first(capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize("stage", [*STAGES, "run"])
-def test_config_fits_a_terminal(
-    stage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_config_fits_a_terminal(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """80 columns; no mark-up; no range, setting or command is broken at a hyphen."""
     monkeypatch.setenv("COLUMNS", "80")
     for domain in ("doorkey", "montezuma", "rooms"):
-        assert main(["config", stage, "--domain", domain]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80 and not any("`" in line for line in lines)
-    assert not any(re.search(r"\w-$", line) for line in lines)
+        lines = run("config", stage, "--domain", domain).out.splitlines()
+        assert max(map(len, lines)) <= 80 and not any("`" in line for line in lines)
+        assert not any(re.search(r"\w-$", line) for line in lines)
 
 
-def test_config_says_where_a_value_is_from(capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_says_where_a_value_is_from() -> None:
     """A domain's own defaults are not from DoorKey's table, a preset's are the preset's."""
 
     def rows(*arguments: str) -> dict[str, dict[str, object]]:
-        assert main(["config", *arguments, "--json"]) == 0
-        return {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+        return {row["name"]: row for row in json.loads(run("config", *arguments, "--json").out)}
 
     ladders, doorkey = rows("train-ensemble", "--domain", "montezuma"), rows("train-ensemble")
     assert (doorkey["learning_rate"]["default"], doorkey["learning_rate"]["source"]) == (2e-4, "Table 3")
@@ -166,12 +157,8 @@ def test_config_loads_no_domain_where_it_needs_none() -> None:
     assert done.stdout.splitlines()[-1] == "HEAVY []"
 
 
-@pytest.mark.parametrize("first", ["import gymnasium, hypogoal", "import hypogoal, gymnasium"])
-def test_gymnasium_knows_the_environments_whichever_comes_first(first: str) -> None:
-    """And neither is imported for the other's sake alone."""
-    script = f"{first}\nprint(sorted(name for name in gymnasium.registry if name.startswith('hypogoal/')))"
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "['hypogoal/DoorKey-8x8-v0', 'hypogoal/MontezumaLadder-v0']"
+def test_the_package_alone_imports_no_gymnasium() -> None:
+    """Which takes a second."""
     light = "import sys, hypogoal; print('gymnasium' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", light], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
@@ -193,39 +180,26 @@ def test_results_are_those_of_the_logs(tmp_path: Path) -> None:
     assert result_of(tmp_path) == pytest.approx({"labelled loss": (0.4 + 0.2) / 2})
 
 
-def test_show_and_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each stage says what it came to, which command follows, and where it is; show says the result first."""
-    data, run = tmp_path / "own.h5", tmp_path / "run"
-    assert main(["collect", "doorkey", "--out", str(data), "--set", "heldout_layouts=1"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-2:] == [f"next: hypogoal train-ensemble {data} --out runs/own/ensemble", str(data)]
-    train = ["train-ensemble", str(data), "--out", str(run / "ensemble"), "--steps", "2", "--set", "workers=1"]
-    assert main([*train, "--set", "sub_goals=collect-blue-key"]) == 0
-    result, then, path = capsys.readouterr().out.splitlines()
+def test_a_stage_says_what_it_came_to_and_what_is_next(tiny_run: Path, tmp_path: Path) -> None:
+    """Then where its output is; of that alone with --quiet."""
+    folder = tmp_path / "run"
+    train = ["train-ensemble", tiny_run / "data.h5", "--out", folder / "ensemble", "--steps", "2"]
+    train += ["--set", "workers=1", "--set", "sub_goals=collect-blue-key"]
+    result, then, path = run(*train).out.splitlines()
     assert re.fullmatch(r"held-out balanced accuracy: best member [\d.]+, mean [\d.]+, worst [\d.]+", result)
-    assert then == f"next: hypogoal train-options {run}/ensemble --out {run}/options"
-    assert path == str(run / "ensemble")
-    quick = "--steps 60 --option-timeout 5 --set warm_up=100 --set max_episode_steps=20 --set random_episodes=1"
-    options = ["train-options", path, "--out", str(run / "options"), "--layout-seed", "101", *quick.split()]
-    assert main(options) == 0
-    then = capsys.readouterr().out.splitlines()[-2]
-    assert then == f"next: hypogoal train-meta {path} --options {run}/options --out {run}/meta"
-    following = [*then.removeprefix("next: hypogoal ").split(), "--steps", "60", "--set", "max_episode_steps=20"]
-    assert main([*following, "--set", "option_timeout=6"]) == 2
-    assert "trained with option_timeout=5, not 6" in capsys.readouterr().err
-    assert main([*following, "--set", "random_episodes=1"]) == 0
-    config = json.loads((run / "meta" / "manifest.json").read_text())["config"]
-    assert (config["option_timeout"], config["layout_seed"]) == (5, 101)  # as of the options
-    assert capsys.readouterr().out.splitlines()[-2] == f"next: hypogoal evaluate {run}"
-    assert main(["show", path]) == 0
-    shown = capsys.readouterr().out.splitlines()
+    assert then == f"next: hypogoal train-options {folder}/ensemble --out {folder}/options"
+    assert path == str(folder / "ensemble")
+    assert run(*train, "-q", "--force").out.splitlines() == [path]
+
+
+def test_show_says_the_result_first(tiny_run: Path) -> None:
+    """Of an artefact, and of each in a run."""
+    path = tiny_run / "ensemble"
+    shown = run("show", path).out.splitlines()
     logged = shown[0].removeprefix(f"{path}: ensemble; ")
     assert re.fullmatch(r"labelled loss [\d.]+", logged)
     assert shown.index("config:") < shown.index("files:")
-    assert main(["show", str(run)]) == 0
-    assert f"{path}: ensemble; {logged}" in capsys.readouterr().out.splitlines()
-    assert main([*options, "-q", "--force"]) == 0
-    assert capsys.readouterr().out.splitlines() == [str(run / "options")]
+    assert f"{path}: ensemble; {logged}" in run("show", tiny_run).out.splitlines()
 
 
 def test_winners_by_hand() -> None:

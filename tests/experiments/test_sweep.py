@@ -12,11 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from command_line import fails, refuses, run
 from forked import forked
 from toy import DATA, SMALL, write_toy
 
-from hypogoal.cli import main
-from hypogoal.core.drafts import draft_folder, unfinished
+from hypogoal.core.drafts import unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Cell
 from hypogoal.experiments.records import (
@@ -33,7 +33,8 @@ from hypogoal.experiments.records import (
 from hypogoal.experiments.runners.local import Running, run_cells
 from hypogoal.experiments.runners.slurm import Options
 from hypogoal.experiments.status import read_status
-from hypogoal.stages.sweep import gather, plan, run, submit
+from hypogoal.stages.sweep import gather, plan, submit
+from hypogoal.stages.sweep import run as run_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0
@@ -45,7 +46,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sweep")
     write_toy(folder / "toy.toml")
     with forked():
-        assert main(["sweep", str(folder / "toy.toml"), "--out", str(folder / "whole"), "-q"]) == 0
+        run("sweep", folder / "toy.toml", "--out", folder / "whole", "-q")
     return folder
 
 
@@ -63,17 +64,15 @@ def killed(arguments: list[str], moment: Callable[[], bool]) -> None:
 
 
 def test_a_killed_sweep_ends_with_the_same_results(swept: Path) -> None:
-    """Spec G1, G4: SIGKILL while states are collected, and while an ensemble is trained; then the same bytes.
+    """Spec G1, G4: SIGKILL while an ensemble is trained; then the same bytes, and nothing complete is made again.
 
     Here cells are started as a user's are; those of ``swept`` are forked, and make the same.
     """
     out = swept / "broken"
     arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
-    killed(arguments, lambda: draft_folder(out / "data.h5").exists())
-    assert not (out / "data.h5").exists()
     killed(arguments, lambda: unfinished(out / "ensemble/seed-0"))
     made = (out / "data.h5").stat().st_mtime_ns
-    assert main(arguments) == 0
+    run(*arguments)
     assert (out / "data.h5").stat().st_mtime_ns == made
     assert (out / "results.csv").read_bytes() == (swept / "whole" / "results.csv").read_bytes()
     for name in ("data.h5", "ensemble/seed-0/metrics.jsonl", "ensemble/seed-1/open-red-door.safetensors"):
@@ -99,7 +98,7 @@ def extended(swept: Path) -> tuple[list[str], dict[str, int]]:
     arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
     with forked():
         for seeds in ("0", "0", "0-1"):
-            assert main([*arguments, "--seeds", seeds]) == 0
+            run(*arguments, "--seeds", seeds)
     return arguments, {cell.name: read_record(out, cell).attempts for cell in read_plan(out).cells}
 
 
@@ -111,7 +110,7 @@ def test_finished_cells_are_never_run_again_and_new_ones_are_added(
     assert (swept / "extended/results.csv").read_bytes() == (swept / "whole/results.csv").read_bytes()
 
 
-def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_sweep_is_refused(swept: Path, tmp_path: Path) -> None:
     """Spec G2: a folder is of one experiment: no cell of before may be missing or be another."""
     out = str(swept / "whole")
     other = tmp_path / "toy.toml"
@@ -126,47 +125,35 @@ def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.Ca
         (["sweep", "figure6", "--out", str(tmp_path / "x"), "--status"], "no sweep here"),
         (["sweep", "--out", out, "--cancel"], "no jobs in Slurm's queue"),
     ):  # fmt: skip
-        capsys.readouterr()
-        assert main(arguments) == 2
-        err = capsys.readouterr().err
-        assert words in err and err.count("\n") == 1, err
+        refuses(words, *arguments)
 
 
-def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
     """Spec G2: as --out of a sweep or run, or where its folder would be: one line, and the file stays."""
     there = tmp_path / "there"
     there.write_text("mine")
     for command in (["sweep"], ["run", "--force"]):
         for out, words in ((there, "this is a file"), (there / "x", "a file is in the way")):
-            capsys.readouterr()
-            assert main([*command, "doorkey", "--preset", "demo", "--out", str(out), "-q"]) == 2
-            err = capsys.readouterr().err
-            assert words in err and err.count("\n") == 1, err
+            refuses(words, *command, "doorkey", "--preset", "demo", "--out", out, "-q")
     assert [path.name for path in tmp_path.iterdir()] == ["there"] and there.read_text() == "mine"
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"format": 1}', "\ud800"])
-def test_a_lost_plan_is_told_with_what_goes_on(
-    swept: Path, tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_lost_plan_is_told_with_what_goes_on(swept: Path, tmp_path: Path, damage: str) -> None:
     """Spec G2: whatever looks at it says which command goes on and that nothing is lost."""
     (tmp_path / "sweep.json").write_bytes(damage.encode(errors="surrogatepass"))
-    for words in (["--status"], ["--gather"], ["--cell", "data"]):
-        command = [sys.executable, "-m", "hypogoal", "sweep", "--out", str(tmp_path), *words]
-        if words[0] == "--cell":  # which listens for signals, in a process of its own
-            told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stderr if not damage else GIVE
-        else:
-            assert main(command[3:]) == 2
-            told = capsys.readouterr().err
+    for words in ("--status", "--gather"):
+        refuses(GIVE, "sweep", "--out", tmp_path, words)
+    if not damage:  # a cell listens for signals, in a process of its own
+        command = [sys.executable, "-m", "hypogoal", "sweep", "--out", str(tmp_path), "--cell", "data"]
+        told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stderr
         assert GIVE in told and told.count("\n") <= 1
     with pytest.raises(LostPlan):
-        run(plan(str(swept / "toy.toml"), tmp_path), tmp_path, force=True, resume=True)
+        run_plan(plan(str(swept / "toy.toml"), tmp_path), tmp_path, force=True, resume=True)
 
 
 @pytest.mark.usefixtures("forked_cells")
-def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(
-    swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(swept: Path, tmp_path: Path) -> None:
     """Spec G4: the same command goes on, nothing is made again; what another command made is refused, and stays."""
     out = tmp_path / "out"
     shutil.copytree(swept / "whole", out)
@@ -176,12 +163,11 @@ def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(
     (out / "sweep.json").write_text("")
     other = tmp_path / "toy.toml"
     other.write_text((swept / "toy.toml").read_text().replace("steps=6", "steps=7"))
-    assert main(["sweep", str(other), "--out", str(out), "-q"]) == 2
-    err = capsys.readouterr().err
+    err = fails("sweep", other, "--out", out, "-q").err
     assert "not what the command of ensemble-seed-0 makes: the complete output was made with steps=6, not 7" in err
     assert (out / "sweep.json").read_text() == ""
-    assert main(["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]) == 0
-    assert "is written anew: what is complete is kept" in capsys.readouterr().err
+    printed = run("sweep", swept / "toy.toml", "--out", out, "-q")
+    assert "is written anew: what is complete is kept" in printed.err
     assert [path.stat().st_mtime_ns for path in kept] == before
     assert (out / "results.csv").read_bytes() == (swept / "whole" / "results.csv").read_bytes()
     plan_of = [json.loads((folder / "sweep.json").read_text())["cells"] for folder in (out, swept / "whole")]
@@ -197,9 +183,7 @@ DOMAIN = CorridorDomain()
 """
 
 
-def test_a_cell_is_done_when_its_output_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cell_is_done_when_its_output_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2: own code that leaves with 0 has made nothing: neither at first, nor in a job, nor made again."""
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT / 'tests'}")
     monkeypatch.setenv("HYPOGOAL_TRUST", "leaver:DOMAIN")
@@ -208,18 +192,17 @@ def test_a_cell_is_done_when_its_output_is_there(
     toml.write_text('format = 1\nevaluate = false\ncells = [{ name = "data", command = "collect leaver:DOMAIN" }]')
     monkeypatch.setenv("LEAVE", "1")
     words = ["sweep", str(toml), "--out", str(out), "-q"]
-    assert main(words) == 2
-    err = capsys.readouterr().err
+    err = fails(*words).err
     assert "1 of 1 cell failed" in err and "own code has left the process" in err and err.count("\n") == 1
     assert [one.state for one in read_status(out).states] == ["failed"]
     job = [sys.executable, "-m", "hypogoal", "sweep", "--out", str(out), "--cell", "data"]
     done = subprocess.run(job, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and "own code has left the process" in done.stderr
     monkeypatch.delenv("LEAVE")
-    assert main(words) == 0
+    run(*words)
     monkeypatch.setenv("LEAVE", "1")
     with pytest.raises(UserError, match="own code has left the process"):
-        run(plan(str(toml), out), out, force=True, quiet=True)
+        run_plan(plan(str(toml), out), out, force=True, quiet=True)
     assert (out / "data.h5").is_file() and read_plan(out).anew == {"data"}
 
 
@@ -237,39 +220,31 @@ command = "train-meta {{worse}} --seed {{seed}}"
 
 
 @pytest.mark.usefixtures("forked_cells")
-def test_a_failed_cell_stops_only_those_that_need_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_cell_stops_only_those_that_need_it(tmp_path: Path) -> None:
     """Spec G4: told with its log; exit code 2 and one line at the end; the status says who waits for whom."""
     toy, out = write_toy(tmp_path / "toy.toml", "0", FAILS), tmp_path / "out"
-    capsys.readouterr()
-    assert main(["sweep", str(toy), "--out", str(out), "-q"]) == 2
-    err = capsys.readouterr().err
+    err = fails("sweep", toy, "--out", out, "-q").err
     assert err.count("\n") == 1 and "1 of 4 cells failed, 1 wait for them; the first is worse-seed-0" in err
     assert str(out / "logs" / "worse-seed-0.log") in err and "magic" in err
     status = read_status(out)
     states = {one.cell.name: one.state for one in status.states}
     assert states == {"data": "done", "ensemble-seed-0": "done", "worse-seed-0": "failed", "agent-seed-0": "held"}
     assert "ensemble,0,open-red-door" in (out / "results.csv").read_text()
-    assert main(["sweep", "--out", str(out), "--status"]) == 0
-    text = capsys.readouterr().out
+    text = run("sweep", "--out", out, "--status").out
     assert "4 cells: 2 done, 0 running, 1 failed, 1 left (1 wait for failed ones)" in text and "magic" in text
-    assert main(["sweep", "--out", str(out), "--status", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["counts"]["held"] == 1
+    assert json.loads(run("sweep", "--out", out, "--status", "--json").out)["counts"]["held"] == 1
 
 
 @pytest.mark.usefixtures("forked_cells")
-def test_what_was_changed_by_hand_is_not_replaced(
-    swept: Path, extended: tuple[list[str], dict[str, int]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_changed_by_hand_is_not_replaced(swept: Path, extended: tuple[list[str], dict[str, int]]) -> None:
     """Spec G2, G4: manifests are verified; a damaged output is told, and stays until the user moves it."""
     out, arguments = swept / "extended", extended[0]
-    capsys.readouterr()
     before = (out / "results.csv").read_bytes()
     log = out / "ensemble/seed-0/metrics.jsonl"
     log.write_text(log.read_text() + "\n")
-    assert main(arguments) == 2
-    assert "metrics.jsonl: changed since it was written" in capsys.readouterr().err
+    refuses("metrics.jsonl: changed since it was written", *arguments)
     (out / "ensemble/seed-0").rename(out / "moved")
-    assert main(arguments) == 0
+    run(*arguments)
     assert (out / "results.csv").read_bytes() == before
 
 
@@ -280,7 +255,7 @@ def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypa
     shutil.copytree(swept / "whole" / "ensemble" / "seed-0", out / "ensemble" / "seed-0")
     shutil.copy(swept / "whole" / "data.h5", out)
     arguments = ["sweep", toy, "--out", str(out), "--set", "evaluate=true", "-q", "--seeds"]
-    assert main([*arguments, "0"]) == 0
+    run(*arguments, "0")
     assert read_status(out).count("done") == 4 and (out / "run.json").is_file()
 
     def states() -> list[str]:
@@ -301,7 +276,7 @@ def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr("hypogoal.experiments.runners.slurm.submit", lambda *given: [])
     submit(both, out, Options(), quiet=True)
     assert states() == ["done", "done", "done", "stopped", "stopped"]
-    assert main([*arguments, "0-1"]) == 0
+    run(*arguments, "0-1")
     assert states() == ["done"] * 5 and (out / "run.json").is_file()
 
 
@@ -350,7 +325,7 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
     out = tmp_path / "out"
     planned = plan(str(write_toy(tmp_path / "toy.toml", "0")), out)
     data, ensemble = (cell.out for cell in planned.cells)
-    run(planned, out, quiet=True)
+    run_plan(planned, out, quiet=True)
 
     def made() -> tuple[int, int]:
         return data.stat().st_mtime_ns, (ensemble / "manifest.json").stat().st_mtime_ns
@@ -363,7 +338,7 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
     with monkeypatch.context() as patch:
         patch.setattr(Running, "ended", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            run(planned, out, force=True, quiet=True)
+            run_plan(planned, out, force=True, quiet=True)
     second = made()
     assert second[0] > first[0] and second[1] == first[1]
     assert [one.state for one in read_status(out).states] == ["done", "waiting"] and not (out / "run.json").exists()
@@ -373,7 +348,8 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
     shutil.copytree(out, copy)
     (copy / "sweep.json").write_text("")
     capsys.readouterr()
-    run(plan(str(tmp_path / "toy.toml"), copy), copy, resume=True, quiet=True)  # what was to be made is not known now
+    again = plan(str(tmp_path / "toy.toml"), copy)
+    run_plan(again, copy, resume=True, quiet=True)  # what was to be made is not known now
     told = capsys.readouterr().err
     assert "kept, though 'run --force' may have been about to make them again: ensemble-seed-0\n" in told
     monkeypatch.setattr("hypogoal.experiments.runners.slurm.check", lambda run, options: None)
@@ -381,10 +357,10 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
     monkeypatch.setattr("hypogoal.experiments.runners.slurm.submit", lambda plan, run, todo, _: submitted.extend(todo))
     submit(planned, out, Options(), quiet=True)
     assert [cell.out for cell in submitted] == [ensemble]
-    run(planned, out, force=True, resume=True, quiet=True)
+    run_plan(planned, out, force=True, resume=True, quiet=True)
     third = made()
     assert third[0] == second[0] and third[1] > second[1] and not read_plan(out).anew
-    run(planned, out, resume=True, quiet=True)
+    run_plan(planned, out, resume=True, quiet=True)
     assert made() == third and (out / "run.json").is_file()
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 from toy_data import write
 
 from hypogoal.cli import main
@@ -112,7 +113,7 @@ def test_what_the_user_gave_or_allowed_is_run_in_cells(tmp_path: Path, monkeypat
         f"train-ensemble {corridor} {few}1",
     )
     toml = experiment(tmp_path / "own.toml", commands, 'own = ["doorkey"], setting = ["x"]')
-    assert main(["sweep", str(toml), "--out", "out", "-y", "-q", "--set", "own=wide_network:wide"]) == 0
+    run("sweep", toml, "--out", "out", "-y", "-q", "--set", "own=wide_network:wide")
     assert len([*tmp_path.glob("out/c?/*/manifest.json")]) == 2
 
 

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from command_line import run, settings
 from corridor_env import LENGTH, CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
@@ -40,35 +41,31 @@ MEMBERS = 2
 DEMO = "HYPOGOAL_DEMO_RUN"  # names the folder of a finished demo run, to be taken instead of a fresh one
 
 
-def settings(*pairs: str) -> list[str]:
-    return [word for pair in pairs for word in ("--set", pair)]
-
-
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The corridor's ensembles and options, learned until they are good."""
-    run = tmp_path_factory.mktemp("runs") / "corridor"
+    made = tmp_path_factory.mktemp("runs") / "corridor"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))
         patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
         layouts = settings("steps=200", "heldout_seeds=4,5")
-        assert main(["collect", "corridor_env:DOMAIN", "--out", str(run / "data.h5"), "-q", *layouts]) == 0
+        run("collect", "corridor_env:DOMAIN", "--out", made / "data.h5", "-q", *layouts)
         few = settings("steps=100", f"members={MEMBERS}", "workers=1", "learning_rate=1e-3")
-        assert main(["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "-q", *few]) == 0
+        run("train-ensemble", made / "data.h5", "--out", made / "ensemble", "-q", *few)
         play = settings("steps=3000", "environments=4", "warm_up=100", "update_interval=4", "layout_seed=0")
         quick = settings("option_batch=32", "epsilon_steps=500", "max_episode_steps=30", "random_episodes=0")
-        assert main(["train-options", str(run / "ensemble"), "--out", str(run / "options"), "-q", *play, *quick]) == 0
-    return run
+        run("train-options", made / "ensemble", "--out", made / "options", "-q", *play, *quick)
+    return made
 
 
 @pytest.fixture(scope="module")
-def ensemble(run: Path) -> Ensemble:
-    return hypogoal.load_ensemble(run / "ensemble", "right-end")
+def ensemble(made: Path) -> Ensemble:
+    return hypogoal.load_ensemble(made / "ensemble", "right-end")
 
 
 @pytest.fixture(scope="module")
-def options(run: Path) -> Options:
-    return hypogoal.load_options(run / "options")
+def options(made: Path) -> Options:
+    return hypogoal.load_options(made / "options")
 
 
 def corridor() -> gymnasium.Env[Any, Any]:
@@ -163,19 +160,19 @@ class Falling(Terminations):
             self.thresholds = self.thresholds - np.float32(0.01)
 
 
-def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
+def test_options_end_by_the_rule_they_were_trained_with(made: Path) -> None:
     """Spec H4: lowered thresholds go with the artefact, into train-meta, to agents and to other people's code."""
     play = settings("environments=4", "warm_up=100", "layout_seed=0", "max_episode_steps=30", "random_episodes=0")
     ends = settings(f"termination={__name__}:Falling:20", "option_timeout=2", "option_batch=32")
-    out, meta = run / "patient", run / "patient-meta"
+    out, meta = made / "patient", made / "patient-meta"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))
         patch.setenv("HYPOGOAL_TRUST", f"corridor_env:DOMAIN,{__name__}:Falling")
         sure = settings("steps=100", f"members={MEMBERS}", "workers=1", "threshold=0.9")
-        ensemble = str(run / "sure")
-        assert main(["train-ensemble", str(run / "data.h5"), "--out", ensemble, "-q", *sure]) == 0
+        ensemble = str(made / "sure")
+        run("train-ensemble", made / "data.h5", "--out", ensemble, "-q", *sure)
         few = settings("steps=400")
-        assert main(["train-options", ensemble, "--out", str(out), "-q", *play, *ends, *few]) == 0
+        run("train-options", ensemble, "--out", out, "-q", *play, *ends, *few)
         lowered = load_tensors(out / "options.safetensors")["thresholds"].numpy()
         before = [hypogoal.load_ensemble(ensemble, goal).thresholds_as_log_odds() for goal in ("left-end", "right-end")]
         assert (lowered <= np.concatenate(before)).all() and (lowered < np.concatenate(before)).any()
@@ -191,7 +188,7 @@ def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
             *settings("decisions=16"),
         ]
         assert main([*agent, *ends, *settings("steps=40", f"termination={__name__}:Falling:1000")]) == 2  # another rule
-        assert main([*agent, *ends, *settings("steps=40")]) == 0
+        run(*agent, *ends, *settings("steps=40"))
         later = load_tensors(meta / "options.safetensors")["thresholds"].numpy()
         assert (later <= lowered).all()
         np.testing.assert_array_equal(agent_of(open_artefact(meta), 0).terminations.thresholds, later)
@@ -201,14 +198,14 @@ def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
         hypogoal.load_options(out)
 
 
-def test_options_are_masked_as_they_were_trained(run: Path, options: Options) -> None:
+def test_options_are_masked_as_they_were_trained(made: Path, options: Options) -> None:
     """Spec D6: with mask_reached=false options are offered where their sub-goals hold, to other agents too."""
-    shutil.copytree(run / "options", run / "unmasked")
-    config = open_artefact(run / "unmasked").config
+    shutil.copytree(made / "options", made / "unmasked")
+    config = open_artefact(made / "unmasked").config
 
     def unmasked(value: Any) -> Options:
-        reseal(run / "unmasked", config={**config, "mask_reached": value})
-        return hypogoal.load_options(run / "unmasked")
+        reseal(made / "unmasked", config={**config, "mask_reached": value})
+        return hypogoal.load_options(made / "unmasked")
 
     for known, masks in ((options, [False, False, True, True]), (unmasked(False), [True] * 4)):
         env = hypogoal.OptionEnv(corridor(), known)
@@ -219,7 +216,7 @@ def test_options_are_masked_as_they_were_trained(run: Path, options: Options) ->
         unmasked("false")
 
 
-def test_options_go_to_another_process(run: Path, options: Options) -> None:
+def test_options_go_to_another_process(made: Path, options: Options) -> None:
     """Spec E1: with their ensembles; what arrives says and does the same."""
     sent = pickle.loads(pickle.dumps(options))  # noqa: S301 - our own
     env = corridor()
@@ -286,11 +283,11 @@ def test_pictures_without_an_axis_of_colours(tmp_path: Path) -> None:
         patch.syspath_prepend(str(TESTS))
         patch.setenv("HYPOGOAL_TRUST", "corridor_env:GREY")
         few = settings("steps=60", "heldout_seeds=4,5", "unlabelled_seeds=1")
-        assert main(["collect", "corridor_env:GREY", "--out", str(tmp_path / "data.h5"), "-q", *few]) == 0
+        run("collect", "corridor_env:GREY", "--out", tmp_path / "data.h5", "-q", *few)
         few = settings("steps=2", f"members={MEMBERS}", "workers=1")
-        assert main(["train-ensemble", str(tmp_path / "data.h5"), "--out", str(tmp_path / "e"), "-q", *few]) == 0
+        run("train-ensemble", tmp_path / "data.h5", "--out", tmp_path / "e", "-q", *few)
         play = settings("steps=100", "environments=2", "layout_seed=0", "random_episodes=0", "warm_up=50")
-        assert main(["train-options", str(tmp_path / "e"), "--out", str(tmp_path / "o"), "-q", *play]) == 0
+        run("train-options", tmp_path / "e", "--out", tmp_path / "o", "-q", *play)
     known = hypogoal.load_ensemble(tmp_path / "e", "left-end")
     assert known.observation_shape == (48, 48, 1)
     for env in (
@@ -331,9 +328,9 @@ def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) 
     assert [both.step(1)[1] for _ in range(3)] == [0, 0, 1.5]
 
 
-def test_a_classifier_ends_an_episode(run: Path) -> None:
+def test_a_classifier_ends_an_episode(made: Path) -> None:
     """Spec D1: the left end is no end of the task, and of the episode only with the wrapper."""
-    reward = hypogoal.SubgoalReward(run / "ensemble", "left-end")
+    reward = hypogoal.SubgoalReward(made / "ensemble", "left-end")
     for ends in (True, False):
         env = reward.wrap(corridor(), ends=ends)
         env.reset(seed=0)
@@ -359,7 +356,7 @@ def test_a_reward_is_shared_by_environments_side_by_side(ensemble: Ensemble, vec
     envs.close()
 
 
-def test_mistakes_are_one_line(run: Path, options: Options, ensemble: Ensemble) -> None:
+def test_mistakes_are_one_line(made: Path, options: Options, ensemble: Ensemble) -> None:
     """Spec G2."""
     other = gymnasium.wrappers.ResizeObservation(CorridorEnv(), (24, 24))
     for make in (lambda: hypogoal.OptionEnv(other, options), lambda: hypogoal.SubgoalReward(ensemble).wrap(other)):
@@ -369,7 +366,7 @@ def test_mistakes_are_one_line(run: Path, options: Options, ensemble: Ensemble) 
         with pytest.raises(UserError, match="Choose one of any, vote, all, mean, or a member, 0 to 1"):
             hypogoal.SubgoalReward(ensemble, by=by)
     with pytest.raises(UserError, match="unknown sub-goal"):
-        hypogoal.SubgoalReward(run / "ensemble")
+        hypogoal.SubgoalReward(made / "ensemble")
     env = hypogoal.OptionEnv(corridor(), options)
     with pytest.raises(UserError, match="was not reset"):
         env.step(0)
@@ -408,9 +405,9 @@ def test_maskable_ppo_learns_which_option_pays(options: Options) -> None:
     assert env.step(_first_choice(agent, env))[2], "the task is over"
 
 
-def test_stable_baselines3_learns_a_classifiers_reward(run: Path) -> None:
+def test_stable_baselines3_learns_a_classifiers_reward(made: Path) -> None:
     """Spec D1: DQN, rewarded by the ensemble of the left end only, goes there; the environment pays at the right."""
-    env = hypogoal.SubgoalReward(run / "ensemble", "left-end").wrap(SameLayout(corridor()))
+    env = hypogoal.SubgoalReward(made / "ensemble", "left-end").wrap(SameLayout(corridor()))
     agent = DQN(
         "MlpPolicy", env, learning_starts=100, buffer_size=2000, train_freq=2, target_update_interval=50, gamma=0.8,
         learning_rate=1e-3, exploration_fraction=0.6, seed=0,
@@ -431,14 +428,14 @@ def test_maskable_ppo_reaches_the_goal_with_the_options_of_the_demo(tmp_path: Pa
     Takes the run that HYPOGOAL_DEMO_RUN names, or makes the options anew: four minutes in all.
     """
     given = os.environ.get(DEMO)
-    run = Path(given) if given else tmp_path / "demo"
+    made = Path(given) if given else tmp_path / "demo"
     if not given:
         data = tmp_path / "data.h5"
-        assert main(["collect", "doorkey", "--out", str(data), "--preset", "demo", "-q"]) == 0
-        assert main(["train-ensemble", str(data), "--out", str(run / "ensemble"), "--preset", "demo", "-q"]) == 0
-        learn = ["train-options", str(run / "ensemble"), "--out", str(run / "options"), "--preset", "demo", "-q"]
-        assert main([*learn, "--set", "steps=120000"]) == 0
-    found = [*find_artefacts(run, "meta"), *find_artefacts(run, "options")]
+        run("collect", "doorkey", "--out", data, "--preset", "demo", "-q")
+        run("train-ensemble", data, "--out", made / "ensemble", "--preset", "demo", "-q")
+        learn = ["train-options", str(made / "ensemble"), "--out", str(made / "options"), "--preset", "demo", "-q"]
+        run(*learn, "--set", "steps=120000")
+    found = [*find_artefacts(made, "meta"), *find_artefacts(made, "options")]
     wanted = {"layout_seed": 100, "termination": "learned"}
     meta = next(one.path for one in found if wanted.items() <= one.config.items())
     learned = hypogoal.load_options(meta)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import own_domain
 import pytest
+from command_line import run, settings
 from test_docs import blocks, commands
 
 from hypogoal.cli import main
@@ -17,21 +18,17 @@ from hypogoal.dataset import open_dataset
 ROOT = Path(__file__).parents[2]
 
 
-def settings(*pairs: str) -> list[str]:
-    return [word for pair in pairs for word in ("--set", pair)]
-
-
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``runs/demo/ensemble`` and ``runs/demo/meta``, as the demo leaves them, hardly trained."""
     folder = tmp_path_factory.mktemp("demo")
-    data, run = str(folder / "data.h5"), folder / "runs" / "demo"
+    data, made = str(folder / "data.h5"), folder / "runs" / "demo"
     layouts = settings("heldout_layouts=1", "unlabelled_seeds=1")
-    assert main(["collect", "doorkey", "--out", data, "-q", *layouts]) == 0
+    run("collect", "doorkey", "--out", data, "-q", *layouts)
     few = settings("steps=2", "workers=1")
-    assert main(["train-ensemble", data, "--out", str(run / "ensemble"), "-q", *few]) == 0
+    run("train-ensemble", data, "--out", made / "ensemble", "-q", *few)
     play = settings("steps=320", "warm_up=100", "max_episode_steps=60", "random_episodes=2")
-    assert main(["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), "-q", *play]) == 0
+    run("train-meta", made / "ensemble", "--out", made / "meta", "-q", *play)
     return folder
 
 

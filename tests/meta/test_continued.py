@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command_line import refuses, run, settings
 
-from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import make_agent
@@ -51,16 +51,10 @@ def walk(learner: Any, steps: int) -> None:
         learner.learn()
 
 
-@pytest.fixture(scope="module")
-def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def ensemble(tiny_run: Path) -> Path:
     """A small real one."""
-    folder = tmp_path_factory.mktemp("continued")
-    data = str(folder / "data.h5")
-    few = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1", "-q"]
-    assert main(["collect", "doorkey", "--out", data, *few]) == 0
-    few = ["--set", "steps=2", "--set", "members=2", "--set", "workers=1", "-q"]
-    assert main(["train-ensemble", data, "--out", str(folder / "ensemble"), *few]) == 0
-    return folder / "ensemble"
+    return tiny_run / "ensemble"
 
 
 @pytest.mark.usefixtures("small_gru")
@@ -68,40 +62,34 @@ def test_the_papers_preset_plays_and_learns(ensemble: Path, tmp_path: Path) -> N
     """Spec E1, E2, Tables 3 to 5: its networks on the real engine, options and meta-policy updated."""
     few = ["steps=120", "decisions=8", "warm_up=8", "random_episodes=2", "option_batch=4"]
     out = tmp_path / "meta"
-    changes = [word for pair in few for word in ("--set", pair)]
-    assert main(["train-meta", str(ensemble), "--out", str(out), "--preset", "paper", *changes, "-q"]) == 0
+    changes = settings(*few)
+    run("train-meta", ensemble, "--out", out, "--preset", "paper", *changes, "-q")
     assert (out / "meta.safetensors").is_file()
     assert (out / "choices.csv").read_text().count("\n") > 1
 
 
-def test_options_go_on_with_the_time_they_learned_for(
-    ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_go_on_with_the_time_they_learned_for(ensemble: Path, tmp_path: Path) -> None:
     """Spec D1: the timeout is part of an option: it is taken over, and another one is refused."""
     few = ["--set", "steps=64", "--set", "random_episodes=2", "-q"]
     options, out = str(tmp_path / "options"), str(tmp_path / "meta")
-    assert main(["train-options", str(ensemble), "--out", options, "--set", "option_timeout=40", *few]) == 0
+    run("train-options", ensemble, "--out", options, "--set", "option_timeout=40", *few)
     meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
-    assert main([*meta, "--set", "option_timeout=10"]) == 2
-    assert "trained with option_timeout=40, not 10" in capsys.readouterr().err
-    assert main(meta) == 0
+    refuses("trained with option_timeout=40, not 10", *meta, "--set", "option_timeout=10")
+    run(*meta)
     assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["option_timeout"] == 40
 
 
-def test_an_embedding_by_name_goes_through_both_stages(
-    ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_embedding_by_name_goes_through_both_stages(ensemble: Path, tmp_path: Path) -> None:
     """Spec D2, D8, H6: where an engine has tiles, too; it is part of the options, and of the light network alone."""
     few = ["--set", "steps=64", "--set", "random_episodes=2", "--set", "warm_up=20", "-q"]
     options, out, named = str(tmp_path / "options"), str(tmp_path / "meta"), ["--set", "embedding=tiles"]
-    assert main(["train-options", str(ensemble), "--out", options, *named, *few]) == 0
+    run("train-options", ensemble, "--out", options, *named, *few)
     meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
-    assert main([*meta, "--set", "embedding=auto"]) == 2
-    assert "trained with embedding=tiles, not auto" in capsys.readouterr().err
-    assert main(meta) == 0
+    refuses("trained with embedding=tiles, not auto", *meta, "--set", "embedding=auto")
+    run(*meta)
     assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["embedding"] == "tiles"
-    assert main([*meta[:2], "--out", str(tmp_path / "other"), *named, "--set", "network=planned"]) == 2
-    assert "needs embedding=auto" in capsys.readouterr().err
+    planned = ["--out", tmp_path / "other", *named, "--set", "network=planned", "-q"]
+    refuses("needs embedding=auto", *meta[:2], *planned)
 
 
 @pytest.mark.usefixtures("small_gru")

@@ -3,18 +3,15 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
+from command_line import refuses, run
 from corridor import Corridor, LongCorridor
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.options.visited import Visited
 from hypogoal.stages.train_ensemble import joined_unlabelled
-
-TESTS = Path(__file__).parents[1]
 
 
 def walk(visited: Visited, engine: Corridor, steps: int, seed: int = 0) -> None:
@@ -102,35 +99,27 @@ def test_it_goes_on_where_it_was() -> None:
     assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
-def test_an_ensemble_learns_from_what_was_visited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ensemble_learns_from_what_was_visited(corridor_run: Path, tmp_path: Path) -> None:
     """Spec B7: options save what they visited, and an ensemble is trained with it, with the data's own or instead."""
-    monkeypatch.syspath_prepend(str(TESTS / "domains"))
-    monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
-    data, run = str(tmp_path / "data.h5"), tmp_path / "run"
-    assert main(["collect", "own_domain:DOMAIN", "--out", data, "-q"]) == 0
-    few = ["--set", "steps=3", "--set", "workers=1", "-q"]
-    assert main(["train-ensemble", data, "--out", str(run / "first"), *few]) == 0
-    played = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
-    saving = [*played, "--set", "save_visited=5"]
-    assert main(["train-options", str(run / "first"), "--out", str(run / "options"), *saving]) == 0
-    assert main(["train-meta", str(run / "first"), "--out", str(run / "meta"), *saving]) == 0
-    for name in ("options", "meta"):
-        found = open_dataset(run / name / "visited.h5")
+    for name in ("options-more", "meta-more"):
+        found = open_dataset(corridor_run / name / "visited.h5")
         assert len(np.unique(found.unlabelled(), axis=0)) == 5
         assert found.counts()["labelled"]["left-end"] == {"states": 0, "positives": 0}
-    both = ["--unlabelled", data, "--unlabelled", str(run / "options")]
-    assert main(["train-ensemble", data, "--out", str(run / "second"), *both, *few]) == 0
-    assert main(["train-ensemble", data, "--out", str(run / "third"), *both[2:], *few]) == 0
-    assert (run / "second/left-end.safetensors").read_bytes() != (run / "first/left-end.safetensors").read_bytes()
-    second = open_artefact(run / "second", "ensemble")
-    assert [entry["kind"] for entry in second.manifest["inputs"]] == ["data", "data", "data"]
-    assert second.input("data") == Path(data), "what is evaluated is the data, not what was visited"
-    states, origins = joined_unlabelled([Path(data), run / "options/visited.h5"])
-    assert len(states) == len(open_dataset(Path(data)).unlabelled()) + 5 and origins == {}
-    assert main(["verify", str(run)]) == 0
+    data, options = corridor_run / "data.h5", corridor_run / "options-more"
+    train = ["train-ensemble", data, "--set", "members=2", "--set", "workers=1", "--set", "steps=10", "-q"]
+    run(*train, "--unlabelled", data, "--unlabelled", options, "--out", tmp_path / "both")
+    run(*train, "--unlabelled", options, "--out", tmp_path / "visited")
+    weights = [folder / "left-end.safetensors" for folder in (corridor_run / "ensemble", tmp_path / "both")]
+    assert weights[0].read_bytes() != weights[1].read_bytes()
+    both = open_artefact(tmp_path / "both", "ensemble")
+    assert [entry["kind"] for entry in both.manifest["inputs"]] == ["data", "data", "data"]
+    assert both.input("data") == data, "what is evaluated is the data, not what was visited"
+    states, origins = joined_unlabelled([data, options / "visited.h5"])
+    assert len(states) == len(open_dataset(data).unlabelled()) + 5 and origins == {}
+    run("verify", tmp_path)
 
 
-def test_states_that_do_not_fit_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_states_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     """Spec G2: of another domain, none at all, and a folder without them: one line, exit code 2, nothing written."""
     import toy_data
 
@@ -141,6 +130,5 @@ def test_states_that_do_not_fit_are_refused(tmp_path: Path, capsys: pytest.Captu
         (other, "the domain another"), (tmp_path / "empty", "not an artefact"), (tmp_path / "no.h5", "no such"),
     ):  # fmt: skip
         command = ["train-ensemble", str(data), "--unlabelled", str(wrong), "--out", str(tmp_path / "out"), "-q"]
-        assert main(command) == 2
-        assert words in capsys.readouterr().err
+        refuses(words, *command)
     assert not (tmp_path / "out").exists()

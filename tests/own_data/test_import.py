@@ -13,9 +13,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from command_line import refuses, run, settings
 from PIL import Image
 
-from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data.arrays import read_arrays
@@ -47,51 +47,47 @@ def arrays(**changes: Any) -> dict[str, Any]:
 def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     """Spec B6, A2, A5: a .npz becomes a data file, an ensemble of it judges the held-out states."""
     np.savez(tmp_path / "own.npz", **arrays())
-    run = tmp_path / "run"
-    data = str(run / "data.h5")
-    assert main(["import", str(tmp_path / "own.npz"), "--out", data, "--sub-goal", "at-right", "-q"]) == 0
+    folder = tmp_path / "run"
+    data = str(folder / "data.h5")
+    run("import", tmp_path / "own.npz", "--out", data, "--sub-goal", "at-right", "-q")
     found = open_dataset(Path(data))
     np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
     assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
-    train = ["train-ensemble", data, "--out", str(run / "ensemble"), "-q"]
-    few = [word for pair in ("steps=40", "members=2", "learning_rate=1e-3") for word in ("--set", pair)]
-    assert main([*train, *few]) == 0
-    assert main(["evaluate", str(run), "-q"]) == 0
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    train = ["train-ensemble", data, "--out", str(folder / "ensemble"), "-q"]
+    few = settings("steps=40", "members=2", "learning_rate=1e-3")
+    run(*train, *few)
+    run("evaluate", folder, "-q")
+    metrics = json.loads((folder / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     assert metrics["hypotheses"][0]["worst"]["mean"] > 0.9
 
 
-def test_images_too_small_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_too_small_are_warned_of(tmp_path: Path) -> None:
     """Spec B6: when they are imported, not when they are trained on; the network that is named takes them."""
     shrunk = {
         name: values[:, ::2, ::2] for name, values in arrays().items() if name not in ("labels", "heldout_labels")
     }
     np.savez(tmp_path / "small.npz", **arrays(**shrunk))
     data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
-    assert main(["import", str(tmp_path / "small.npz"), "--out", data, "-q"]) == 0
-    told = capsys.readouterr().err
+    told = run("import", tmp_path / "small.npz", "--out", data, "-q").err
     assert "the network 'doorkey' does not take these observations: observation shape (24, 24, 3). Give --set" in told
-    few = [word for pair in ("steps=2", "members=1", "network=tiles") for word in ("--set", pair)]
+    few = settings("steps=2", "members=1", "network=tiles")
     assert "--set network=tiles" in told
-    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
-    assert main(["import", str(tmp_path / "small.npz"), "--out", str(tmp_path / "m.h5"), "--domain", "montezuma"]) == 0
-    assert "the network 'montezuma' does not take these observations" in capsys.readouterr().err
+    run("train-ensemble", data, "--out", ensemble, "-q", *few)
+    printed = run("import", tmp_path / "small.npz", "--out", tmp_path / "m.h5", "--domain", "montezuma")
+    assert "the network 'montezuma' does not take these observations" in printed.err
     np.savez(tmp_path / "own.npz", **arrays())
-    assert main(["import", str(tmp_path / "own.npz"), "--out", str(tmp_path / "large.h5")]) == 0
-    assert "does not take" not in capsys.readouterr().err
+    assert "does not take" not in run("import", tmp_path / "own.npz", "--out", tmp_path / "large.h5").err
 
 
-def test_options_of_states_of_no_domain_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_states_of_no_domain_are_refused(tmp_path: Path) -> None:
     """Spec B6, G2: what to do is said: which domain the states are of is told when they are imported."""
     np.savez(tmp_path / "own.npz", **arrays())
     data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
-    assert main(["import", str(tmp_path / "own.npz"), "--out", data, "-q"]) == 0
-    few = [word for pair in ("steps=2", "members=1") for word in ("--set", pair)]
-    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
-    capsys.readouterr()
-    assert main(["train-options", ensemble, "--out", str(tmp_path / "options"), "-q"]) == 2
-    told = capsys.readouterr().err
-    assert "the domain of these imported states is not known: imported. Import them again with --domain" in told
+    run("import", tmp_path / "own.npz", "--out", data, "-q")
+    few = settings("steps=2", "members=1")
+    run("train-ensemble", data, "--out", ensemble, "-q", *few)
+    command = ["train-options", ensemble, "--out", tmp_path / "options", "-q"]
+    refuses("the domain of these imported states is not known: imported. Import them again with --domain", *command)
 
 
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
@@ -103,9 +99,9 @@ def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
         np.save(folder / f"{name}.npy", values)
     data, again = tmp_path / "data.h5", tmp_path / "again.h5"
     names = ["--sub-goal", "odd", "--sub-goal", "third"]
-    assert main(["import", str(folder), "--out", str(data), *names, "-q"]) == 0
-    assert main(["export", str(data), "--out", str(tmp_path / "out.npz")]) == 0
-    assert main(["import", str(tmp_path / "out.npz"), "--out", str(again), "-q"]) == 0
+    run("import", folder, "--out", data, *names, "-q")
+    run("export", data, "--out", tmp_path / "out.npz")
+    run("import", tmp_path / "out.npz", "--out", again, "-q")
     one, other = open_dataset(data), open_dataset(again)
     assert one.sub_goals == other.sub_goals == ("odd", "third")
     for split in ("labelled", "heldout"):
@@ -113,19 +109,19 @@ def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
             left, right = getattr(one, split)(goal), getattr(other, split)(goal)
             np.testing.assert_array_equal(left.observations, right.observations)
             np.testing.assert_array_equal(left.labels, right.labels)
-    assert main(["export", str(data), "--out", str(tmp_path / "out.npz")]) == 2, "it exists"
-    assert main(["export", str(data), "--out", str(tmp_path / "out.csv")]) == 2
+    refuses("exists already", "export", data, "--out", tmp_path / "out.npz")
+    refuses("as .npz", "export", data, "--out", tmp_path / "out.csv")
 
 
-def test_a_share_is_held_out_where_nothing_else_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_share_is_held_out_where_nothing_else_is_given(tmp_path: Path) -> None:
     """Spec B3: of each class, and it is said that this tells nothing of other contexts."""
     np.savez(tmp_path / "own.npz", **arrays(heldout_observations=None, heldout_labels=None))
     data = tmp_path / "data.h5"
-    assert main(["import", str(tmp_path / "own.npz"), "--out", str(data), "--heldout", "0.25", "-q"]) == 0
+    said = run("import", tmp_path / "own.npz", "--out", data, "--heldout", "0.25", "-q")
+    assert "says nothing about other contexts" in said.err
     counts = open_dataset(data).counts()
     assert counts["heldout"]["sub-goal"] == {"states": 10, "positives": 5}
     assert counts["labelled"]["sub-goal"] == {"states": 30, "positives": 15}
-    assert "says nothing about other contexts" in capsys.readouterr().err
 
 
 def test_a_share_is_held_out_of_many_small_groups_too() -> None:
@@ -291,7 +287,7 @@ def test_zip_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> Non
 def test_a_name_that_is_no_utf_8_is_imported(tmp_path: Path) -> None:
     """Spec B6: what the source was called is only told; what of it cannot be is a '?'."""
     np.savez(tmp_path / "own\udcff.npz", **arrays())
-    assert main(["import", str(tmp_path / "own\udcff.npz"), "--out", str(tmp_path / "data.h5"), "-q"]) == 0
+    run("import", tmp_path / "own\udcff.npz", "--out", tmp_path / "data.h5", "-q")
     assert open_dataset(tmp_path / "data.h5").config["source"] == "own?.npz"
 
 
@@ -315,13 +311,13 @@ def test_folders_of_images_become_states(tmp_path: Path) -> None:
     """Spec B6: the folder's name is the sub-goal's; grey images have one channel; the ensemble trains."""
     data, out = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
     folder = save_images(tmp_path / "at-right")
-    assert main(["import", str(folder), "--out", data, "-q"]) == 0
+    run("import", folder, "--out", data, "-q")
     found = open_dataset(Path(data))
     assert found.sub_goals == ("at-right",)
     images, labels = pictures(24)
     np.testing.assert_array_equal(found.labelled("at-right").observations[:12], images[labels])
     assert found.counts()["heldout"]["at-right"] == {"states": 6, "positives": 3}
-    assert main(["train-ensemble", data, "--out", out, "--set", "steps=2", "--set", "members=2", "-q"]) == 0
+    run("train-ensemble", data, "--out", out, "--set", "steps=2", "--set", "members=2", "-q")
     assert read_images(save_images(tmp_path / "grey", grey=True)).observations.shape == (24, SIDE, SIDE, 1)
 
 
@@ -418,13 +414,13 @@ def test_minari_datasets_are_labelled_by_a_function(tmp_path: Path, nested: bool
     folder, data = save_minari(tmp_path / "own-v0", nested=nested), tmp_path / "data.h5"
     given = ["import", str(folder), "--out", str(data), "--label", "right=test_import:at_right", "-q"]
     given += ["--key", "image"] if nested else []
-    assert main(given) == 0
+    run(*given)
     counts = open_dataset(data).counts()
     assert counts["labelled"]["right"] == {"states": 24, "positives": 12}
     assert counts["heldout"]["right"] == {"states": 12, "positives": 6}
     assert counts["unlabelled"] == 24
     before = open_dataset(data).unlabelled()
-    assert main([*given, "--force"]) == 0
+    run(*given, "--force")
     np.testing.assert_array_equal(open_dataset(data).unlabelled(), before)
     assert open_dataset(data).config["labels"] == {"right": "test_import:at_right"}
 
@@ -440,13 +436,13 @@ def test_several_keys_of_a_minari_dataset(tmp_path: Path) -> None:
         for number in range(10):
             file[f"episode_{number}/observations/speed"] = np.arange(12.0).reshape(6, 2)
     words = ["import", str(folder), "--out", str(data), "--label", "right=test_import:goes_right", "-q"]
-    assert main([*words, "--key", "image", "--key", "speed"]) == 0
+    run(*words, "--key", "image", "--key", "speed")
     states = open_dataset(data).labelled("right")
     assert states.observations["image"].shape == (24, SIDE, SIDE, 3)
     assert states.labels.sum() == 12 and set(states.observations["speed"][:, 0]) == {0, 2, 4, 6, 8, 10}
 
 
-def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path) -> None:
     """Spec G2."""
     label = ["--label", "right=test_import:at_right"]
     cases = [
@@ -477,6 +473,5 @@ def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.Ca
             del file["episode_3/observations"]
             file["episode_3/observations"] = np.ones(shape, np.uint8)
     for folder, more, message in cases:
-        assert main(["import", str(folder), "--out", str(tmp_path / "data.h5"), *more]) == 2
-        assert message in capsys.readouterr().err
+        refuses(message, "import", folder, "--out", tmp_path / "data.h5", *more)
         assert not (tmp_path / "data.h5").exists()

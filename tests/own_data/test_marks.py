@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 
 from hypogoal.cli import main
 from hypogoal.dataset import digest, open_dataset
@@ -20,7 +21,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("marks")
     np.savez(folder / "states.npz", **mixed.arrays())
     out = folder / "data.h5"
-    assert main(["import", str(folder / "states.npz"), "--out", str(out), "--sub-goal", "open", "-q"]) == 0
+    run("import", folder / "states.npz", "--out", out, "--sub-goal", "open", "-q")
     return out
 
 
@@ -68,24 +69,21 @@ def test_a_damaged_table_is_read_or_refused(data: Path, tmp_path: Path, capsys: 
 def test_a_table_saved_by_a_spreadsheet_is_read(data: Path, tmp_path: Path) -> None:
     marks = tmp_path / "marks.csv"
     marks.write_bytes(table(data, 4).replace("\n", "\r\n").encode("utf-8-sig"))
-    assert main(["import", str(data), "--label", f"open={marks}", "--out", str(tmp_path / "more.h5"), "-q"]) == 0
+    run("import", data, "--label", f"open={marks}", "--out", tmp_path / "more.h5", "-q")
     assert len(open_dataset(tmp_path / "more.h5").unlabelled()) == len(open_dataset(data).unlabelled()) - 4
 
 
-def test_it_is_said_when_no_unlabelled_state_is_left(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_said_when_no_unlabelled_state_is_left(data: Path, tmp_path: Path) -> None:
     """The labels are kept: members without diversity, or with other unlabelled states, can be trained on them."""
     marks, out = tmp_path / "marks.csv", tmp_path / "all.h5"
     for count, said in ((len(open_dataset(data).unlabelled()), True), (4, False)):
         marks.write_text(table(data, count))
         words = ["import", str(data), "--label", f"open={marks}", "--out", str(out), "--force", "-q"]
-        assert main(words) == 0
-        line = capsys.readouterr().err
+        line = run(*words).err
         assert ("no unlabelled state is left in all.h5: members cannot be made to differ" in line) == said
         assert line.count("\n") == said
     marks.write_text(table(data, len(open_dataset(data).unlabelled())))
-    assert main(["import", str(data), "--label", f"open={marks}", "--out", str(out), "--force", "-q"]) == 0
+    run("import", data, "--label", f"open={marks}", "--out", out, "--force", "-q")
     train = ["train-ensemble", str(out), "--out", str(tmp_path / "ensemble"), "-q", "--set", "steps=2"]
     assert main(train) == 2
-    assert main([*train, "--set", "diversity=none"]) == 0
+    run(*train, "--set", "diversity=none")

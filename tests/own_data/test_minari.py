@@ -7,6 +7,7 @@ import gymnasium
 import minari
 import numpy as np
 import pytest
+from command_line import refuses, run
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
@@ -15,20 +16,15 @@ from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.own_data.minari import read_minari
 from hypogoal.stages.export_episodes import dataset_id
-from tests.attacks.kills import STAGES, needed
 
 LAYOUT = 100
 EPISODES = 3
 
 
-@pytest.fixture(scope="module")
-def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A toy run's agent, whose episodes are cut after 60 steps."""
-    run = tmp_path_factory.mktemp("toy")
-    for part in needed(["meta"]):
-        stage = STAGES[part]
-        assert main([*stage.arguments(run), "--out", str(run / f"{part}{stage.suffix}"), "-q"]) == 0
-    return run / "meta"
+@pytest.fixture
+def agent(tiny_run: Path) -> Path:
+    """An agent whose episodes are cut after 64 steps."""
+    return tiny_run / "meta"
 
 
 @pytest.fixture
@@ -42,11 +38,10 @@ def even(observation: np.ndarray) -> bool:
     return int(observation.astype(int).sum()) % 2 == 0
 
 
-def test_an_agents_episodes_are_a_minari_dataset(agent: Path, there: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_agents_episodes_are_a_minari_dataset(agent: Path, there: Path) -> None:
     """Spec B6: minari reads them; played again, their actions lead to the same observations and rewards."""
     out = there / "toy-v0"
-    assert main(["export", str(agent), "--out", str(out), "--episodes", str(EPISODES)]) == 0
-    said = capsys.readouterr().out
+    said = run("export", agent, "--out", out, "--episodes", EPISODES).out
     dataset = minari.load_dataset("toy-v0")
     assert dataset.total_episodes == EPISODES
     assert re.search(rf"{EPISODES} episodes, {dataset.total_steps} steps", said)
@@ -62,12 +57,12 @@ def test_an_agents_episodes_are_a_minari_dataset(agent: Path, there: Path, capsy
             assert (episode.rewards[step], episode.terminations[step]) == (reward, terminated)
         assert episode.terminations[-1] != episode.truncations[-1]
         assert not (episode.terminations[:-1] | episode.truncations[:-1]).any()
-        assert episode.terminations[-1] or len(episode.actions) == 60
+        assert episode.terminations[-1] or len(episode.actions) == 64
         options = episode.infos["option"]
         assert options[0] == -1
         assert (options[1:] >= 0).all() and (options[1:] < 4).all()
     again = there / "again-v0"
-    assert main(["export", str(agent), "--out", str(again), "--episodes", str(EPISODES), "-q"]) == 0
+    run("export", agent, "--out", again, "--episodes", EPISODES, "-q")
     for one, other in zip(dataset.iterate_episodes(), minari.load_dataset("again-v0").iterate_episodes(), strict=True):
         np.testing.assert_array_equal(one.actions, other.actions)
 
@@ -82,7 +77,7 @@ def states_in(folder: Path) -> list[bytes]:
 
 def test_exported_episodes_are_imported(agent: Path, there: Path) -> None:
     """Spec B6: what goes out comes in."""
-    assert main(["export", str(agent), "--out", str(there / "toy-v1"), "--episodes", str(EPISODES), "-q"]) == 0
+    run("export", agent, "--out", there / "toy-v1", "--episodes", EPISODES, "-q")
     episodes = minari.load_dataset("toy-v1").iterate_episodes()
     assert states_in(there / "toy-v1") == sorted(seen.tobytes() for one in episodes for seen in one.observations)
 
@@ -93,7 +88,7 @@ def test_a_dataset_is_called_by_where_it_lies(
 ) -> None:
     """Spec B6: in a namespace its id begins with that, whichever way its place is written; outside it is its name."""
     monkeypatch.chdir(tmp_path)
-    assert main(["export", str(agent), "--out", f"minari/{place}", "--episodes", "1", "-q"]) == 0
+    run("export", agent, "--out", f"minari/{place}", "--episodes", "1", "-q")
     dataset = minari.load_dataset(place)
     assert dataset.id == dataset.spec.dataset_id == place
     assert place in minari.list_local_datasets()
@@ -112,14 +107,11 @@ def test_a_dataset_is_called_by_where_it_lies(
         ("there-v0", ["--force"], "Move it away"),
     ],
 )
-def test_what_cannot_be_exported_is_one_line(
-    agent: Path, there: Path, capsys: pytest.CaptureFixture[str], name: str, more: list[str], words: str
-) -> None:
+def test_what_cannot_be_exported_is_one_line(agent: Path, there: Path, name: str, more: list[str], words: str) -> None:
     """Spec G2: nothing half-written, nothing replaced."""
     (there / "there-v0").mkdir(parents=True)
     (there / "there-v0" / "mine").write_text("mine")
-    assert main(["export", str(agent), "--out", str(there / name), *more]) == 2
-    assert words in capsys.readouterr().err
+    refuses(words, "export", agent, "--out", there / name, *more)
     assert [path.name for path in there.iterdir()] == ["there-v0"]
     assert main(["export", str(agent.parent), "--out", str(there / "x-v0")]) == 2
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 from PIL import Image
 from test_import import arrays, pictures, save_images, save_minari
 
-from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data.images import read_image, read_images
@@ -91,7 +91,7 @@ def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
     for number, source in enumerate(sources):
         given = ["--label", "right=test_import:at_right"] if number == 2 else []
         out = tmp_path / f"{number}.h5"
-        assert main(["import", str(source), "--out", str(out), "--resize", "24", *given, "-q"]) == 0
+        run("import", source, "--out", out, "--resize", "24", *given, "-q")
         data = open_dataset(out)
         assert data.observation_shape == (24, 24, 3) and data.config["resize"] == 24
         if number == 0:
@@ -130,7 +130,7 @@ def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
     np.testing.assert_array_equal(parts.observations, states[[0, 3, 1, 4]])
     np.testing.assert_array_equal(parts.unlabelled, states[[2, 5]])
     given = ["--heldout", "0.4", "--resize", "16", "-q"]
-    assert main(["import", str(tmp_path / "goal"), "--out", str(tmp_path / "goal.h5"), *given]) == 0
+    run("import", tmp_path / "goal", "--out", tmp_path / "goal.h5", *given)
     wanted = states[[2, 5]].reshape(2, 16, 4, 12, 4, 4).mean((2, 4))
     assert np.abs(open_dataset(tmp_path / "goal.h5").unlabelled() - wanted).max() <= 1
     many = np.random.default_rng(0).integers(0, 255, (4, 48, 60, 3), dtype=np.uint8)
@@ -146,9 +146,7 @@ def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "arrays", "minari"])
-def test_large_pictures_are_proposed_to_be_made_smaller(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
-) -> None:
+def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path, kind: str) -> None:
     """Spec B6, G1: in a line that is a command and works as it stands; never of what is small, or was made so."""
 
     def large(states: np.ndarray) -> np.ndarray:
@@ -167,8 +165,7 @@ def test_large_pictures_are_proposed_to_be_made_smaller(
         save_minari(source, side=240)
         given, name = ["--label", "right=test_import:at_right"], "right"
     out = tmp_path / "large ones.h5"
-    assert main(["import", str(source), "--out", str(out), *given]) == 0
-    said = capsys.readouterr()
+    said = run("import", source, "--out", out, *given)
     [line] = [line for line in said.err.splitlines() if "--resize" in line]
     shape = (240, 240, 3) if kind == "minari" else (240, 192, 3)
     sizes = " x ".join(map(str, shape))
@@ -177,8 +174,7 @@ def test_large_pictures_are_proposed_to_be_made_smaller(
     before = open_dataset(out)
     labels = before.labelled(name).labels
     assert before.observation_shape == shape
-    assert main(["import", str(source), "--out", str(out), *given, *line.partition("add ")[2].split()]) == 0
-    assert "--resize" not in capsys.readouterr().err
+    assert "--resize" not in run("import", source, "--out", out, *given, *line.partition("add ")[2].split()).err
     after = open_dataset(out)
     assert after.observation_shape == (160, 160 if kind == "minari" else 128, 3)
     for mine in ("domain", "seed", "sub_goals"):

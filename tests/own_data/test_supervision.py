@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 from PIL import Image
 from test_import import arrays, at_right, pictures, save_images, save_minari
 
@@ -28,15 +29,12 @@ def smooth(count: int, seed: int = 5) -> np.ndarray:
     return np.stack([np.asarray(Image.fromarray(each).resize((128, 96), Image.Resampling.BICUBIC)) for each in small])
 
 
-def test_pictures_with_both_labels_are_counted_and_two_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures_with_both_labels_are_counted_and_two_named(tmp_path: Path) -> None:
     """Spec B6: of files by their names, of arrays by their rows, of each sub-goal; the import goes on."""
     folder = save_images(tmp_path / "at-right")
     for name in ("01", "03", "05"):
         shutil.copy(folder / "positive" / f"{name}.png", folder / "negative" / f"copy-{name}.png")
-    assert main(["import", str(folder), "--out", str(tmp_path / "data.h5"), "-q"]) == 0
-    said = capsys.readouterr().err
+    said = run("import", folder, "--out", tmp_path / "data.h5", "-q").err
     assert "3 pictures carry both labels of at-right, such as positive/" in said and " and negative/copy-0" in said
     assert open_dataset(tmp_path / "data.h5").counts()["labelled"]["at-right"] == {"states": 27, "positives": 12}
     images, labels = pictures(40)

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_line import refuses, run, settings
 from numpy.typing import NDArray
 from own_domain import CorridorDomain, TallCorridor
 from PIL import Image
-from toy_data import files_of
+from toy_data import files_of, reseal
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.own_code import OF_FILE
-from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS, lines_of
-from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.options.termination import Terminations
-from hypogoal.stages.collect import collect
-from hypogoal.stages.train_ensemble import train_ensemble
 
 BLUE_FIRST = "101"  # a layout on which the blue key is nearer than the red one
 Pictures = NDArray[np.uint8]
@@ -93,10 +91,6 @@ class PlacedDomain(CorridorDomain):
 PLACED = PlacedDomain()
 
 
-def settings(*pairs: str) -> list[str]:
-    return [word for pair in pairs for word in ("--set", pair)]
-
-
 QUICK = settings("environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10", "option_batch=24")
 CORRIDOR = ["--domain", PLACED.name, "--sub-goal", "left-end", *QUICK]
 
@@ -104,8 +98,8 @@ CORRIDOR = ["--domain", PLACED.name, "--sub-goal", "left-end", *QUICK]
 def audited(out: Path, classifier: str, *words: str) -> tuple[dict[str, Any], list[dict[str, str]]]:
     """``audit.json`` and ``exploits.csv`` of an audit of an ensemble or of a function of this module."""
     target = classifier if "/" in classifier else f"{__name__}:{classifier}"
-    assert main(["audit", target, "--out", str(out), "-q", *words]) == 0
-    assert main(["verify", str(out)]) == 0
+    run("audit", target, "--out", out, "-q", *words)
+    run("verify", out)
     report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
     with (out / "exploits.csv").open(newline="", encoding="utf-8") as file:
         return report, list(csv.DictReader(file))
@@ -183,7 +177,7 @@ def test_places_are_kinds_of_their_own(tmp_path: Path) -> None:
 def test_a_broken_audit_is_resumed_to_the_last_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G1."""
     words = ["audit", f"{__name__}:too_soon", *CORRIDOR, "-q", *settings("steps=800")]
-    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+    run(*words, "--out", tmp_path / "whole")
 
     seen: list[Checkpoints] = []
 
@@ -198,23 +192,20 @@ def test_a_broken_audit_is_resumed_to_the_last_bit(tmp_path: Path, monkeypatch: 
         patch.setattr(Checkpoints, "offer", offer)
         assert main([*words, "--out", str(tmp_path / "broken")]) == 130
     assert not (tmp_path / "broken").exists()
-    assert main([*words, "--out", str(tmp_path / "broken"), "--resume"]) == 0
+    run(*words, "--out", tmp_path / "broken", "--resume")
     names = {file.name for file in (tmp_path / "whole").iterdir()} - {"manifest.json"}
     assert {"audit.json", "exploits.csv", "options.safetensors", "before-1.gif"} <= names
     for name in names:
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "broken" / name).read_bytes(), name
 
 
-@pytest.fixture(scope="module")
-def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two members, barely trained."""
-    folder = tmp_path_factory.mktemp("member")
-    config = DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,), wrong_key="ends")
-    collect(DOMAIN, config, folder / "d.h5", quiet=True)
-    rule = "0.6"
-    few = TrainEnsembleConfig(steps=10, members=2, workers=1, sub_goals=("open-red-door",), threshold=rule)
-    train_ensemble(folder / "d.h5", few, folder / "ensemble", quiet=True)
-    return folder / "ensemble"
+@pytest.fixture
+def ensemble(tiny_run: Path, tmp_path: Path) -> Path:
+    """Two members, barely trained, of states of another world than usual."""
+    out = shutil.copytree(tiny_run / "ensemble-none", tmp_path / "made" / "ensemble")
+    config = open_artefact(out).config
+    reseal(out, config={**config, "domain_config": config["domain_config"] | {"wrong_key": "ends"}})
+    return out
 
 
 def test_a_member_is_audited_at_its_own_threshold(ensemble: Path, tmp_path: Path) -> None:
@@ -250,19 +241,13 @@ DOOR = "--domain doorkey --sub-goal go-to-goal"
         ("{ensemble} --domain doorkey --sub-goal go-to-goal", "unknown sub-goal: go-to-goal"),
     ],
 )
-def test_mistakes(words: str, told: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec G2: one line that says what to do, exit code 2, nothing written."""
-    assert main(["audit", *words.format(ensemble=ensemble).split(), "--out", str(tmp_path / "audit"), "-q"]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and told in lines[0], lines
-    assert not any(tmp_path.iterdir())
+def test_mistakes(words: str, told: str, ensemble: Path, tmp_path: Path) -> None:
+    """Spec G2: one line that says what to do."""
+    refuses(told, "audit", *words.format(ensemble=ensemble).split(), "--out", tmp_path / "out" / "audit", "-q")
 
 
-def test_a_files_word_is_not_the_users(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_files_word_is_not_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec H8: a classifier that a sweep's file names is loaded only where the user allowed it."""
     monkeypatch.setenv(OF_FILE, "1")
     words = ["--domain", "doorkey", "--sub-goal", "go-to-goal", "--out", str(tmp_path / "audit"), "-q"]
-    assert main(["audit", f"{__name__}:left_end", *words]) == 2
-    assert "a file names code of its own as its classifier" in capsys.readouterr().err
+    refuses("a file names code of its own as its classifier", "audit", f"{__name__}:left_end", *words)

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
+from command_line import refuses, run, settings
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.dataset import digest, open_dataset
 from hypogoal.evaluation.recorded import picture_of
@@ -28,10 +28,10 @@ def audited(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     np.savez(folder / "states.npz", **mixed.arrays())
     words = ["--sub-goal", GOAL, "--out", str(folder / "data.h5"), "-q"]
-    assert main(["import", str(folder / "states.npz"), *words]) == 0
-    few = [word for setting in ("steps=8", "members=2") for word in ("--set", setting)]
-    assert main(["train-ensemble", str(folder / "data.h5"), "--out", str(folder / "ensemble"), "-q", *few]) == 0
-    assert main(["audit", str(folder / "ensemble"), "--out", str(folder / "audit")]) == 0
+    run("import", folder / "states.npz", *words)
+    few = settings("steps=8", "members=2")
+    run("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "-q", *few)
+    run("audit", folder / "ensemble", "--out", folder / "audit")
     return folder
 
 
@@ -52,11 +52,11 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     assert "Content-Security-Policy" in page and "http" not in page.replace("http-equiv", "")
 
 
-def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path) -> None:
     """Each state of the table is a picture; filled in, it is imported as the audit printed, and the audit is whole."""
     audit = tmp_path / "audit"
-    assert main(["audit", str(audited / "ensemble"), "--out", str(audit)]) == 0
-    (printed,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
+    said = run("audit", audited / "ensemble", "--out", audit)
+    (printed,) = [line for line in said.out.splitlines() if line.startswith("next: ")]
     words = shlex.split(printed)[2:]
     table = audit / "next" / GOAL / TO_FILL_IN
     assert words[:4] == ["import", str((audited / "data.h5").resolve()), "--label", f"{GOAL}={table}"]
@@ -73,9 +73,9 @@ def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path, capsy
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    assert main(["verify", str(audit)]) == 0
+    run("verify", audit)
     more = tmp_path / "more.h5"
-    assert main([*words[:5], str(more), "-q"]) == 0
+    run(*words[:5], more, "-q")
     after = open_dataset(more)
     places = [int(row["row"]) for row in rows[:4]]
     labelled = after.labelled(GOAL)
@@ -84,37 +84,35 @@ def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path, capsy
     np.testing.assert_array_equal(after.unlabelled(), np.delete(unlabelled, places))
     np.testing.assert_array_equal(after.heldout(GOAL).observations, before.heldout(GOAL).observations)
     few = ["--set", "steps=2", "--set", "members=2"]
-    assert main(["train-ensemble", str(more), "--out", str(tmp_path / "ensemble"), "-q", *few]) == 0
+    run("train-ensemble", more, "--out", tmp_path / "ensemble", "-q", *few)
 
 
-def test_a_data_file_is_taken_as_it_is(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_data_file_is_taken_as_it_is(audited: Path, tmp_path: Path) -> None:
     """What ``import`` would do to other sources is not silently left out."""
     out, table = tmp_path / "more.h5", audited / "audit/next" / GOAL / TO_FILL_IN
     for words in (["--resize", "32"], ["--every", "2"], ["--domain", "doorkey"], ["--key", "front"], ["--stack"]):
         words = ["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", *words, "--out", str(out)]
-        assert main(words) == 2
-        assert "a data file is taken as it is" in capsys.readouterr().err and not out.exists()
+        refuses("a data file is taken as it is", *words)
+        assert not out.exists()
 
 
-def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path) -> None:
     """Data of two sub-goals can be audited; labelling them is one line, and no command is printed that would fail."""
     arrays = mixed.arrays()
     for name in ("labels", "heldout_labels"):
         arrays[name] = np.stack([arrays[name], ~arrays[name]], axis=1)
     np.savez(tmp_path / "states.npz", **arrays)
-    run = tmp_path / "run"
+    folder = tmp_path / "run"
     goals = ["--sub-goal", "one", "--sub-goal", "two"]
-    assert main(["import", str(tmp_path / "states.npz"), *goals, "--out", str(run / "data.h5"), "-q"]) == 0
+    run("import", tmp_path / "states.npz", *goals, "--out", folder / "data.h5", "-q")
     few = ["--set", "steps=2", "--set", "members=1", "--set", "diversity=none", "--set", "workers=1"]
-    assert main(["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "-q", *few]) == 0
-    capsys.readouterr()
-    for words in (["--sub-goal", "one", "--out", str(run / "of-one")], ["--out", str(run / "audit")]):
-        assert main(["audit", str(run / "ensemble"), *words]) == 0
-        assert "next:" not in capsys.readouterr().out
-    assert {path.name for path in (run / "audit/next").iterdir()} == {"one", "two"}
-    table = run / "audit/next/one" / TO_FILL_IN
-    assert main(["import", str(run / "data.h5"), "--label", f"one={table}", "--out", str(run / "more.h5")]) == 2
-    assert "a table labels data of one sub-goal" in capsys.readouterr().err
+    run("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "-q", *few)
+    for words in (["--sub-goal", "one", "--out", str(folder / "of-one")], ["--out", str(folder / "audit")]):
+        assert "next:" not in run("audit", folder / "ensemble", *words).out
+    assert {path.name for path in (folder / "audit/next").iterdir()} == {"one", "two"}
+    table = folder / "audit/next/one" / TO_FILL_IN
+    command = ["import", folder / "data.h5", "--label", f"one={table}", "--out", folder / "more.h5"]
+    refuses("a table labels data of one sub-goal", *command)
 
 
 def damaged(table: Path, out: Path, **cells: str) -> Path:
@@ -139,17 +137,13 @@ def damaged(table: Path, out: Path, **cells: str) -> Path:
         ({}, "the table has no label yet"),
     ],
 )
-def test_a_table_that_does_not_fit_is_refused(
-    audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], cells: dict[str, str], says: str
-) -> None:
+def test_a_table_that_does_not_fit_is_refused(audited: Path, tmp_path: Path, cells: dict[str, str], says: str) -> None:
     table = damaged(audited / "audit/next" / GOAL / TO_FILL_IN, tmp_path / "labels.csv", **cells)
     out = tmp_path / "more.h5"
-    assert main(["import", str(audited / "data.h5"), "--label", f"{GOAL}={table}", "--out", str(out)]) == 2
-    error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1 and not out.exists()
+    refuses(says, "import", audited / "data.h5", "--label", f"{GOAL}={table}", "--out", out)
 
 
-def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path) -> None:
     """No ensemble, settings, an unknown sub-goal, another artefact; nothing is left behind."""
     ensemble, out = str(audited / "ensemble"), tmp_path / "audit"
     for words, says in [
@@ -160,9 +154,7 @@ def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path, capsy
         ([ensemble, "--domain", "doorkey"], "which sub-goal is the truth?"),
         ([str(audited / "audit")], "but ensemble is needed"),
     ]:
-        assert main(["audit", *words, "--out", str(out)]) == 2
-        error = capsys.readouterr().err
-        assert says in error and error.count("\n") == 1 and not out.exists()
+        refuses(says, "audit", *words, "--out", out)
 
 
 def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:

@@ -5,11 +5,10 @@ import re
 import shutil
 
 import pytest
+from command_line import refuses, run
 from toy_data import fill, reseal
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
-from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.evaluation.compare import labels_of
 from hypogoal.stages.compare import compare
@@ -49,7 +48,7 @@ def runs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def compared(runs):
-    assert main(["compare", str(runs / "slow"), str(runs / "fast"), "--out", str(runs / "both")]) == 0
+    run("compare", runs / "slow", runs / "fast", "--out", runs / "both")
     return json.loads((runs / "both" / "metrics.json").read_text(encoding="utf-8"))
 
 
@@ -100,47 +99,40 @@ def test_methods_side_by_side(runs, tmp_path):
     assert "No two runs share a seed" in text
 
 
-def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
-    """Spec G2: one run, one run twice, none evaluated, another domain, other settings, an older evaluation."""
-    slow, fast = runs / "slow", runs / "fast"
+def of_another_domain(metrics):
+    for artefact in metrics["provenance"]["artefacts"]:
+        artefact["config"]["domain"] = "montezuma"
 
-    def refused(*given):
-        capsys.readouterr()
-        assert main(["compare", *map(str, given), "--out", str(tmp_path / "out")]) == 2
-        (line,) = capsys.readouterr().err.strip().splitlines()
-        assert not (tmp_path / "out").exists()
-        return line
 
-    def changed(name, change):
-        shutil.copytree(fast, tmp_path / name)
-        path = tmp_path / name / "evaluation" / "metrics.json"
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-        change(metrics)
-        path.write_text(json.dumps(metrics), encoding="utf-8")
-        reseal(path.parent, files={**open_artefact(path.parent).manifest["files"], path.name: sha256_of(path)})
-        return tmp_path / name
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (of_another_domain, "different domains (slow: doorkey; other: montezuma)"),
+        (lambda metrics: metrics["settings"].update(window=50), "different window (slow: 100; other: 50)"),
+        (lambda metrics: metrics.update(agents=[]), "no kind of result in common (slow: agents; other: nothing)"),
+        (lambda metrics: metrics.pop("distance"), "does not fit this hypogoal, or is damaged"),
+        (lambda metrics: metrics.pop("format"), "another version of hypogoal evaluated this (format 1, needed: 4)"),
+    ],
+)
+def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, change, words):
+    """Spec G2: another domain, other settings, nothing in common, another version's."""
+    shutil.copytree(runs / "fast", tmp_path / "other")
+    path = tmp_path / "other" / "evaluation" / "metrics.json"
+    metrics = json.loads(path.read_text(encoding="utf-8"))
+    change(metrics)
+    path.write_text(json.dumps(metrics), encoding="utf-8")
+    reseal(path.parent, files={**open_artefact(path.parent).manifest["files"], path.name: sha256_of(path)})
+    refuses(words, "compare", runs / "slow", tmp_path / "other", "--out", tmp_path / "out")
 
-    assert "two or more different runs" in refused(slow)
-    assert "two or more different runs" in refused(slow, fast, runs / "both" / ".." / "slow")
+
+def test_what_cannot_be_compared_is_refused(runs, tmp_path):
+    """Spec G2: one run, one run twice, one that was not evaluated, into one of them."""
+    slow, fast, out = runs / "slow", runs / "fast", tmp_path / "out"
     (tmp_path / "empty").mkdir()
-    assert "was not evaluated" in refused(slow, tmp_path / "empty")
-
-    def elsewhere(metrics):
-        for artefact in metrics["provenance"]["artefacts"]:
-            artefact["config"]["domain"] = "montezuma"
-
-    line = refused(slow, changed("elsewhere", elsewhere))
-    assert "different domains (slow: doorkey; elsewhere: montezuma)" in line
-    line = refused(slow, changed("otherwise", lambda metrics: metrics["settings"].update(window=50)))
-    assert "different window (slow: 100; otherwise: 50)" in line
-    line = refused(slow, changed("bare", lambda metrics: metrics.update(agents=[])))
-    assert "no kind of result in common (slow: agents; bare: nothing)" in line
-    old = changed("old", lambda metrics: metrics.pop("distance"))
-    assert "does not fit this hypogoal, or is damaged" in refused(slow, old)
-    old = changed("older", lambda metrics: metrics.pop("format"))
-    assert "another version of hypogoal evaluated this (format 1, needed: 4)" in refused(slow, old)
-    with pytest.raises(UserError, match="would replace an input"):
-        compare([slow, fast], fast)
+    refuses("two or more different runs", "compare", slow, "--out", out)
+    refuses("two or more different runs", "compare", slow, fast, runs / "both" / ".." / "slow", "--out", out)
+    refuses("was not evaluated", "compare", slow, tmp_path / "empty", "--out", out)
+    refuses("would replace an input", "compare", slow, fast, "--out", fast)
 
 
 def test_labels_tell_runs_apart():

@@ -254,21 +254,10 @@ def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypat
         assert "metrics.json" in said.err and "evaluation" in said.out and "balanced" not in said.out.lower()
 
 
-def test_numbers_of_a_stranger_are_shown_as_they_are(capsys):
-    """Spec G2: a terminal obeys nothing that stands in an evaluation, and one of another shape is told."""
-    row = {"name": "[red]x[/blue]\x1b[31m", "sub_goal": "y"}
-    row |= {which: {"mean": 0.5} for which in ("best", "mean", "worst", "disagreement_heldout")}
-    numbers = {
-        "rooms": [],
-        "hypotheses": [row],
-        "distance": {"options": []},
-        "agents": [],
-        "missing": [],
-        "choosing": [],
-    }
-    draw(summary_of(numbers, "here"), 80)
-    text = capsys.readouterr().out
-    assert "[red]x[/blue]?" in text and "\x1b" not in text
+def test_numbers_of_another_shape_are_told(capsys):
+    """Spec G2: a table of a stranger's evaluation is drawn whatever stands in it, or is damaged in one line."""
+    row = {"sub_goal": "y"} | {which: {"mean": 0.5} for which in ("best", "mean", "worst", "disagreement_heldout")}
+    numbers = {"rooms": [], "distance": {"options": []}, "agents": [], "missing": [], "choosing": []}
     with pytest.raises(UserError, match="the evaluation is damaged: here"):
         summary_of(numbers | {"hypotheses": [{"name": 3}]}, "here")
     for name in (3, None, True, ["x"], 1e308):
@@ -421,6 +410,13 @@ def test_arrays_say_what_the_report_draws(tiny_run, metrics):
         assert some.shape == (64, 64, 3)
         counts = arrays["termination-states/meta/counts"][()]
         assert [str(option) for option in np.flatnonzero(counts)] == sorted(arrays["terminations/meta"], key=int)
+
+
+def test_damaged_states_where_options_stop_are_one_line(tiny_copy):
+    """Spec G2: the file is named, and no half-written evaluation is left."""
+    path = tiny_copy / "meta" / "terminations.h5"
+    path.write_bytes(path.read_bytes()[:-40])
+    refuses("terminations.h5", "evaluate", tiny_copy, "--out", tiny_copy / "again", "-q")
 
 
 def test_nothing_to_evaluate_is_one_line(tmp_path):

@@ -12,23 +12,12 @@ from far_device import FAR, far_device
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.stages import train_baseline, train_ensemble, train_meta, train_options
-from hypogoal.stages.collect import collect
 
 QUIET = {"quiet": True, "seed": 3}
 SHORT: dict[str, Any] = {
     "steps": 192, "max_episode_steps": 30, "option_timeout": 7, "random_episodes": 1, "warm_up": 32, "replay": 200,
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """Data, and an ensemble that was made on the CPU."""
-    made = tmp_path_factory.mktemp("made")
-    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,)), made / "data.h5", **QUIET)
-    ensemble(made / "data.h5", made / "ensemble")
-    return made
 
 
 def ensemble(data: Path, out: Path) -> None:
@@ -63,13 +52,13 @@ CASES: dict[str, tuple[Any, Callable[[Path, Path], None]]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_same_files(case: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_files(case: str, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G5: whole artefacts with the same tensors; learners' bytes are compared elsewhere."""
     module, train = CASES[case]
-    train(made, tmp_path / "cpu")
+    train(tiny_run, tmp_path / "cpu")
     with far_device(monkeypatch):
         monkeypatch.setattr(module, "prepare", lambda device="auto": FAR)
-        train(made, tmp_path / "far")
+        train(tiny_run, tmp_path / "far")
     near, far = (open_artefact(tmp_path / name).whole() for name in ("cpu", "far"))
     assert near.manifest["files"].keys() == far.manifest["files"].keys()
     for name in near.manifest["files"]:
@@ -83,20 +72,20 @@ def test_the_same_files(case: str, made: Path, tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_no_gpu_is_one_line(made: Path, tmp_path: Path) -> None:
+def test_no_gpu_is_one_line(tiny_run: Path, tmp_path: Path) -> None:
     """Spec G2, G5: and nothing is written."""
     with pytest.raises(UserError, match="torch finds no GPU"):
-        options(made, tmp_path / "cuda")
+        options(tiny_run, tmp_path / "cuda")
     assert not (tmp_path / "cuda").exists()
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("case", CASES)
-def test_on_a_gpu(case: str, made: Path, tmp_path: Path) -> None:
+def test_on_a_gpu(case: str, tiny_run: Path, tmp_path: Path) -> None:
     """Spec G5, G8: the real thing, where there is one."""
     if not torch.cuda.is_available():
         pytest.skip("no GPU")
-    CASES[case][1](made, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
-    CASES[case][1](made, tmp_path / "cpu")
+    CASES[case][1](tiny_run, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
+    CASES[case][1](tiny_run, tmp_path / "cpu")
     near, far = (open_artefact(path).whole() for path in sorted(tmp_path.iterdir()))
     assert near.manifest["files"].keys() == far.manifest["files"].keys()

@@ -9,10 +9,10 @@ import corridor_env
 import gymnasium
 import numpy as np
 import pytest
+from command_line import refuses, run
 from corridor_env import SUB_GOALS as SUB_GOALS_OF_CORRIDOR
 from corridor_env import CorridorEnv
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.domains.doorkey_env import SUB_GOALS
@@ -33,27 +33,27 @@ def walked(layout_seed: int, steps: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def own_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An ensemble of states that were labelled elsewhere, for DoorKey."""
-    run = tmp_path_factory.mktemp("runs") / "own"
-    run.mkdir()
+    own_run = tmp_path_factory.mktemp("runs") / "own"
+    own_run.mkdir()
     labels = np.arange(40) % 2
     np.savez(
-        run / "own.npz", observations=walked(0, 40), labels=labels, unlabelled=walked(1, 40),
+        own_run / "own.npz", observations=walked(0, 40), labels=labels, unlabelled=walked(1, 40),
         heldout_observations=walked(5, 40), heldout_labels=labels,
     )  # fmt: skip
     given = ["--sub-goal", "at-the-door", "--domain", "doorkey", "-q"]
-    assert main(["import", str(run / "own.npz"), "--out", str(run / "data.h5"), *given]) == 0
+    run("import", own_run / "own.npz", "--out", own_run / "data.h5", *given)
     few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
-    assert main(["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), *few]) == 0
-    return run
+    run("train-ensemble", own_run / "data.h5", "--out", own_run / "ensemble", *few)
+    return own_run
 
 
-def test_an_agent_of_own_labels_is_evaluated(run: Path) -> None:
+def test_an_agent_of_own_labels_is_evaluated(own_run: Path) -> None:
     """Spec A5, F6: everything but the match, of which nobody knows; that is said."""
-    assert main(["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), *FEW]) == 0
-    assert main(["evaluate", str(run), "-q"]) == 0
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    run("train-meta", own_run / "ensemble", "--out", own_run / "meta", *FEW)
+    run("evaluate", own_run, "-q")
+    metrics = json.loads((own_run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     (goal,) = metrics["selection"][0]["runs"][0]["sub_goals"]
     assert goal["sub_goal"] == "at-the-door" and [member["match"] for member in goal["members"]] == [None, None]
     assert sum(member["chosen"] for member in goal["members"]) > 0
@@ -62,13 +62,13 @@ def test_an_agent_of_own_labels_is_evaluated(run: Path) -> None:
     assert line.endswith(
         "and go-to-goal; import them under one of these names, if it is one of them, then evaluate again"
     )
-    assert not (run / "meta" / "exploits.csv").exists() and metrics["exploits"]["over_runs"] == []
-    assert main(["report", str(run)]) == 0
-    assert "no truth of at-the-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    assert not (own_run / "meta" / "exploits.csv").exists() and metrics["exploits"]["over_runs"] == []
+    run("report", own_run)
+    assert "no truth of at-the-door" in (own_run / "report" / "index.html").read_text(encoding="utf-8")
 
 
 def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Spec A5, F6: of a domain of one's own, the place where the sub-goal's function belongs; added, it is matched."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
@@ -85,13 +85,11 @@ def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
     np.savez(tmp_path / "own.npz", observations=shown, labels=labels, unlabelled=shown)
     data, made = tmp_path / "data.h5", tmp_path / "made"
     given = ["--sub-goal", "near-the-end", "--domain", "corridor_env:DOMAIN", "-q"]
-    assert main(["import", str(tmp_path / "own.npz"), "--out", str(data), *given]) == 0
+    run("import", tmp_path / "own.npz", "--out", data, *given)
     few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
-    assert main(["train-ensemble", str(data), "--out", str(tmp_path / "ensemble"), *few]) == 0
-    assert main(["train-options", str(tmp_path / "ensemble"), "--out", str(made / "options"), *FEW]) == 0
-    capsys.readouterr()
-    assert main(["evaluate", str(made)]) == 0
-    shown_text = " ".join(capsys.readouterr().out.split())
+    run("train-ensemble", data, "--out", tmp_path / "ensemble", *few)
+    run("train-options", tmp_path / "ensemble", "--out", made / "options", *FEW)
+    shown_text = " ".join(run("evaluate", made).out.split())
     assert "What options did while they learned" in shown_text and "near-the-end" in shown_text
     metrics = json.loads((made / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     assert metrics["missing"][1:] == [
@@ -102,32 +100,28 @@ def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
     members = metrics["selection"][0]["runs"][0]["sub_goals"][0]["members"]
     row = practised("near-the-end", members)
     assert row["chosen"] == sum(member["chosen"] for member in members) > 0 and 1 <= row["duration"] <= 10
-    assert main(["report", str(made)]) == 0
+    run("report", made)
     page = (made / "report" / "index.html").read_text(encoding="utf-8")
     assert "andom choice while options learn" in page and "Whether hypotheses mattered is unknown" in page
     known = GymnasiumDomain(CorridorEnv, {**SUB_GOALS_OF_CORRIDOR, "near-the-end": lambda env: env.unwrapped.cell == 4})
     monkeypatch.setattr(corridor_env, "DOMAIN", known)
-    assert main(["evaluate", str(made), "--force", "-q"]) == 0
+    run("evaluate", made, "--force", "-q")
     assert json.loads((made / "evaluation" / "metrics.json").read_text())["missing"] == ["no ensemble"]
 
 
-def test_true_sub_goals_that_the_domain_does_not_have_are_refused(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_true_sub_goals_that_the_domain_does_not_have_are_refused(own_run: Path) -> None:
     """Spec E6, G2: options that end at other sub-goals under this one's name would be a wrong control."""
-    out = ["--out", str(run / "oracle"), "--set", "termination=oracle", *FEW]
+    out = ["--out", str(own_run / "oracle"), "--set", "termination=oracle", *FEW]
     for stage in ("train-options", "train-meta"):
-        assert main([stage, str(run / "ensemble"), *out]) == 2
-        err = capsys.readouterr().err
-        assert "doorkey does not know where this sub-goal holds: at-the-door" in err and err.count("\n") == 1
-        assert not (run / "oracle").exists()
+        refuses("doorkey does not know where this sub-goal holds: at-the-door", stage, own_run / "ensemble", *out)
+        assert not (own_run / "oracle").exists()
 
 
-def test_oracles_of_some_sub_goals_are_of_those(run: Path) -> None:
+def test_oracles_of_some_sub_goals_are_of_those(own_run: Path) -> None:
     """Spec E6: one option for each of the ensemble's sub-goals, in its order, and no other."""
-    about = {**open_artefact(run / "ensemble").config, "sub_goals": ["go-to-goal", "collect-red-key"]}
+    about = {**open_artefact(own_run / "ensemble").config, "sub_goals": ["go-to-goal", "collect-red-key"]}
     config = TrainOptionsConfig(termination="oracle")
-    loop = assemble(DOMAIN, run / "ensemble", about, config, seed=0)
+    loop = assemble(DOMAIN, own_run / "ensemble", about, config, seed=0)
     ids = loop.engine.reachable()
     assert ids is not None and loop.terminations.options == 2
     columns = [SUB_GOALS.index("go-to-goal"), SUB_GOALS.index("collect-red-key")]

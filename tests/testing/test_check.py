@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from command_line import fails, refuses, run, settings
 from corridor import Corridor
 from corridor_env import ALWAYS, NEVER, SUB_GOALS, CorridorEnv, all_labels, at_left, swift
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
@@ -290,7 +291,7 @@ BAD = [
 @pytest.mark.parametrize(("name", "method"), BAD)
 @pytest.mark.parametrize("around", [lambda env: env, Wrapped, gymnasium.wrappers.OrderEnforcing])
 def test_a_wrapper_that_breaks_the_contract_is_named(
-    name: str, method: Any, around: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    name: str, method: Any, around: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Spec B6, G2: by its own file and line, wherever it is met."""
     bad = wrapper(**{name: method})
@@ -300,14 +301,9 @@ def test_a_wrapper_that_breaks_the_contract_is_named(
     assert here in fault.text and fault.text.count("test_check.py") == 1, fault.text
     assert fault.name == "gymnasium" or method is _gives_text
     monkeypatch.setitem(bases.REGISTERED, "bad", domain)
-    few = [word for pair in ("steps=200", "heldout_seeds=4") for word in ("--set", pair)]
-    assert main(["collect", "bad", "--out", str(tmp_path / "data.h5"), *few, "-q"]) == 2
-    err = capsys.readouterr().err
-    assert here in err and err.count("\n") == 1, err
-    assert main(["train-baseline", "bad", "--out", str(tmp_path / "ppo"), "--set", "steps=256", "-q"]) == 2
-    err = capsys.readouterr().err
-    assert here in err and err.count("\n") == 1, err
-    assert not [*tmp_path.glob("*")]
+    few = settings("steps=200", "heldout_seeds=4")
+    refuses(here, "collect", "bad", "--out", tmp_path / "data.h5", *few, "-q")
+    refuses(here, "train-baseline", "bad", "--out", tmp_path / "ppo", "--set", "steps=256", "-q")
 
 
 @pytest.mark.parametrize("family", [*FAMILIES])
@@ -441,26 +437,20 @@ def test_networks_are_told_how_they_are_explained(name: str, method: str, monkey
     assert verdicts["explained"].text == f"by {method}"
 
 
-def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B6: exit code 0 where all are kept, 2 where one is not; what the user named needs no permission."""
     monkeypatch.chdir(TESTS)
-    small = [word for pair in ("steps=150", "heldout_seeds=4,5") for word in ("--set", pair)]
-    assert main(["check", "corridor_env:DOMAIN", *small]) == 0
-    told = capsys.readouterr().out.splitlines()
+    small = settings("steps=150", "heldout_seeds=4,5")
+    told = run("check", "corridor_env:DOMAIN", *small).out.splitlines()
     assert all(line.startswith("ok   ") for line in told if "unbalanced" not in line) and len(told) == 15
-    assert main(["check", "corridor_env:RESTLESS", *small]) == 2
-    told = capsys.readouterr().out.splitlines()
+    told = fails("check", "corridor_env:RESTLESS", *small).out.splitlines()
     assert told[-1].startswith("FAIL determinism") and "np_random" in told[-1]
-    assert main(["check", "corridor_env:SENSED", *small, "--network", "mlp"]) == 0
-    told = capsys.readouterr().out
+    told = run("check", "corridor_env:SENSED", *small, "--network", "mlp").out
     assert "ok   images: float32 (11,)" in told and "FAIL" not in told and told.count("ok   builds") == 1
-    assert main(["check", "corridor_env:SENSED", *small, "--network", "doorkey"]) == 2
-    told = capsys.readouterr().out
+    told = fails("check", "corridor_env:SENSED", *small, "--network", "doorkey").out
     assert "'doorkey' does not take these observations: observation shape (11,). Give --set network=mlp" in told
-    assert main(["check", "corridor_env:WORDY"]) == 2
-    assert "observations must be images" in capsys.readouterr().err
-    assert main(["check"]) == 2
-    assert "nothing to check" in capsys.readouterr().err
+    assert "observations must be images" in fails("check", "corridor_env:WORDY").err
+    refuses("nothing to check", "check")
 
 
 def test_own_objectives_and_networks_train(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -471,26 +461,25 @@ def test_own_objectives_and_networks_train(tmp_path: Path, monkeypatch: pytest.M
     from hypogoal import load_ensemble
 
     monkeypatch.chdir(TESTS.parent / "examples")
-    assert main(["check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide"]) == 0
+    run("check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide")
     data, out = tmp_path / "data.h5", tmp_path / "ensemble"
     monkeypatch.syspath_prepend(str(TESTS))
-    assert main(["collect", "corridor_env:DOMAIN", "--out", str(data), "--set", "steps=150", "-q"]) == 0
+    run("collect", "corridor_env:DOMAIN", "--out", data, "--set", "steps=150", "-q")
     train = ["train-ensemble", str(data), "--out", str(out), "--diversity", "margin:pair_loss", "-q"]
-    few = [word for pair in ("steps=20", "members=2", "workers=1") for word in ("--set", pair)]
+    few = settings("steps=20", "members=2", "workers=1")
     monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
-    assert main([*train, *few, "--set", "network=wide_network:wide"]) == 0
+    run(*train, *few, "--set", "network=wide_network:wide")
     with pytest.raises(UserError, match=r"names code of its own as its network.*HYPOGOAL_TRUST=wide_network:wide"):
         load_ensemble(out, "left-end")
     monkeypatch.setenv("HYPOGOAL_TRUST", "wide_network:wide")
     assert load_ensemble(out, "left-end").predict(np.zeros((1, 48, 48, 3), np.uint8)).shape == (1, 2)
 
 
-def test_a_preset_cannot_name_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_preset_cannot_name_code(tmp_path: Path) -> None:
     """Spec G2: a preset may be a stranger's file; what it names is not loaded unless it is allowed."""
     from toy_data import write
 
     preset = tmp_path / "theirs.toml"
     preset.write_text('[train-ensemble]\ndiversity = "evil:pair_loss"\n')
     given = ["train-ensemble", str(write(tmp_path / "data.h5")), "--out", str(tmp_path / "out")]
-    assert main([*given, "--preset", str(preset)]) == 2
-    assert "a file names code of its own as its diversity objective: evil:pair_loss" in capsys.readouterr().err
+    refuses("a file names code of its own as its diversity objective: evil:pair_loss", *given, "--preset", preset)
