@@ -1,14 +1,14 @@
 """Spec G1: ensembles trained with a break are those trained without, whatever is trained and changed on the way."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from breaking import Breaking, Broken
 from test_training import toy
 
-from hypogoal.core.checkpoints import Checkpoints, State, checkpoints_of
+from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
 from hypogoal.hypotheses.training import Watcher, fit
@@ -21,25 +21,6 @@ OWN = EnsembleConfig(members=2, steps=12, batch_size=16, diversity_weight=1e-2, 
 def dropping(channels: int) -> tuple[list[torch.nn.Module], tuple[int, ...]]:
     """A network with a layer that draws random numbers itself."""
     return [torch.nn.Conv2d(channels, 4, 5, stride=4), torch.nn.ReLU(), torch.nn.Dropout()], (8,)
-
-
-class Broken(Exception):
-    """The end of a process."""
-
-
-class Breaking(Checkpoints):
-    """Saves after the step before the last and breaks off after the last."""
-
-    def __init__(self, path: Path, last: int):
-        super().__init__(path)
-        self.last, self.steps = last, 0
-
-    def offer(self, state: Callable[[], State]) -> None:
-        self.steps += 1
-        if self.steps == self.last - 1:
-            self.save(state())
-        if self.steps == self.last:
-            raise Broken
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from breaking import Breaking, Broken
 from numpy.typing import NDArray
-from test_broken_training import Breaking, Broken
 from test_training import TOY, follows, toy
 
 from hypogoal.core.checkpoints import Checkpoints

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from breaking import Breaking, Broken
 from corridor import Corridor
 from loops import CASES, loop_of
 
@@ -18,25 +19,6 @@ from hypogoal.meta import training
 from hypogoal.options.loop import OptionLoop
 
 STEPS, BREAKS = 300, (23, 51, 80)  # environment steps, and the steps of the loop after which it breaks
-
-
-class Broken(Exception):
-    """The end of a process."""
-
-
-class Breaking(Checkpoints):
-    """Saves after each of ``saves`` steps and breaks off five steps after the last of them."""
-
-    def __init__(self, path: Path, last: int):
-        super().__init__(path)
-        self.last, self.steps = last, 0
-
-    def offer(self, state: Callable[[], State]) -> None:
-        self.steps += 1
-        if self.steps in (self.last // 2, self.last):
-            self.save(state())
-        if self.steps == self.last + 5:
-            raise Broken
 
 
 def run(case: str, folder: Path, checkpoints: Checkpoints, until: float = 0.0) -> OptionLoop:
@@ -57,7 +39,7 @@ def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.Mo
     unbroken = run(case, tmp_path / "unbroken", Checkpoints(None))
     path = tmp_path / "broken" / "checkpoint.safetensors"
     for last in BREAKS:
-        before = Breaking(path, last)
+        before = Breaking(path, last + 5, saves=(last // 2, last))
         before.steps = 0 if last == BREAKS[0] else BREAKS[BREAKS.index(last) - 1]
         with pytest.raises(Broken):
             run(case, tmp_path / "broken", before)
@@ -90,7 +72,7 @@ def test_training_that_succeeds_ends_whatever_breaks_it(
     run(case, folders[0], Checkpoints(None), until)
     path = folders[1] / "checkpoint.safetensors"
     with pytest.raises(Broken):
-        run(case, folders[1], Breaking(path, 23), until)
+        run(case, folders[1], Breaking(path, 28, saves=(11, 23)), until)
     loop = run(case, folders[1], Checkpoints(path), until)
     one, other = ((folder / "metrics.jsonl").read_bytes() for folder in folders)
     assert one == other
@@ -133,7 +115,7 @@ def test_a_checkpoint_of_something_else_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     case = "DoorKey, many layouts, random"
     with pytest.raises(Broken):
-        run(case, tmp_path, Breaking(path, 23))
+        run(case, tmp_path, Breaking(path, 28, saves=(11, 23)))
     saved = Checkpoints(path).load() or {}
     for name in ("logged", "log", "loop"):
         odd = {key: value for key, value in saved.items() if key != name}
@@ -155,6 +137,6 @@ class Plain(Corridor):
 def test_an_engine_without_snapshots_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B6, G1: own domains need none; what is played there saves no checkpoint."""
     monkeypatch.setitem(CASES, "plain", (Plain, "light", {}, "random"))
-    checkpoints = Breaking(tmp_path / "checkpoint.safetensors", 1)
+    checkpoints = Breaking(tmp_path / "checkpoint.safetensors", 6, saves=(1,))
     assert run("plain", tmp_path, checkpoints).recorder.steps == STEPS
     assert not checkpoints.saved and checkpoints.steps == 0

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from breaking import Breaking, Broken
+from command_line import refuses, run, settings
 from stable_baselines3 import DQN, PPO
 
 import hypogoal
 from hypogoal.cli import main
-from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import mixed_type, open_dataset, packed, type_of, type_text
 from hypogoal.domains.gymnasium_engine import reader_of
@@ -27,49 +28,49 @@ from hypogoal.hypotheses.views import full_view
 from tests.own_data.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
 
 GOAL = "door-open"
-FEW = [word for pair in ("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3") for word in ("--set", pair)]
+FEW = settings("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with ``data.h5`` and ``ensemble``."""
-    run = tmp_path_factory.mktemp("mixed") / "run"
-    np.savez(run.with_suffix(".npz"), **arrays())
-    data = str(run / "data.h5")
-    assert main(["import", str(run.with_suffix(".npz")), "--out", data, "--sub-goal", GOAL, "-q"]) == 0
-    assert main(["train-ensemble", data, "--out", str(run / "ensemble"), "-q", *FEW]) == 0
-    return run
+    made = tmp_path_factory.mktemp("mixed") / "run"
+    np.savez(made.with_suffix(".npz"), **arrays())
+    data = str(made / "data.h5")
+    run("import", made.with_suffix(".npz"), "--out", data, "--sub-goal", GOAL, "-q")
+    run("train-ensemble", data, "--out", made / "ensemble", "-q", *FEW)
+    return made
 
 
-def test_a_file_keeps_each_key(run: Path) -> None:
+def test_a_file_keeps_each_key(made: Path) -> None:
     """Spec A8, H6: as a compound that h5py reads without hypogoal, one field a key."""
     wanted = arrays()
-    with h5py.File(run / "data.h5") as file:
+    with h5py.File(made / "data.h5") as file:
         seen = file[f"labelled/{GOAL}/observations"]
         for key in ("front", "wrist", "state"):
             np.testing.assert_array_equal(seen[key], wanted[f"observations/{key}"])
-    data = open_dataset(run / "data.h5")
+    data = open_dataset(made / "data.h5")
     assert type_of(type_text(data.observation_dtype)) == data.observation_dtype
     assert data.observation_bytes == np.prod(FRONT) + np.prod(WRIST) + 16
     assert data.features() == ["front", "state[0]", "state[1]", "state[2]", "state[3]", "wrist"]
-    assert main(["verify", str(run)]) == 0
+    run("verify", made)
 
 
-def test_arrays_come_out_as_they_went_in(run: Path, tmp_path: Path) -> None:
-    assert main(["export", str(run / "data.h5"), "--out", str(tmp_path / "again.npz")]) == 0
+def test_arrays_come_out_as_they_went_in(made: Path, tmp_path: Path) -> None:
+    run("export", made / "data.h5", "--out", tmp_path / "again.npz")
     with np.load(tmp_path / "again.npz") as again:
         for name, values in arrays().items():
             np.testing.assert_array_equal(again[name].reshape(values.shape), values)
 
 
-def test_each_key_has_its_encoder(run: Path) -> None:
+def test_each_key_has_its_encoder(made: Path) -> None:
     """Spec C5, H6: pictures the picture network, numbers the mlp; a name for one key, or for all pictures."""
-    dtype = open_dataset(run / "data.h5").observation_dtype
+    dtype = open_dataset(made / "data.h5").observation_dtype
     assert network_for("auto", dtype) == "front=doorkey,state=mlp,wrist=doorkey"
     assert network_for("tiles,wrist=montezuma", dtype) == "front=tiles,state=mlp,wrist=montezuma"
     with pytest.raises(UserError, match="no such key in the observations: arm"):
         network_for("arm=tiles", dtype)
-    ensemble = hypogoal.load_ensemble(run / "ensemble", GOAL)
+    ensemble = hypogoal.load_ensemble(made / "ensemble", GOAL)
     assert ensemble.network == "front=doorkey,state=mlp,wrist=doorkey"
     seen, labels = states(30, 5)
     assert ((ensemble.predictions(seen) == labels[:, None]).mean(0) > 0.9).all()
@@ -96,9 +97,9 @@ def test_a_network_sees_what_the_keys_hold() -> None:
     np.testing.assert_array_equal(view.see(mixed)["front"], seen["front"])
 
 
-def test_a_joint_network_uses_every_key(run: Path) -> None:
+def test_a_joint_network_uses_every_key(made: Path) -> None:
     """A change in any key changes the logits."""
-    dtype = open_dataset(run / "data.h5").observation_dtype
+    dtype = open_dataset(made / "data.h5").observation_dtype
     network = build_network("auto", (), torch.Generator().manual_seed(0), dtype=dtype).eval()
     mixed = packed(states(4)[0])
     with torch.no_grad():
@@ -107,23 +108,6 @@ def test_a_joint_network_uses_every_key(run: Path) -> None:
             other = mixed.copy()
             other[key] = other[key][::-1]
             assert not torch.allclose(network(as_input(as_tensor(other), dtype)), before, atol=1e-7)
-
-
-class Broken(Exception):
-    """The training stops here."""
-
-
-class Breaking(Checkpoints):
-    """Checkpoints after the third step, and a break after the fifth."""
-
-    steps = 0
-
-    def offer(self, state: Callable[[], State]) -> None:
-        self.steps += 1
-        if self.steps == 3:
-            self.save(state())
-        if self.steps == 5:
-            raise Broken
 
 
 def test_a_break_leaves_no_trace(tmp_path: Path) -> None:
@@ -136,15 +120,15 @@ def test_a_break_leaves_no_trace(tmp_path: Path) -> None:
 
     unbroken = trained(None)
     with pytest.raises(Broken):
-        trained(Breaking(tmp_path / "e.safetensors"))
+        trained(Breaking(tmp_path / "e.safetensors", 5, saves=(3,)))
     resumed = trained(Checkpoints(tmp_path / "e.safetensors"))
     assert resumed.keys() == unbroken.keys() and {"view.mean", "view.deviation"} <= resumed.keys()
     assert all(torch.equal(resumed[name], value) for name, value in unbroken.items())
 
 
-def test_attributions_are_by_key_and_complete(run: Path) -> None:
+def test_attributions_are_by_key_and_complete(made: Path) -> None:
     """Spec F2: a field for each key; over all keys they add up to the difference in log-odds."""
-    ensemble = hypogoal.load_ensemble(run / "ensemble", GOAL)
+    ensemble = hypogoal.load_ensemble(made / "ensemble", GOAL)
     seen, others = states(4)[0], states(6, 1)[0]
     values = ensemble.attributions(packed(seen), packed(others))
     assert values["front"].shape == (4, 2, *FRONT) and values["state"].shape == (4, 2, *STATE)
@@ -155,29 +139,29 @@ def test_attributions_are_by_key_and_complete(run: Path) -> None:
     assert patch > np.abs(values["wrist"][1]).sum(), "the wrist camera shows nothing"
 
 
-def test_evaluation_and_report(run: Path) -> None:
+def test_evaluation_and_report(made: Path) -> None:
     """Spec A5, F1, F2: scores, bars of numbers and a map for each camera."""
-    assert main(["evaluate", str(run), "-q"]) == 0
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    run("evaluate", made, "-q")
+    metrics = json.loads((made / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     assert metrics["hypotheses"][0]["worst"]["mean"] > 0.9
-    assert main(["report", str(run), "-q"]) == 0
-    page = (run / "report" / "index.html").read_text(encoding="utf-8")
+    run("report", made, "-q")
+    page = (made / "report" / "index.html").read_text(encoding="utf-8")
     assert f"What members go by: {GOAL}" in page and f"Where members look: {GOAL}" in page
 
 
-def test_the_environments_dictionary_is_read_in_any_order(run: Path) -> None:
+def test_the_environments_dictionary_is_read_in_any_order(made: Path) -> None:
     """Spec B6, H6: keys are sorted, as in the file."""
     env = DoorEnv()
     reader, observation = reader_of(env), env.reset(seed=0)[0]
-    assert reader.dtype == open_dataset(run / "data.h5").observation_dtype
+    assert reader.dtype == open_dataset(made / "data.h5").observation_dtype
     for key in observation:
         np.testing.assert_array_equal(reader.read(env, observation)[key], observation[key])
 
 
 @pytest.mark.parametrize("agent", [PPO, DQN])
-def test_an_agent_learns_from_cameras_and_numbers(run: Path, agent: type[PPO] | type[DQN]) -> None:
+def test_an_agent_learns_from_cameras_and_numbers(made: Path, agent: type[PPO] | type[DQN]) -> None:
     """Spec D1, I6: stable-baselines3's MultiInputPolicy, rewarded by the members alone, opens the door."""
-    reward = hypogoal.SubgoalReward(run / "ensemble", by="any")
+    reward = hypogoal.SubgoalReward(made / "ensemble", by="any")
     env = reward.wrap(DoorEnv(), ends=False)
     short = (
         {"n_steps": 64} if agent is PPO else {"learning_starts": 50, "buffer_size": 500, "exploration_fraction": 0.5}
@@ -192,7 +176,7 @@ def test_an_agent_learns_from_cameras_and_numbers(run: Path, agent: type[PPO] | 
     assert earned >= 7
 
 
-def test_options_say_that_they_cannot(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_say_that_they_cannot(made: Path, tmp_path: Path) -> None:
     """Spec G2: agents see one kind; the line says what does learn from both."""
     (tmp_path / "doors.py").write_text(
         "from hypogoal import GymnasiumDomain\nfrom tests.own_data.mixed import DoorEnv\n"
@@ -201,14 +185,13 @@ def test_options_say_that_they_cannot(run: Path, tmp_path: Path, capsys: pytest.
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
         patch.setenv("HYPOGOAL_TRUST", "doors:DOMAIN")
-        few = [word for pair in ("steps=40", "heldout_seeds=4", "unlabelled_seeds=1") for word in ("--set", pair)]
-        assert main(["check", "doors:DOMAIN", *few]) == 0
-        assert main(["collect", "doors:DOMAIN", "--out", str(tmp_path / "d.h5"), "-q", *few]) == 0
+        few = settings("steps=40", "heldout_seeds=4", "unlabelled_seeds=1")
+        run("check", "doors:DOMAIN", *few)
+        run("collect", "doors:DOMAIN", "--out", tmp_path / "d.h5", "-q", *few)
         train = ["train-ensemble", str(tmp_path / "d.h5"), "--out", str(tmp_path / "e"), "-q", *FEW]
-        assert main([*train, "--set", "steps=2"]) == 0
-        capsys.readouterr()
-        assert main(["train-options", str(tmp_path / "e"), "--out", str(tmp_path / "o"), "-q"]) == 2
-        assert "agents see pictures or numbers, not both: front, state, wrist. Reward" in capsys.readouterr().err
+        run(*train, "--set", "steps=2")
+        command = ["train-options", tmp_path / "e", "--out", tmp_path / "o", "-q"]
+        refuses("agents see pictures or numbers, not both: front, state, wrist. Reward", *command)
     assert not (tmp_path / "o").exists()
 
 
@@ -223,14 +206,10 @@ def test_options_say_that_they_cannot(run: Path, tmp_path: Path, capsys: pytest.
         ({"labels/front": np.zeros(40)}, "unknown array 'labels/front'"),
     ],
 )
-def test_what_does_not_fit_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, np.ndarray], words: str
-) -> None:
+def test_what_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, np.ndarray], words: str) -> None:
     """Spec G2: and nothing is written."""
     np.savez(tmp_path / "odd.npz", **(arrays() | changes))
-    assert main(["import", str(tmp_path / "odd.npz"), "--out", str(tmp_path / "data.h5")]) == 2
-    line = capsys.readouterr().err
-    assert words in line and line.count("\n") == 1
+    refuses(words, "import", tmp_path / "odd.npz", "--out", tmp_path / "data.h5")
     assert [file.name for file in tmp_path.iterdir()] == ["odd.npz"]
 
 
@@ -243,7 +222,7 @@ def test_cameras_are_resized_each(tmp_path: Path) -> None:
         (["--resize", "wrist=22"], FRONT, (22, 22, 3)),
     ):
         data = tmp_path / "data.h5"
-        assert main(["import", str(tmp_path / "own.npz"), "--out", str(data), "--force", "-q", *words]) == 0
+        run("import", tmp_path / "own.npz", "--out", data, "--force", "-q", *words)
         dtype = open_dataset(data).observation_dtype
         assert (dtype["front"].shape, dtype["wrist"].shape, dtype["state"].shape) == (front, wrist, STATE)
 
@@ -275,24 +254,22 @@ print(sorted(name for name in ("numpy", "gymnasium", "h5py", "stable_baselines3"
 """
 
 
-def test_a_folder_for_a_hub_loads_without_hypogoal(run: Path, tmp_path: Path) -> None:
+def test_a_folder_for_a_hub_loads_without_hypogoal(made: Path, tmp_path: Path) -> None:
     """Spec I6: in a process that has torch and safetensors; the same probabilities."""
     hub = tmp_path / "hub"
-    assert main(["export", str(run / "ensemble"), "--out", str(hub)]) == 0
+    run("export", made / "ensemble", "--out", hub)
     assert {file.name for file in hub.iterdir()} == {"README.md", "config.json", f"{GOAL}.safetensors", "load.py"}
     seen, _ = states(6, 7)
     np.savez(tmp_path / "seen.npz", **seen)
     words = [sys.executable, "-c", LOADER, str(hub), str(tmp_path / "seen.npz"), str(tmp_path / "p.pt")]
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path, env={"PATH": ""})
     assert done.stdout.strip() == "['numpy']"
-    wanted = hypogoal.load_ensemble(run / "ensemble", GOAL).predict(seen)
+    wanted = hypogoal.load_ensemble(made / "ensemble", GOAL).predict(seen)
     np.testing.assert_allclose(torch.load(tmp_path / "p.pt", weights_only=True).numpy(), wanted, atol=1e-5)
-    assert main(["export", str(run / "ensemble"), "--out", str(hub), "--force"]) == 2
+    assert main(["export", str(made / "ensemble"), "--out", str(hub), "--force"]) == 2
 
 
-def test_a_layer_that_others_cannot_build_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_layer_that_others_cannot_build_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2, H6: of a network of the user's, for one key; nothing is written."""
     (tmp_path / "half.py").write_text(
         "from torch import nn\nclass Half(nn.Module):\n    def forward(self, x):\n        return x / 2\n"
@@ -300,12 +277,11 @@ def test_a_layer_that_others_cannot_build_is_named(
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     np.savez(tmp_path / "own.npz", **arrays())
-    assert main(["import", str(tmp_path / "own.npz"), "--out", str(tmp_path / "d.h5"), "-q"]) == 0
+    run("import", tmp_path / "own.npz", "--out", tmp_path / "d.h5", "-q")
     words = ["--set", "network=wrist=half:half", "--set", "steps=2", "-q"]
-    assert main(["train-ensemble", str(tmp_path / "d.h5"), "--out", str(tmp_path / "e"), *words]) == 0
-    assert main(["export", str(tmp_path / "e"), "--out", str(tmp_path / "hub")]) == 2
-    assert "a file names code of its own as its network: half:half" in capsys.readouterr().err
+    run("train-ensemble", tmp_path / "d.h5", "--out", tmp_path / "e", *words)
+    command = ["export", tmp_path / "e", "--out", tmp_path / "hub"]
+    refuses("a file names code of its own as its network: half:half", *command)
     monkeypatch.setenv("HYPOGOAL_TRUST", "half:half")
-    assert main(["export", str(tmp_path / "e"), "--out", str(tmp_path / "hub")]) == 2
-    assert "only hypogoal can build the layer Half" in capsys.readouterr().err
+    refuses("only hypogoal can build the layer Half", "export", tmp_path / "e", "--out", tmp_path / "hub")
     assert not (tmp_path / "hub").exists()
