@@ -79,15 +79,7 @@ class LongCorridor(Corridor):
     observation_shape = (20, 84, 4)  # not made of cells
     cells: ClassVar[dict[str, int]] = {"middle": 2, "left": 0}
 
-    def __init__(
-        self,
-        count: int,
-        max_steps: int = 30,
-        *,
-        start: str = "middle",
-        memory: int = 200_000,
-        seed: int = 0,
-    ):
+    def __init__(self, count: int, max_steps: int = 30, *, start: str = "middle", memory: int = 200_000, seed: int = 0):
         self.memory = memory
         self.starts = [Start(self.cells[start])]
         self.cell = [start.cell for start in self.starts]

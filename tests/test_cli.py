@@ -120,10 +120,7 @@ def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
 def test_same_seed_same_bytes(tiny_run: Path, tiny_copy: Path, tmp_path: Path) -> None:
     """Same seed, same machine, same bytes: every stage, in any number of processes, logs in TensorBoard or not."""
     boards = tmp_path / "boards"
-    more = {
-        "ensemble": ["--set", "workers=2", "--tensorboard", boards],
-        "meta": ["--tensorboard", boards / "meta"],
-    }
+    more = {"ensemble": ["--set", "workers=2", "--tensorboard", boards], "meta": ["--tensorboard", boards / "meta"]}
     for name in ("data.h5", "ensemble", "options", "meta", "ppo"):
         run(*command(DOORKEY_RUN, tiny_copy, name), *more.get(name, []), "--force")
         made = tiny_run / name

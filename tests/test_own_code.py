@@ -106,10 +106,7 @@ LIES: list[tuple[GymnasiumDomain, str]] = [
         for value in [*ENDS, object()]
     ),
     (labelling_all({"left-end": True}), "the function of all labels gave labels for left-end: test_own_code.py, line "),
-    (
-        labelling_all({"left-end": True, "lie": True, 3: 1}),
-        "gave labels for left-end, lie, 3: test_own_code.py",
-    ),
+    (labelling_all({"left-end": True, "lie": True, 3: 1}), "gave labels for left-end, lie, 3: test_own_code.py"),
     *((labelling_all(value), "the function of all labels gave a ") for value in (None, [True, True])),
     *(
         (choosing(value), "the domain's policy gave the action ")

@@ -105,10 +105,7 @@ def test_entry_points_load() -> None:
 
     scripts = [("hypogoal", PROJECT["scripts"]["hypogoal"], "console_scripts")]
     domains = PROJECT["entry-points"]["hypogoal.domains"]
-    for name, value, group in [
-        *scripts,
-        *((name, value, "hypogoal.domains") for name, value in domains.items()),
-    ]:
+    for name, value, group in [*scripts, *((name, value, "hypogoal.domains") for name, value in domains.items())]:
         loaded = metadata.EntryPoint(name, value, group).load()
         if group == "console_scripts":
             assert callable(loaded)

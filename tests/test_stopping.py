@@ -72,10 +72,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.Captu
             "hypogoal: stopped; the last checkpoint is kept: give the same command with --resume to continue\n"
         )
         assert unfinished(out) and not out.exists()
-    for given, line in (
-        ([], "an unfinished output exists"),
-        (["--resume", "--seed", "1"], "begun with seed=0, not 1"),
-    ):
+    for given, line in (([], "an unfinished output exists"), (["--resume", "--seed", "1"], "begun with seed=0, not 1")):
         assert main([*arguments, *given]) == 2
         err = capsys.readouterr().err
         assert line in err and err.count("\n") == 1

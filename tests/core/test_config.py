@@ -101,11 +101,7 @@ def test_each_mistake_gets_one_line(assignment: str, words: str) -> None:
 def test_unknown_and_broken_presets(tmp_path: Path) -> None:
     broken = tmp_path / "broken.toml"
     broken.write_text("[example\n")
-    for preset, words in (
-        ("nosuch", "demo"),
-        (str(broken), "not valid TOML"),
-        (str(tmp_path / "no.toml"), "no such"),
-    ):
+    for preset, words in (("nosuch", "demo"), (str(broken), "not valid TOML"), (str(tmp_path / "no.toml"), "no such")):
         with pytest.raises(UserError, match=words):
             resolve(Example, stage="example", preset=preset)
 
@@ -145,19 +141,8 @@ def test_the_paper_preset_has_the_papers_tables() -> None:
     assert (meta.replay, meta.update_interval, meta.target_interval, meta.target_tau) == (100_000, 4, 10, 1.0)
     assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
     assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
-    assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (
-        100,
-        0.01,
-        0.97,
-        64,
-        10,
-    )
-    assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (
-        1_500_000,
-        500,
-        "own",
-        "paper",
-    )
+    assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.01, 0.97, 64, 10)
+    assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
     assert (meta.meta_network, meta.head) == ("paper", "gaussian")
     run = resolve(config_class_of("run"), stage="run", preset="paper")
     assert not run.pretrain and run.paired

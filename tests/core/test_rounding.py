@@ -29,12 +29,7 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
 @pytest.mark.parametrize(
     "share",
     [
-        *(
-            NEAR,
-            SOLVED,
-            *montezuma_states.KIND_SHARES.values(),
-            montezuma_states.SPARE,
-        ),
+        *(NEAR, SOLVED, *montezuma_states.KIND_SHARES.values(), montezuma_states.SPARE),
         *(montezuma_states.FEWEST_POSITIVES, montezuma_states.FEWEST_AT_A_BASE),
     ],
 )

@@ -137,12 +137,7 @@ def test_two_definitions_of_the_open_door(corner: DoorKeyEnv) -> None:
     corner.ring = [Key("red")]
     corner.agent_pos = (3, 1)
     act(corner, TOGGLE)
-    for position, direction, in_front in (
-        ((3, 1), 0, True),
-        ((5, 1), 2, True),
-        ((3, 1), 1, False),
-        ((2, 1), 0, False),
-    ):
+    for position, direction, in_front in (((3, 1), 0, True), ((5, 1), 2, True), ((3, 1), 1, False), ((2, 1), 0, False)):
         corner.agent_pos, corner.agent_dir = position, direction
         for label, expected in (("open", True), ("in-front", in_front)):
             corner.door_label = label

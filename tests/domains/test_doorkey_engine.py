@@ -113,16 +113,7 @@ def test_engines_are_exact_to_minigrid() -> None:
     seen: Counter[str] = Counter()
     for layout_seed in LAYOUTS:
         play_side_by_side(layout_seed, seen)
-    for event in (
-        "pickup",
-        "drop",
-        "unlock",
-        "close",
-        "reopen",
-        "in the doorway",
-        "terminated",
-        "truncated",
-    ):
+    for event in ("pickup", "drop", "unlock", "close", "reopen", "in the doorway", "terminated", "truncated"):
         assert seen[event] >= 20, (event, seen)
     assert seen["hold 1"] >= 100
     assert seen["hold 2"] >= 100

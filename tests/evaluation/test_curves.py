@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.curves import (
-    curves,
-    run_numbers,
-    steps_to_solve,
-    trailing_mean,
-)
+from hypogoal.evaluation.curves import curves, run_numbers, steps_to_solve, trailing_mean
 from hypogoal.evaluation.numbers import (
     BOOTSTRAP_FROM,
     STUDENT,

@@ -54,11 +54,7 @@ def test_agents_are_named_after_how_they_choose():
 def test_a_setting_that_differs_splits_an_agent():
     """Spec F5: a run with another discount is another agent."""
     groups = group_runs([made(), made(seed=1, option_gamma=0.9), made(seed=2, domain_config={"door_label": "open"})])
-    assert sorted(groups) == [
-        LEARNED,
-        f"{LEARNED}, door_label=open",
-        f"{LEARNED}, option_gamma=0.9",
-    ]
+    assert sorted(groups) == [LEARNED, f"{LEARNED}, door_label=open", f"{LEARNED}, option_gamma=0.9"]
 
 
 def table_of(runs):

@@ -9,21 +9,9 @@ import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.networks import (
-    ENTRY_POINTS,
-    NETWORKS,
-    as_input,
-    build_network,
-    folded,
-    reordered,
-)
+from hypogoal.hypotheses.networks import ENTRY_POINTS, NETWORKS, as_input, build_network, folded, reordered
 
-SHAPES = {
-    "doorkey": (64, 64, 3),
-    "montezuma": (84, 84, 4),
-    "tiles": (48, 48, 3),
-    "mlp": (6, 7, 3),
-}
+SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "tiles": (48, 48, 3), "mlp": (6, 7, 3)}
 
 
 def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -> nn.Sequential:

@@ -32,12 +32,7 @@ def test_transitions_reach_n_steps_on_but_not_beyond_the_end() -> None:
         return list(zip(*columns, strict=True))
 
     assert listed(rows[2]) == [(10, 0, 13, 3, False), (20, 10, 23, 3, False)]
-    assert listed(rows[3]) == [
-        (11, 1, 14, 3, True),
-        (12, 2, 14, 2, True),
-        (13, 3, 14, 1, True),
-        (21, 11, 24, 3, False),
-    ]
+    assert listed(rows[3]) == [(11, 1, 14, 3, True), (12, 2, 14, 2, True), (13, 3, 14, 1, True), (21, 11, 24, 3, False)]
     # The next sequence begins empty: nothing is joined to what came before.
     both = np.array([True, True])
     again = ahead.add(Ended(np.array([30, 24]), np.array([0, 14]), np.array([31, 25]), np.ones(2, int), both), both)

@@ -236,10 +236,7 @@ def test_what_a_wrapped_environment_gives_is_looked_at(options: Options, ensembl
             observation, _, *rest = super().step(action)
             return observation, float("nan"), *rest  # type: ignore[return-value]
 
-    for env in (
-        hypogoal.OptionEnv(Unsure(), options),
-        hypogoal.SubgoalReward(ensemble).wrap(Unsure()),
-    ):
+    for env in (hypogoal.OptionEnv(Unsure(), options), hypogoal.SubgoalReward(ensemble).wrap(Unsure())):
         env.reset(seed=0)
         with pytest.raises(UserError, match=r"^the environment's step gave the reward nan: test_agents\.py, line "):
             env.step(0)
@@ -247,10 +244,7 @@ def test_what_a_wrapped_environment_gives_is_looked_at(options: Options, ensembl
 
 def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) -> None:
     """Spec E1: Gymnasium's checker, whose warnings are errors here, but for the one that says: wrapped."""
-    wrapped = [
-        hypogoal.OptionEnv(corridor(), options),
-        hypogoal.SubgoalReward(ensemble).wrap(corridor(), ends=False),
-    ]
+    wrapped = [hypogoal.OptionEnv(corridor(), options), hypogoal.SubgoalReward(ensemble).wrap(corridor(), ends=False)]
     for env in wrapped:
         with pytest.warns(UserWarning, match="different from the unwrapped version"):
             check_env(env, skip_render_check=True)

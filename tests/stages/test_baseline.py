@@ -18,12 +18,7 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
-from hypogoal.learners.baselines.settings import (
-    HYPERPARAMETERS,
-    BaselineConfig,
-    DQNSettings,
-    PPOSettings,
-)
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig, DQNSettings, PPOSettings
 from hypogoal.meta.training import cut
 from hypogoal.stages.train_baseline import train_baseline
 
