@@ -192,13 +192,6 @@ def tables(path: Path) -> Iterator[str]:
             for m in tested
         ),
     )
-    yield "By sub-goal: ranking / balanced accuracy at 0.5, cross-fitted best."
-    yield ""
-
-    def both(method: str, goal: str) -> str:
-        return " / ".join(f"{by_seed(test, method, chosen[method], SHOWN[n], [goal]).mean():.3f}" for n in CROSSED)
-
-    yield from table(["", *every], ([m, *(both(m, goal) for goal in every)] for m in tested))
     yield "D-BAT minus the other, cross-fitted ranking, seed by seed (seeds in which D-BAT is above)."
     yield ""
     yield from table(["", "all", *every], _differences(test, chosen, tested))

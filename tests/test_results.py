@@ -1,5 +1,6 @@
 """Published tables are drawn from the committed cells (Spec F5, H7)."""
 
+import ast
 import importlib
 import re
 import sys
@@ -99,6 +100,42 @@ def test_each_claim_of_the_paper_names_a_command_that_runs(tmp_path: Path, monke
             with pytest.raises(SystemExit, match="0"):
                 study.main()
     assert not list(tmp_path.iterdir())
+
+
+NAMED = re.compile(r"(?<![\w/.-])(?:docs|studies|examples|benchmarks|tests)/[\w./-]*\w")
+MODULE = re.compile(r"(?<![\w/.-])(?:studies|examples|benchmarks)\.[a-z_]\w*")
+
+
+def test_pages_and_files_that_are_named_are_there() -> None:
+    """By a setting's source, by code, by the docs and by what tests say they do."""
+    texts = {path: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]}
+    for folder in ("hypogoal", "studies", "examples", "benchmarks"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in (".py", ".toml", ".json", ".html"):
+                texts[path] = path.read_text(encoding="utf-8")
+    for path in (ROOT / "tests").rglob("*.py"):
+        texts[path] = "\n".join(docstrings(path))
+    named = {path: {*NAMED.findall(text), *map(as_path, MODULE.findall(text))} for path, text in texts.items()}
+    assert sum(map(len, named.values())) > 50
+    gone = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path, names in named.items()
+        for name in sorted(names)
+        if not (ROOT / name).exists()
+    ]
+    assert not gone
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """Those of a module, its classes and its functions."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def as_path(module: str) -> str:
+    """The file of a module."""
+    return f"{module.replace('.', '/')}.py"
 
 
 def _numbers(text: str) -> set[str]:
