@@ -64,13 +64,13 @@ def result_of(path: Path) -> dict[str, float]:
         last[str(line.get("sub_goal"))] = line
     results = {}
     for name, title in RESULTS.items():
-        values = [value for value in (line.get(name) for line in last.values()) if _is_number(value)]
+        values: list[Any] = [value for value in (line.get(name) for line in last.values()) if _is_number(value)]
         if values:
             results[title] = sum(values) / len(values)
     return results
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e300
 
 

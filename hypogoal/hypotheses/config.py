@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hypogoal.core.config import fixed, setting
+from hypogoal.core.config import setting
 
 BEYOND = "own: beyond the paper"
 FULL = "full"  # the view that shows all of an observation
@@ -57,7 +57,6 @@ class EnsembleConfig:
     )
     class_weight_negative: float = setting(0.5, "weight of negatives in the cross entropy", source="Table 3", low=1e-6)
     class_weight_positive: float = setting(0.5, "weight of positives in the cross entropy", source="Table 3", low=1e-6)
-    class_balance: str = fixed("batch")  # a setting up to 0.15; with "none" go-to-goal falls to .63 (DEV-13)
     unlabelled_bn: bool = setting(
         True,
         "BatchNorm's running statistics include unlabelled batches, so that they cover more than one layout",

@@ -56,9 +56,6 @@ class SubgoalReward:
     """
 
     def __init__(self, source: str | os.PathLike[str] | Ensemble, sub_goal: str = "", by: By = "vote"):
-        if isinstance(source, gymnasium.Env):  # so it was called until version 0.18
-            do = "Give SubgoalReward(ensemble).wrap(env)."
-            raise UserError("SubgoalReward takes an ensemble, not an environment", None, do)
         ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
         rule = by if isinstance(by, str) else as_number(by)
         if rule not in RULES and rule not in range(len(ensemble)):
