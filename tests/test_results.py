@@ -16,7 +16,7 @@ from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders, one_room
-from studies.cells import collect_once, difference, interval, run_cells
+from studies.cells import collect_once, difference, interval, read_rows, run_cells
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -189,6 +189,18 @@ def test_agents_of_figure_6_are_told_apart() -> None:
     assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
     assert figure6.method_of({"network": "paper"}, "meta") == "literal"
     assert figure6.method_of({}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
+
+
+def test_members_one_after_the_other_stay_by_their_rule() -> None:
+    """The row of the history is that of its cells, and they fail the rule by which ``sequential`` would have gone."""
+    solved: dict[str, list[float]] = {"simultaneous": [], "sequential": []}
+    for row in read_rows(RESULTS / "rooms-schedules.csv"):
+        if row["chooser"] == "agent":
+            solved[row["schedule"]].append(float(row["success"]))
+    differences = np.subtract(solved["simultaneous"], solved["sequential"])
+    printed = difference(differences, 2).replace("0.", ".")
+    assert f"| {printed} | 10 |" in (RESULTS / "history.md").read_text(encoding="utf-8")
+    assert len(differences) == 10 and differences.mean() < -0.03
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
