@@ -26,7 +26,6 @@ LONGEST = (
     "test_evaluate_report",
     "test_stopping",
     "test_cli",
-    "test_attacks",
     "test_trust",
     "test_docs",
     "test_loop",

@@ -166,7 +166,7 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(tmp_path: Path) -> Non
 
 
 def test_a_command_without_room_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec G2: one line, and neither a draft nor a hidden file; ``tests.attacks.attacks`` tries each write of each."""
+    """Spec G2: one line, and neither a draft nor a hidden file."""
     folder, there = tmp_path / "run", tmp_path / "there"
     folder.mkdir()
     there.mkdir()

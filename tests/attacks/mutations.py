@@ -173,55 +173,6 @@ def safetensors_changed(data: bytes, rng: Rng, odd: list[Any]) -> bytes:
     return length.to_bytes(8, "little") + header + data[8 + size :]
 
 
-def state_changed(state: dict[str, Any], rng: Rng) -> tuple[str, str]:
-    """Change one thing in a checkpoint's state, in place; returns what was done ("drop") and where ("/loop/option").
-
-    Places that differ only in a number in a list count as one, so that long lists are not all that is hit.
-    """
-    places: dict[str, list[tuple[Any, Any]]] = {}
-
-    def walk(value: Any, place: str) -> None:
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            name = f"{place}/{key if isinstance(value, dict) else '*'}"
-            places.setdefault(name, []).append((value, key))
-            if isinstance(item, dict | list):
-                walk(item, name)
-
-    walk(state, "")
-    where = rng.choice(sorted(places))
-    owner, key = rng.choice(places[where])
-    value = owner[key]
-    ways: dict[str, Callable[[], Any]] = {"text": lambda: "odd", "dict": lambda: {"odd": 1}}
-    if hasattr(value, "dtype"):
-        values = np.asarray(value)
-        ways |= {
-            "axis": lambda: values[None],
-            "dtype": lambda: np.zeros(values.shape, "i2" if values.dtype != "i2" else "i4"),
-        }
-        if values.ndim:
-            ways |= {"rows": lambda: values[:-1] if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)}
-        if values.ndim > 1:
-            ways |= {"cut": lambda: values[..., :-1]}
-    elif isinstance(value, list):
-        ways |= {"items": lambda: value[:-1] if value else [0], "number": lambda: 3}
-    elif isinstance(value, int | float):
-        ways |= {"list": lambda: [value], "number": lambda: rng.choice((-1, 2**62, 10**30))}
-    if value is not None:
-        ways |= {"none": lambda: None}
-    how = rng.choice(["drop", "add", *ways])
-    if how == "drop":
-        del owner[key]
-    elif how == "add":
-        owner.update(odd=np.zeros(3)) if isinstance(owner, dict) else owner.append({"odd": 1})
-    else:
-        owner[key] = ways[how]()
-        if hasattr(value, "detach") and isinstance(owner[key], np.ndarray):
-            owner[key] = value.new_tensor(
-                owner[key], dtype=None if how != "dtype" else value.new_zeros(1).short().dtype
-            )
-    return how if isinstance(owner, dict) or how in ways else f"{how} item", where
-
-
 def toml_of(tree: Any, rng: Rng) -> str:
     """TOML text of tables, with dates, times and inline tables strewn in."""
     lines: list[str] = []
