@@ -75,8 +75,9 @@ class Ensemble(nn.Module):
         self.view = view or FullView(self.observation_shape)
         self.network = network = network_for(network, self.view.dtype)
         shape, dtype = self.view.shape, self.view.dtype
-        self.members = nn.ModuleList(build_network(network, shape, generator, dtype) for _ in range(members))
-        self.networks = tuple(map(reordered, self.members))
+        built = [build_network(network, shape, generator, dtype) for _ in range(members)]
+        self.members = nn.ModuleList(built)
+        self.networks = tuple(reordered(member) for member in built)
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self.train()
 
