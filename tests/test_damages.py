@@ -303,9 +303,10 @@ BROKEN_TOML = {
     "[settings.a]\nvalue = [0x" + "f" * 500 + "]": "not valid TOML",
     "[settings.a]\nvalue = 9007199254740992": "not valid TOML",
     "[settings.a]\nvalue = -9007199254740992": "not valid TOML",
+    "[train-ensemble]\nmembers = " + "9" * 400: "not valid TOML",
+    "train-ensemble = 3": "",
     "# " + "x" * 2**20: "",
 }
-WRONG_VALUES = ["1979-05-27", "{a = 1}", "inf", "[[1]]", "9" * 400]
 
 
 @pytest.mark.parametrize("text", BROKEN_TOML, ids=range(len(BROKEN_TOML)))
@@ -318,15 +319,13 @@ def test_toml_files(tmp_path: Path, text: str) -> None:
     assert len(refuses(words, "sweep", path, "--out", tmp_path / "out", "--dry-run")) < 1000
 
 
-@pytest.mark.parametrize("value", WRONG_VALUES, ids=range(len(WRONG_VALUES)))
+@pytest.mark.parametrize("value", ["1979-05-27", "{a = 1}", "inf", "[[1]]"])
 def test_values_of_a_preset(tmp_path: Path, value: str) -> None:
     """Spec G2: types that no setting has."""
     path = tmp_path / "own.toml"
-    train = ["train-ensemble", write(tmp_path / "data.h5", domain="doorkey"), "--out", tmp_path / "out"]
     path.write_text(f"[train-ensemble]\nmembers = {value}\n")
-    assert len(refuses("", *train, "--preset", path)) < 1000
-    path.write_text("train-ensemble = 3")
-    refuses("", *train, "--preset", path)
+    train = ["train-ensemble", write(tmp_path / "data.h5", domain="doorkey"), "--out", tmp_path / "out"]
+    refuses("wrong type of value: members=", *train, "--preset", path)
 
 
 def test_labels_of_what_is_not_there(tmp_path: Path) -> None:
