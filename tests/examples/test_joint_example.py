@@ -11,8 +11,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from command_line import run, settings
 from numpy.typing import NDArray
 
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_own
 from hypogoal.domains.rooms.states import FACTORS, crossed_states, labelled_states, unlabelled_states
@@ -164,3 +166,13 @@ def test_what_does_not_suit_is_one_clear_line(joint: ModuleType) -> None:
     observations, labels, unlabelled = states
     with pytest.raises(ValueError, match="too small"):
         joint.teach(observations[:, :7], labels, unlabelled[:, :7], 2, 0)
+
+
+def test_the_command_teaches(joint: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who types a teacher's name trusts it; the file has the setting."""
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    data, out = tmp_path / "data.h5", tmp_path / "ensemble"
+    run("collect", "rooms", "--out", data, *settings("unlabelled=200"))
+    few = settings("steps=2", "workers=1", "teacher=joint:independent")
+    run("train-ensemble", data, "--out", out, "--diversity", "none", "--members", 2, *few)
+    assert open_artefact(out).config["teacher"] == "joint:independent"
