@@ -354,12 +354,11 @@ def test_data_that_do_not_say_enough_are_one_line() -> None:
             fit(observations, labels, observations, config, 0, origins=StateOrigins(some, origins))
 
 
-@pytest.mark.slow
 @pytest.mark.atari
 def test_bases_are_recognised_in_rooms_without_labels(tmp_path: Path) -> None:
     """The claim, in small: the agent is found there, and what is around it says more than the whole picture."""
     data = tmp_path / "data.h5"
-    counts = ("states_per_room=300", "unlabelled_per_room=200", "heldout_per_room=20", "workers=1")
+    counts = ("states_per_room=150", "unlabelled_per_room=120", "heldout_per_room=12", "workers=1")
     assert main(["collect", "montezuma", "--out", str(data), "-q", *(w for c in counts for w in ("--set", c))]) == 0
     dataset = open_dataset(data)
     (goal,) = dataset.sub_goals
@@ -372,8 +371,8 @@ def test_bases_are_recognised_in_rooms_without_labels(tmp_path: Path) -> None:
         ensemble = fit(split.observations, split.labels, unlabelled, config, 0, origins=origins)
         return ensemble.view, float(ranking(ensemble.predict(unseen.observations), unseen.labels).mean())
 
-    window = {"view": "one_room:AgentView", "network": "one_room:network", "view_settings": ("localiser_steps=200",)}
-    view, of_windows = trained(steps=150, **window)
+    window = {"view": "one_room:AgentView", "network": "one_room:network", "view_settings": ("localiser_steps=70",)}
+    view, of_windows = trained(steps=60, **window)
     _, of_pictures = trained(steps=60, network="montezuma")
     positions = np.stack([unseen.origins[name] for name in ("room", "x", "y")], axis=1)
     errors = np.abs(view.locate(unseen.observations) - observed_pixel(positions)).max(axis=1)  # type: ignore[attr-defined]
