@@ -126,6 +126,20 @@ def test_messages_about_manifests_stay_helpful(corridor_copy: Path) -> None:
         read_manifest(path)
 
 
+def test_what_was_made_with_settings_that_are_gone_is_refused(corridor_copy: Path) -> None:
+    """Not read as if it had been made without them; their old defaults changed nothing."""
+    folder = corridor_copy / "meta"
+    config = read_manifest(folder / MANIFEST)["config"]
+    reseal(folder, config={**config, "initiation": "anywhere"})
+    read_manifest(folder / MANIFEST)
+    reseal(folder, config={**config, "initiation": "learned"})
+    with pytest.raises(UserError, match="made with initiation=learned.*Make the artefact again"):
+        read_manifest(folder / MANIFEST)
+    reseal(folder, config={**config, "domain_config": {"keyring": False}})
+    with pytest.raises(UserError, match="made with keyring=False"):
+        read_manifest(folder / MANIFEST)
+
+
 def test_verify_looks_inside_the_folder_only(corridor_run: Path, corridor_copy: Path) -> None:
     """Spec A8: of a copied run an input that is gone is gone, though it still is where it was once."""
     run_there, here = corridor_run, corridor_copy

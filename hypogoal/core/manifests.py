@@ -80,6 +80,10 @@ def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
         raise UserError(f"the manifest's {key!r} is missing or malformed", path, AGAIN)
     if key := misfit(manifest["config"], {}, SETTINGS):
         raise UserError(f"the manifest's setting {key!r} is malformed", path, AGAIN)
+    settings = {**manifest["config"], **manifest["config"].get("domain_config", {})}
+    for key, without in GONE.items():
+        if settings.get(key, without) != without:
+            raise UserError(f"it was made with {key}={settings[key]}, which is gone since 0.24", path, AGAIN)
     return manifest
 
 
@@ -87,6 +91,15 @@ def _size(value: Any) -> bool:
     return is_count(value) and 0 < value < 1 << 16
 
 
+# Settings of 0.23 without which what was made would be taken for something else, and the values that changed nothing.
+GONE = {
+    "actions": "all",
+    "encoder": "separate",
+    "initiation": "anywhere",
+    "keyring": True,
+    "policy_pixels": "all",
+    "policy_view": "full",
+}
 # WANTED must be in every manifest; SETTINGS, read by other stages, are checked if present.
 WANTED: Schema = {
     "kind": plain_name,
