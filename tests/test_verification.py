@@ -133,7 +133,7 @@ def test_what_was_made_with_settings_that_are_gone_is_refused(corridor_copy: Pat
     reseal(folder, config={**config, "initiation": "anywhere"})
     read_manifest(folder / MANIFEST)
     reseal(folder, config={**config, "initiation": "learned"})
-    with pytest.raises(UserError, match="made with initiation=learned.*Make the artefact again"):
+    with pytest.raises(UserError, match=r"made with initiation=learned.*Make the artefact again"):
         read_manifest(folder / MANIFEST)
     reseal(folder, config={**config, "domain_config": {"keyring": False}})
     with pytest.raises(UserError, match="made with keyring=False"):
