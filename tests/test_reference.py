@@ -57,6 +57,13 @@ def test_it_is_as_it_was(name: str, made: Callable[[str], Path]) -> None:
     assert apart is None, f"{name}, made by {recorded['code']}: {apart}"
 
 
+def test_every_part_is_there() -> None:
+    """Each part has its table and its record, and together they are small."""
+    tables_there = {path.name.removesuffix(".csv.gz") for path in REFERENCE.glob("*.csv.gz")}
+    assert set(PARTS) == set(tables.record()) == tables_there
+    assert sum(path.stat().st_size for path in REFERENCE.glob("*.*")) < 900_000
+
+
 def test_a_difference_is_seen() -> None:
     """The comparison itself: where two tables part, what is gone or new, what is close enough."""
     old = [("line", "column", "value"), ("1", "loss", "0.5"), ("2", "loss", "0.25"), ("2", "episodes", "3")]
