@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from hypogoal.core.surroundings import Around, close_library_path
 
-__version__ = "0.23.0"
+__version__ = "0.24.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options
