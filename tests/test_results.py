@@ -203,6 +203,23 @@ def test_members_one_after_the_other_stay_by_their_rule() -> None:
     assert len(differences) == 10 and differences.mean() < -0.03
 
 
+def test_switches_of_montezuma_s_options_stay_by_their_rule() -> None:
+    """The row of the history is that of its cells; on one ladder each is worth a tenth of the executions or more."""
+    rows = [row for row in read_rows(RESULTS / "montezuma-steps.csv") if row["ladder"] == "3-9"]
+    printed = []
+    for column, better in (("n_step", "10"), ("exploration", "persistent")):
+        differences = []
+        for seed in ("0", "1", "2"):
+            of_seed = [row for row in rows if row["seed"] == seed]
+            with_it = [int(row["at_base"]) / 100 for row in of_seed if row[column] == better]
+            without = [int(row["at_base"]) / 100 for row in of_seed if row[column] != better]
+            assert len(with_it) == len(without) == 2
+            differences.append(np.mean(with_it) - np.mean(without))
+        assert np.mean(differences) >= 0.1
+        printed.append(interval(np.array(differences), 3).replace("0.", "."))
+    assert f"| {'; '.join(printed)} | 3 |" in (RESULTS / "history.md").read_text(encoding="utf-8")
+
+
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
     """A mean over some of the sub-goals is of no use beside one over all."""
     lines = (RESULTS / "hypotheses-doorkey.csv").read_text(encoding="utf-8").splitlines()
