@@ -18,8 +18,9 @@ Then `python -m examples.distilled` plays each option once in one more layout. A
     hypogoal train-meta runs/far/ensemble --options runs/far/options --out runs/far/meta \
         --set network=examples.distilled:Learner --set embedding=examples.distilled:Deep
 
-Agents that learn in many layouts need `--set meta_network=examples.distilled:Grid`, too. `Grid` in place of `Deep`
-takes a third of the time and carries over less. Measured: docs/results/distilled.md and distilled-agents.md.
+Agents that learn in many layouts need `--set meta_network=examples.distilled:Grid`, too, and permission for it. `Grid`
+in place of `Deep` takes a third of the time and carries over less. Measured: docs/results/distilled.md and
+distilled-agents.md.
 """
 
 from __future__ import annotations

@@ -150,12 +150,11 @@ def test_equations_lead_to_code() -> None:
 
 
 def test_requirements_lead_to_code_and_tests() -> None:
-    """Each requirement's row names files that exist, and a test cites it."""
+    """Each requirement's row names files that exist; tests cite all rows, and nothing else."""
     rows = re.findall(r"^\| ([A-I]\d) \| .+ \| ([^|]+) \|$", (DOCS / "requirements.md").read_text(), re.M)
-    assert len(rows) == 56
     tests = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     cited = re.findall(r"[A-I]\d", " ".join(re.findall(r"Spec [A-I]\d(?:[-, ]+[A-I]\d)*", tests)))
+    assert {number for number, _ in rows} == set(cited)
     for number, cell in rows:
-        assert number in cited, number
         for name in re.findall(r"`([^`]+)`", cell):
             assert (ROOT / "hypogoal" / name).exists(), (number, name)

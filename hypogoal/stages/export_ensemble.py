@@ -41,7 +41,7 @@ Positive above the thresholds in `config.json`.
 def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
     """Write the members of an ensemble artefact, ``load.py`` and a card into the folder ``out``.
 
-    Members with layers of the user's own, or that see only the agent's surroundings, are a ``UserError``.
+    Members with layers or a view of the user's own are a ``UserError``.
     """
     artefact = open_artefact(source, "ensemble").whole()
     out = claim(out, kind="hub", inputs=[source], force=force)
@@ -51,7 +51,7 @@ def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
             ensemble = read_ensemble(artefact.path, config, goal)
             if not isinstance(ensemble.view, FullView):
                 do = "Export those trained with view=full."
-                raise UserError("these members see the agent's surroundings, which only hypogoal cuts out", source, do)
+                raise UserError("these members have a view of your own, which only hypogoal can load", source, do)
             members = nn.ModuleList(ensemble.members)
             state = {**members.state_dict(), **dict(ensemble.view.named_buffers())}
             save_tensors(work.files / f"{goal}.safetensors", {name: part.clone() for name, part in state.items()})

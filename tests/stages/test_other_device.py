@@ -82,7 +82,7 @@ def test_no_gpu_is_one_line(tiny_run: Path, tmp_path: Path) -> None:
 @pytest.mark.gpu
 @pytest.mark.parametrize("case", CASES)
 def test_on_a_gpu(case: str, tiny_run: Path, tmp_path: Path) -> None:
-    """Spec G5, G8: the real thing, where there is one."""
+    """Spec G5: the real thing, where there is one."""
     if not torch.cuda.is_available():
         pytest.skip("no GPU")
     CASES[case][1](tiny_run, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
