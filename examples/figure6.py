@@ -1,7 +1,8 @@
 """The paper's Figure 6 at its own budget: 1.5 million steps on ten layouts, practice of options included.
 
 D-BAT beside no diversity, one classifier a sub-goal, and the true sub-goals; PPO and DQN tuned, and as the paper's
-tables have them on the first five layouts; last PPO that is paid where D-BAT's members predict positive.
+tables have them on the first five layouts. ``studies.bonus`` adds PPO that is paid where D-BAT's members
+predict positive.
 
     hypogoal sweep examples.figure6:figure6 --out runs/figure6
     python -m studies.bonus runs/figure6 docs/results/figure6-doorkey.csv
