@@ -145,7 +145,8 @@ def test_equations_lead_to_code() -> None:
                 file = ROOT / name
                 assert file.is_file(), name
             else:
-                module = importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
+                dotted = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+                module = importlib.import_module(dotted.removesuffix(".__init__"))
                 assert hasattr(module, name), (row, name)
 
 
