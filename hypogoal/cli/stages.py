@@ -11,7 +11,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import draw, give, say
 from hypogoal.settings import configuration
-from hypogoal.stages import domain_of, inherited_of
+from hypogoal.stages import domain_of, inherited_of, typed_in
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
@@ -125,7 +125,7 @@ def audit(
     if sub_goal is None:
         raise UserError("which sub-goal is the truth?", domain, "Give --sub-goal NAME.")
     config = call.config(domain, by_user=True)
-    with own_code.given(classifier, domain):
+    with own_code.given(classifier, domain, *typed_in(call.settings)):
         rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member or 0, **call.how)
     for line in () if call.how["quiet"] else lines_of(rates):
         say(line)

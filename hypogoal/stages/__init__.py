@@ -26,15 +26,18 @@ def make(
     domain = source if isinstance(source, str) else domain_of(source, stage)
     inherited = inherited_of(stage, rest["options"]) if rest.get("options") else {}
     config = configuration(stage, domain, preset, (), settings, by_user=by_user, inherited=inherited)
-    values = [
-        part for value in settings.values() for part in (re.split("[,=]", value) if isinstance(value, str) else ())
-    ]
     trusted = [value for value in defaults_of(domain, stage, by_user=by_user).values() if isinstance(value, str)]
     first: Any = source
     if stage == "collect":
         first, rest["name"] = load_domain(domain, by_user=True), domain
-    with own_code.given(*map(str.strip, values)), own_code.vouched(*trusted):
+    with own_code.given(*typed_in(settings)), own_code.vouched(*trusted):
         return named(stage)(first, config, out, **rest)
+
+
+def typed_in(settings: Mapping[str, Any]) -> list[str]:
+    """The words of the user's settings, split at commas and equals signs: names of own code may be among them."""
+    texts = [value for value in settings.values() if isinstance(value, str)]
+    return [part.strip() for text in texts for part in re.split("[,=]", text)]
 
 
 def inherited_of(stage: str, options: Path) -> dict[str, Any]:

@@ -155,9 +155,8 @@ class Falling(Terminations):
         self.thresholds = np.full_like(self.thresholds, np.log(3))
 
 
-def test_a_threshold_that_falls_is_told_as_it_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From .9, which this classifier never says: where the rule lowers it, and not where it does not."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", f"{__name__}:Falling")
+def test_a_threshold_that_falls_is_told_as_it_ends(tmp_path: Path) -> None:
+    """From .9, which this classifier never says: where the rule that was typed lowers it, and not where it does not."""
     where = [*CORRIDOR, *settings("steps=400", "mend=0", "warm_up=400", "threshold=0.9")]
     for rule, told in (("learned", 0.9), (f"{__name__}:Falling", 0.75)):
         report, _ = audited(tmp_path / rule.partition(":")[0], "too_soon", *where, *settings(f"termination={rule}"))
