@@ -165,17 +165,12 @@ def checked(file: Any, name: str, kinds: str) -> Any:
         sides = dataset.chunks or shape
         chunk = prod(map(int, sides)) * dtype.itemsize if dataset.chunks else 0
         chunks = prod(-(-side // width) for side, width in zip(shape, sides, strict=True) if width)
-    size = size_of(dataset)
+    size = prod(map(int, shape)) * int(dtype.itemsize)  # the dataset's own ``nbytes`` may overflow
     if stored > whole or size > (MOST_RATIO if filters else 1) * stored or chunk > MAX_CHUNK_BYTES:
         raise Foreign(f"{name!r} declares {size:,} bytes but stores {stored:,} in a file of {whole:,}")
     if chunks > min(MAX_CHUNKS, max(stored, 1)):  # ``stored`` may be a lie
         raise Foreign(f"{name!r} declares {size:,} bytes in {chunks} chunks but stores {stored:,}")
     return dataset
-
-
-def size_of(dataset: Any) -> int:
-    """The bytes of a dataset's values; its own ``nbytes`` may overflow."""
-    return prod(map(int, dataset.shape)) * int(dataset.dtype.itemsize)
 
 
 def read_array(file: Any, name: str, kinds: str, rows: slice | NDArray[np.int64] | None = None) -> NDArray[Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 from hypogoal.core.files import MOST_INTEGER
 
-LARGEST = 1e18  # of bytes or seconds: a million terabytes, the age of the universe; sums of them stay finite
+LARGEST = 1e18  # of seconds: the age of the universe; sums of them stay finite
 MOST_TEXT = 1 << 16  # characters; settings in commands may be long lists
 Test = Callable[[Any], bool]
 Schema = Mapping[str, Test]
@@ -32,7 +32,7 @@ def is_count(value: Any) -> bool:
 
 
 def is_amount(value: Any) -> bool:
-    """Whether a value is a number of seconds or bytes."""
+    """Whether a value is a number of seconds."""
     return type(value) in (int, float) and 0 <= value <= LARGEST
 
 

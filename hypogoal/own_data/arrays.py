@@ -35,7 +35,7 @@ def read_arrays(path: Path) -> Parts:
 
     Missing, damaged or misnamed arrays, ones larger than memory, and pickled Python objects are a ``UserError``.
     """
-    arrays: dict[str, Any] = dict(_folder(path) if path.is_dir() else _file(path, others=False))
+    arrays: dict[str, Any] = dict(_folder(path) if path.is_dir() else _file(path))
     for name in [name for name in arrays if "/" in name]:
         base, _, key = name.partition("/")
         if isinstance(arrays.setdefault(base, {}), np.ndarray):
@@ -85,8 +85,7 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
-    """The arrays of a file with known names; ``others``: it may hold more."""
+def _file(path: Path) -> dict[str, NDArray[Any]]:
     do = "Write it with numpy.savez."
     with open_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.") as raw:
         try:
@@ -99,9 +98,8 @@ def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
         raw.seek(0)
         try:
             with np.load(raw, allow_pickle=False) as arrays:
-                if not others:
-                    _require_known(arrays.files, path)
-                return {name: arrays[name] for name in arrays.files if _known(name)}
+                _require_known(arrays.files, path)
+                return {name: arrays[name] for name in arrays.files}
         except DAMAGED as error:
             raise _damaged(path, error) from None
 
