@@ -74,14 +74,6 @@ class Position(NamedTuple):
     y: int
 
 
-class Outcome(NamedTuple):
-    """What a step has come to, but for the frame."""
-
-    reward: float
-    over: bool  # the game
-    ram: bytes  # (128,)
-
-
 @dataclass(frozen=True)
 class Snapshot:
     """A state of the emulator and the frames before it, which the emulator does not keep."""
@@ -172,10 +164,6 @@ class Emulator:
                 self.screen = self._brighter(self._drawn[0], self._drawn[1] if drawn == 2 else self.screen)
             self.seen = (*self.seen[1:], self._shrink(self.screen))
         return reward
-
-    def play(self, action: int) -> Outcome:
-        """A :meth:`step`, and how things are after it."""
-        return Outcome(self.step(action), self.ale.game_over(), self.ram().tobytes())
 
     def _shrink(self, screen: NDArray[np.uint8]) -> NDArray[np.uint8]:
         small: Any = self._resize(screen, (SIDE, SIDE), interpolation=self._area)

@@ -79,7 +79,8 @@ class MontezumaEngine(TurnEngine):
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         emulator, state = self._emulators[number], self.n_states
-        reward, over, ram = emulator.play(action)
+        reward = emulator.step(action)
+        over, ram = emulator.ale.game_over(), emulator.ram().tobytes()
         alive = not over and ram[DYING] == 0
         self._keep(state, emulator.seen)
         self._facts += bytes(facts_in(ram))
