@@ -191,7 +191,7 @@ class Engine(ABC):
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """The agent's positions, int64 (n, ``position_names``), also in forgotten states."""
-        raise UserError("this domain's engine does not know where the agent is", None, "Train with view=full.")
+        raise UserError("this domain's engine does not know where the agent is", None, "Leave them out.")
 
     @property
     def tiles(self) -> NDArray[np.uint8] | None:
