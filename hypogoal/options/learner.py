@@ -210,5 +210,5 @@ def make_policies(
         fault = "these options end at the true sub-goals, which only the domain's engine can see"
         raise UserError(fault, "termination=oracle", "Load options that were trained with learned members.")
 
-    shape = tuple(ensemble_config.get("observation_shape", ()))
+    shape = tuple(ensemble_config["observation_shape"])
     return load_learner(config["network"]).policies(SavedOptions(config, weights, shape))

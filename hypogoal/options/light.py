@@ -225,7 +225,7 @@ class LightPolicies:
     def __init__(self, saved: SavedOptions):
         config, weights = saved.config, below("online.", saved.weights)
         actions = saved.actions("online.heads.weight", saved.count)
-        embedding = config.get("embedding", AUTO)
+        embedding = config["embedding"]
         standard = standard_in(weights, saved.shape)
         make = partial(LightQNetwork, saved.shape, saved.count, actions, standard, embedding)
         custom = embedding not in (AUTO, *NETWORKS)

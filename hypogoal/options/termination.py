@@ -104,9 +104,8 @@ class Terminations(Part):
         return {THRESHOLDS: torch.from_numpy(self.thresholds.copy())}
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on with the thresholds of an artefact; old ones have none: then with the ensemble's."""
-        if THRESHOLDS in state:
-            self.thresholds = thresholds_in(state, self.options)
+        """Go on with the thresholds of an artefact."""
+        self.thresholds = thresholds_in(state, self.options)
 
     def _grow(self, ids: NDArray[np.int64]) -> None:
         size, highest = len(self._log_odds), int(ids.max(initial=-1))

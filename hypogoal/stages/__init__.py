@@ -46,7 +46,7 @@ def inherited_of(stage: str, options: Path) -> dict[str, Any]:
 
     trained = open_artefact(options, "options").config
     fixed = import_module(named(stage).__module__).FIXED
-    return {name: trained[name] for name in fixed if name in trained and not (name == PLACE and trained.get("layouts"))}
+    return {name: trained[name] for name in fixed if name != PLACE or not trained["layouts"]}
 
 
 def named(stage: str) -> Any:

@@ -30,7 +30,7 @@ def export_episodes(
         raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
     source = open_artefact(meta, "meta").whole()
     out = claim(out, kind="episodes", inputs=[meta], force=force)
-    where = source.config.get("layouts") or source.config["layout_seed"]
+    where = source.config["layouts"] or source.config["layout_seed"]
     described = (
         f"Episodes of an agent that chooses among {len(source.config['sub_goals']) * source.config['members']} options "
         f"({source.config['domain']}, layout seed {where}, seed {seed})."

@@ -66,7 +66,7 @@ def train_meta(
         if practice:
             continue_with(loop, practice)
             recorder.start_at(practice.config.get("ended_at", practice.config["steps"]))
-            if all(practice.config.get(key, 0.0) == settings[key] for key in WORLD):
+            if all(practice.config[key] == settings[key] for key in WORLD):
                 recorder.episodes.extend(Episodes.read(practice.path / Episodes.FILE).rows())
         train(loop, config.steps, work.log, work.progress, work.checkpoints)
         write_trained(work.folder, loop, domain, source.config, config, seed)

@@ -33,7 +33,7 @@ def policies_of(network: str) -> Policies:
         name: value * 0 if "bias" in name else value * 6 if value.ndim > 1 else value for name, value in weights.items()
     }
     config: dict[str, Any] = {"termination": "learned", "network": network, "sub_goals": ["a", "b"], "members": 1}
-    config |= {"recurrence": "execution"} if network == "paper" else {}
+    config |= {"recurrence": "execution"} if network == "paper" else {"embedding": "auto"}
     return make_policies(config, weights, {"observation_shape": SHAPE})
 
 
