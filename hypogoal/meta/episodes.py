@@ -14,6 +14,7 @@ from hypogoal.dataset import Observations
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.training import ONE_LAYOUT, assemble, continue_with
+from hypogoal.options.choosers import FILE
 from hypogoal.options.loop import OptionLoop, Transitions
 
 REPLAY = 1_000  # nothing is learned: a small one
@@ -71,8 +72,8 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
         domain, source.path, source.config, from_values(TrainMetaConfig, settings, "train-meta"), seed, layouts=others
     )
     continue_with(loop, artefact)
-    if loop.chooser.FILE in files:
-        loop.chooser.load(load_tensors(artefact.path / loop.chooser.FILE))
+    if FILE in files:
+        loop.chooser.load(load_tensors(artefact.path / FILE))
     return loop
 
 

@@ -21,7 +21,7 @@ from hypogoal.learners.double_dqn import descend
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, meta_network
 from hypogoal.meta.smdp import smdp_advantages
-from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
+from hypogoal.options.choosers import FILE, Chooser, Ids, Offered, Outcome
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import apply_to_states
 
@@ -178,7 +178,7 @@ class MetaPolicy(Chooser):
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
-        check_fit(self.state(), state, "meta.safetensors", AGAIN)
+        check_fit(self.state(), state, FILE, AGAIN)
         self.policy.load_state_dict(state)
 
     def snapshot(self) -> State:

@@ -23,7 +23,7 @@ from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
-from hypogoal.options.choosers import load_chooser
+from hypogoal.options import choosers
 from hypogoal.options.config import STACK
 from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
@@ -53,7 +53,7 @@ def assemble(
     there are several, layouts and start states. ``ends`` gives other terminations than the ensemble's, ``standard``
     goes with them; ``layouts`` replace those of ``config``. What does not go together is a ``UserError``.
     """
-    learner, chooser = load_learner(config.network), load_chooser(config.chooser)
+    learner, chooser = load_learner(config.network), choosers.load_chooser(config.chooser)
     if config.termination == ORACLE:
         columns_of(domain, ensemble_config["sub_goals"])
     world = domain.world(played_world(domain, ensemble_config["domain_config"], config.world))
@@ -313,7 +313,7 @@ def write_trained(
         loop.visited.write(folder, domain, ensemble_config, seed)
     save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
     if weights := loop.chooser.state():
-        save_tensors(folder / loop.chooser.FILE, weights)
+        save_tensors(folder / choosers.FILE, weights)
     places = {"start": config.start, "layouts": config.layouts.strip()}
     if places["layouts"].isdecimal():
         seeds = layout_seeds(config.layouts, config.layout_seed)

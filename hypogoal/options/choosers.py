@@ -25,6 +25,7 @@ CHOOSERS = {
     "ppo": "hypogoal.meta.ppo:MetaPolicy",
 }
 
+FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
 Ids = NDArray[np.int64]  # (n,), of environments, states or options
 Offered = NDArray[np.bool_]  # (n, O), the options that may be chosen
 
@@ -47,13 +48,7 @@ class Outcome:
 
 
 class Chooser(Part, ABC):
-    """A policy over options.
-
-    Attributes:
-        FILE: what an artefact calls the file of its :meth:`state`, if there is any.
-    """
-
-    FILE: ClassVar[str] = "meta.safetensors"
+    """A policy over options."""
 
     @classmethod
     def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
