@@ -98,7 +98,7 @@ def experiment(domain: str, *, stages: Sequence[str]) -> Callable[[Callable[...,
     """
 
     def decorated(function: Callable[..., Iterable[Any]]) -> Experiment:
-        return _experiment_of(function, domain=domain, stages=(*stages,))
+        return _experiment_of(function, domain, stages)
 
     return decorated
 
@@ -133,7 +133,9 @@ def run_config(fields: Sequence[tuple[str, Any, Any]], workers: int = 0, evaluat
     return make_dataclass("RunConfig", [*fields, *common], namespace=namespace, frozen=True)
 
 
-def _experiment_of(function: Callable[..., Iterable[Any]], domain: str | None = None, **more: Any) -> Experiment:
+def _experiment_of(
+    function: Callable[..., Iterable[Any]], domain: str | None = None, stages: Sequence[str] = ()
+) -> Experiment:
     """A function as an experiment whose settings are those that the function's signature describes."""
     fields = []
     with UsersCode("the experiment", function):
@@ -149,4 +151,4 @@ def _experiment_of(function: Callable[..., Iterable[Any]], domain: str | None = 
             do = "Make it keyword-only, a bool, int, float, str or a tuple of one of them, with a default."
             raise UserError("this argument of an experiment cannot be a setting", f"{function.__name__}: {name}", do)
         fields.append((name, kind, setting(parameter.default, **metadata)))
-    return Experiment(function.__name__.replace("_", "-"), function, run_config(fields), domain, **more)
+    return Experiment(function.__name__.replace("_", "-"), function, run_config(fields), domain, (*stages,))
