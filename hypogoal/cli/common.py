@@ -104,8 +104,8 @@ def offer(kind: str) -> Any:
 
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
-OWN_PRESET = "demo, paper, or your .toml file."
-Preset = Annotated[str | None, Option("--preset", help=OWN_PRESET, autocompletion=offer("preset"))]
+PRESET = "demo, paper, or your .toml file."
+Preset = Annotated[str | None, Option("--preset", help=PRESET, autocompletion=offer("preset"))]
 DOMAINS = "doorkey, montezuma, rooms, or module:object."
 DomainName = Annotated[str, Argument(help=DOMAINS, autocompletion=offer("domain"))]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."

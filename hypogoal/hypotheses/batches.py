@@ -82,7 +82,7 @@ class TrainingStates:
         return list(logits.split(sizes, dim=1))
 
     def _inputs(
-        self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator] = ()
+        self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator]
     ) -> Tensor | patches.Batch:
         """The networks' inputs for groups of states: images, or their patches."""
         if self._tables is not None:
@@ -92,14 +92,14 @@ class TrainingStates:
         return self._images_of(np.concatenate(groups), None)
 
     def count_in(
-        self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
+        self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator
     ) -> None:
         """Update BatchNorm's running statistics, of networks in training mode, with states (B,), and nothing else."""
         first = [_up_to_last_norm(network) for network in networks]
         if not any(len(network) for network in first):
             return
         with torch.no_grad():
-            inputs = self._inputs([states], [changes] if changes else [])
+            inputs = self._inputs([states], [changes])
             for network in first:
                 _forward(network, inputs, [len(states)])
 

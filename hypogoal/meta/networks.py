@@ -34,14 +34,13 @@ class LightMetaNetwork(LightNetwork):
 
 
 class PaperMetaNetwork(nn.Module):
-    """The paper's: three convolutions with ReLU between, a dense layer, shared by actor and critic.
+    """The paper's, of pictures: three convolutions with ReLU between, a dense layer, shared by actor and critic.
 
     The paper gives no sizes; 16, 32 and 32 channels with kernel 3 and stride 2, dense 256, are ours.
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None):
+    def __init__(self, observation_shape: tuple[int, ...], options: int):
         super().__init__()
-        assert standard is None, "pictures only"
         height, width, depth = observation_shape
         self.features = nn.Sequential(
             nn.Conv2d(depth, 16, 3, stride=2), nn.ReLU(),
@@ -157,5 +156,5 @@ def meta_network(
 ) -> LightMetaNetwork | PaperMetaNetwork:
     """The network of this ``name``: ``light``, ``paper``, or ``module:function``, as a light network's embedding."""
     if name == "paper":
-        return PaperMetaNetwork(observation_shape, options, standard)
+        return PaperMetaNetwork(observation_shape, options)
     return LightMetaNetwork(observation_shape, options, standard, name)

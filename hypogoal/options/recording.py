@@ -30,7 +30,7 @@ class Execution(NamedTuple):
     inside_at_start: bool  # its own classifier was positive where it began
     terminated: bool  # it ended in a terminal state of the episode
     states: list[int]  # the ids of those that it came to, the last one that it ended in
-    began: int = -1  # the id of the one before them
+    began: int  # the id of the one before them
 
 
 class Recorder(Resumable):

@@ -40,8 +40,8 @@ class _Network:
         yield "gradients", self.gradients
         yield "stored and read", self.stored
 
-    def ensemble(self, members: int = 2) -> Ensemble:
-        return Ensemble(self.name, self.shape, members, torch_generator(0, "check"), self.view)
+    def ensemble(self) -> Ensemble:
+        return Ensemble(self.name, self.shape, 2, torch_generator(0, "check"), self.view)
 
     def network(self) -> nn.Sequential:
         return build_network(self.name, self.shape, torch_generator(0, "check"))

@@ -12,7 +12,7 @@ from hypogoal.diversity import Context, Objective
 from hypogoal.testing.verdict import Verdict, promise, run
 
 EXTREME = (20.0, 100.0, 1e4)  # logit gaps: from 17, a float32 probability is exactly 0 or 1
-AGREED = ((1, 0), (1, 1), (0, 0))
+SURE, AGREED = 10.0, ((1, 0), (1, 1), (0, 0))  # logit gap and classes of members that agree
 LEAST_GRADIENT = 1e-6
 LOG_SPACE = "Compute from log_softmax"
 
@@ -64,13 +64,13 @@ def disagreement_lowers_it(objective: Objective) -> str:
 
 
 def context_of(
-    members: int = 3, states: int = 7, frozen: int = 0, *, gap: float = 1.0, seed: int = 3, dtype: Any = torch.float64
+    members: int = 3, states: int = 7, frozen: int = 0, *, gap: float = 1.0, dtype: Any = torch.float64
 ) -> Context:
     """A differentiable batch of random members: 6 labelled and ``states`` unlabelled states.
 
     ``gap`` is the standard deviation of the logits; members agree on half of the unlabelled states.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(3)
 
     def normal(*size: int) -> Tensor:
         return torch.randn(*size, generator=generator, dtype=dtype)
@@ -129,7 +129,7 @@ def finite_at_extreme_logits(objective: Objective) -> str:
     return f"logits up to {EXTREME[-1]:g} apart"
 
 
-def gradient_does_not_vanish(objective: Objective, gap: float = 10.0) -> str:
+def gradient_does_not_vanish(objective: Objective) -> str:
     """Each of three members gets a gradient.
 
     Of a pair, confident members that agree must also be pushed apart. An objective that compares members across states,
@@ -142,9 +142,9 @@ def gradient_does_not_vanish(objective: Objective, gap: float = 10.0) -> str:
     text = f"member {largest.index(min(largest))} gets a gradient of {min(largest):.1g}"
     promise(min(largest) >= LEAST_GRADIENT, text, "Do not detach it, and compute from log_softmax.")
     if objective.pair_loss:
-        agreed = [torch.stack([confident(*classes, gap=gap)] * 2).requires_grad_() for classes in AGREED]
+        agreed = [torch.stack([confident(*classes, gap=SURE)] * 2).requires_grad_() for classes in AGREED]
         sure = max(float(torch.autograd.grad(objective.pair_loss(*pair), pair)[0].abs().max()) for pair in agreed)
-        text = f"members that agree with logits {gap:g} apart get a gradient of {sure:.1g}"
+        text = f"members that agree with logits {SURE:g} apart get a gradient of {sure:.1g}"
         promise(sure >= LEAST_GRADIENT, text, f"{LOG_SPACE}: from probabilities nothing of it is left.")
     return f"at least {min(largest):.2g} for each member"
 
