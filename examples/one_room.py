@@ -322,7 +322,7 @@ class Patience(Terminations):
     It falls to ``NEXT`` of the highest log-odds among these steps, never below ``LEAST`` of the first threshold.
     """
 
-    LENGTH = "STEPS"
+    NUMBERED = True
     CHANGING = (*Terminations.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
 
     def __init__(self, *arguments: Any, **more: Any):

@@ -41,11 +41,11 @@ class Terminations(Part):
         length: the number behind the rule's name.
 
     Attributes:
-        LENGTH: what the number behind the rule's name counts; empty where it has none.
+        NUMBERED: whether a number, ``length``, stands behind the rule's name.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
-    LENGTH: ClassVar[str] = ""
+    NUMBERED: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ def rule_of(termination: str) -> tuple[type[Terminations], int]:
         raise UserError("unknown termination", f"termination={termination}", do)
     with vouched(*([name] if termination in allowed() else [])):  # who gave the rule with its number gave its name
         rule = load_part(name, "termination rule", Terminations, RULES)
-    if bool(rule.LENGTH) != bool(number) or (number and int(number) < 1):
+    if bool(number) != rule.NUMBERED or (number and int(number) < 1):
         raise UserError("unknown termination", f"termination={termination}", do)
     return rule, int(number or 0)
 

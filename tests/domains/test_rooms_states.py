@@ -78,7 +78,7 @@ def test_labelled_states_are_aligned(names: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("mix", [0.0, 0.1, 0.25, 0.5, 1.0])
 def test_mix_is_the_share_of_states_drawn_factor_by_factor(mix: float) -> None:
     """Of those drawn factor by factor 14 of 16 are not aligned, so a state is not with a probability of 7/8 mix."""
-    factors = unlabelled_states(4000, mix, 5).factors
+    factors = unlabelled_states(4000, mix, 5, FACTORS).factors
     crossing = int((factors != factors[:, :1]).any(axis=1).sum())
     assert binomtest(crossing, 4000, mix * 7 / 8).pvalue > 1e-3 if mix else crossing == 0
     for holds in factors.T:

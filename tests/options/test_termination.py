@@ -139,7 +139,7 @@ def test_what_was_said_stands(asked: str, monkeypatch: pytest.MonkeyPatch) -> No
 class AtLeast(Terminations):
     """A rule with a number."""
 
-    LENGTH = "STEPS"
+    NUMBERED = True
 
 
 def test_rules_are_read_from_their_names(monkeypatch: pytest.MonkeyPatch) -> None:

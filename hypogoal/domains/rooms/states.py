@@ -35,14 +35,14 @@ class Scenes:
     factors: NDArray[np.bool_]  # (N, F), the requested ones; others are drawn evenly
 
 
-def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
+def labelled_states(count: int, seed: int, names: Sequence[str]) -> Scenes:
     """The labelled context: every factor holds in half of the states, the positives, and none in the others."""
     rng = rng_for(seed, "which-feature", "labelled")
     holds = rng.permutation(np.arange(count) % 2 == 0)
     return drawn(np.repeat(holds[:, None], len(names), axis=1), names, rng)
 
 
-def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
+def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str]) -> Scenes:
     """States without labels.
 
     ``mix`` is the probability that a state's factors are drawn independently and evenly; else all are one even bit.
@@ -52,7 +52,7 @@ def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str] = 
     return drawn(np.where(rng.random((count, 1)) < mix, independent, joint), names, rng)
 
 
-def crossed_states(copies: int, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
+def crossed_states(copies: int, seed: int, names: Sequence[str]) -> Scenes:
     """Every combination of factors ``copies`` times, in random order."""
     rng = rng_for(seed, "which-feature", "test")
     every = np.array(list(product((False, True), repeat=len(names))))
