@@ -102,6 +102,7 @@ def make_seeds(root: Path) -> None:
     options = len(SUB_GOALS) * MEMBERS
     settings = about | {"network": "light", "termination": "learned", "chooser": "ppo", "layout_seed": 100, "steps": 50}
     settings |= {"option_timeout": 10, "mask_reached": True, "setting": "light", "max_episode_steps": 60}
+    settings |= {"embedding": "auto", "layouts": ""}
     for kind, inputs in (("options", ["ensemble"]), ("meta", ["ensemble", "options"])):
         with create_artefact(
             root / kind, kind=kind, config=settings, seed=0, inputs=[root / name for name in inputs]
