@@ -45,7 +45,7 @@ GOES_BY = (
     r"|counts\.|arrays\.examples.*kinds"
 )
 MADE_BY = (
-    r"kind$|inputs\..*sha256$|relative$|files|sub_goals\.\*$|network$|rooms\.config\.domain|config\.(members|diversity|network|sub_goals|agent"
+    r"kind$|inputs\..*sha256$|relative$|files|observation_dtype|config\.view|sub_goals\.\*$|network$|rooms\.config\.domain|config\.(members|diversity|network|sub_goals|agent"
     r"|observation_shape|setting|steps|start|termination|mask_reached|chooser)\.None$|options\.config\.domain\.None"
 )
 COMPARED_BY = r"sub_goal$|domain$"

@@ -75,7 +75,7 @@ def test_a_strangers_experiment_runs_none_of_its_code(
     commands = tuple(text.replace("DATA", str(data)).replace("THEIRS", str(theirs)) for text in SPELLINGS)
     axes = 'own = ["evilmod:obj"], setting = ["network=evilmod:obj"]'
     stranger = experiment(tmp_path / "stranger.toml", (commands[1], commands[8], commands[-1]), axes)
-    assert main(["sweep", str(stranger), "--out", "out", "-y", "-q"]) == 2
+    assert main(["sweep", str(stranger), "--out", "out", "-q"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     told = [last_line(log) for log in (tmp_path / "out" / "logs").glob("*.log")]
     assert len(told) == 3
@@ -113,7 +113,7 @@ def test_what_the_user_gave_or_allowed_is_run_in_cells(tmp_path: Path, monkeypat
         f"train-ensemble {corridor} {few}1",
     )
     toml = experiment(tmp_path / "own.toml", commands, 'own = ["doorkey"], setting = ["x"]')
-    run("sweep", toml, "--out", "out", "-y", "-q", "--set", "own=wide_network:wide")
+    run("sweep", toml, "--out", "out", "-q", "--set", "own=wide_network:wide")
     assert len([*tmp_path.glob("out/c?/*/manifest.json")]) == 2
 
 
