@@ -65,7 +65,8 @@ def figure6(
     paper_agents = agents_of(paper_layouts, paper_seeds, paired=paired)
     yield Command("data", "collect doorkey")
     for method, seed in product(methods, seeds):
-        ensemble, columns = f"ensemble/method-{method}-seed-{seed}", {"method": method, "seed": seed}
+        ensemble = f"ensemble/method-{method}-seed-{seed}"
+        columns: dict[str, str | int] = {"method": method, "seed": seed}
         yield Command(ensemble, f"train-ensemble @data {METHODS[method]} --seed {seed}", columns)
         of_seed = [agent for agent in agents if agent[1] == seed]
         for agent in of_seed:
