@@ -146,7 +146,7 @@ def test_what_a_session_shows_is_one_useful_line(options: Options) -> None:
 class Falling(Terminations):
     """After so many executions in all the thresholds of all options fall."""
 
-    LENGTH = "EXECUTIONS"
+    NUMBERED = True
     CHANGING = (*Terminations.CHANGING, "ended")
 
     def __init__(self, *arguments: Any, **more: Any):

@@ -68,7 +68,7 @@ class Straight(Learner):
 class AtLeast(Terminations):
     """No execution reaches its sub-goal in its first ``length`` steps."""
 
-    LENGTH = "STEPS"
+    NUMBERED = True
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
         return self.of_running(ids, options) & (age >= self.length)
