@@ -1,16 +1,12 @@
 """hypogoal: transferable sub-goals by hypothesising which features generalise.
 
-Its environments are registered with Gymnasium. The heavy parts (torch, the environments' modules) are imported on first
-use, so that ``import hypogoal`` and the command line's ``--help`` stay fast.
+Its environments are registered with Gymnasium if that was imported before, else by :mod:`hypogoal.envs`. Heavy parts
+(torch, the environments' modules) are imported on first use, so that ``import hypogoal`` and ``--help`` stay fast.
 """
 
-import contextlib
 import importlib
 import sys
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
-
-from hypogoal.core.surroundings import Around, close_library_path
 
 __version__ = "0.24.0"
 
@@ -33,6 +29,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
+        importlib.import_module("hypogoal.envs")
         return getattr(importlib.import_module(_LAZY.get(name, "hypogoal.api")), name)
     raise AttributeError(f"module 'hypogoal' has no attribute {name!r}")
 
@@ -41,21 +38,6 @@ def __dir__() -> list[str]:
     return __all__
 
 
-@contextlib.contextmanager
-def _registered(_gymnasium: object = None) -> Iterator[None]:
-    """Register the environments once Gymnasium is loaded; their modules are loaded when one is made."""
-    yield
-    from gymnasium import register
-
-    register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
-    register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
-
-
 if "gymnasium" in sys.modules:
-    with _registered():
-        pass
-else:
-    # Importing Gymnasium here would take longer than the rest of this package. An entry point ``gymnasium.envs`` would
-    # need an installed package and load hypogoal in every program that uses Gymnasium.
-    sys.meta_path.insert(0, Around("gymnasium", _registered))
-close_library_path()
+    # Not otherwise: importing Gymnasium takes longer than the rest of this package.
+    importlib.import_module("hypogoal.envs")

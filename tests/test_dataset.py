@@ -1,7 +1,5 @@
 """The data file: whole or refused in one line (Spec A1, A8, G2)."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
@@ -37,26 +35,6 @@ def test_a_file_that_is_open_elsewhere_is_not_damaged(tmp_path: Path) -> None:
         fcntl.flock(other, fcntl.LOCK_EX)  # as HDF5 does for who writes
         assert "Collect" not in refuses("is open in another program", "show", path)
     run("verify", path)
-
-
-@pytest.mark.parametrize(
-    "first",
-    [
-        "import gymnasium, hypogoal",
-        "import hypogoal, gymnasium",
-        "import hypogoal, importlib.util; assert importlib.util.find_spec('gymnasium')",
-        "import hypogoal; hypogoal.load_ensemble",
-        "import hypogoal.domains.doorkey",
-    ],
-)
-def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> None:
-    """Spec B1: the README's example works where nothing else was imported, and whatever first wants Gymnasium."""
-    code = f"""{first}
-import gymnasium
-assert "hypogoal/MontezumaLadder-v0" in gymnasium.registry
-print(gymnasium.make("hypogoal/DoorKey-8x8-v0").observation_space.shape)"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "(64, 64, 3)", done.stderr
 
 
 def test_some_heldout_states_are_of_both_classes_and_as_in_the_file(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from hypogoal.cli import stages, sweep, inspect, own_data  # isort: skip  # so -
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core import stopping
 from hypogoal.core.errors import Complete, NumericalError, UserError, one_line
-from hypogoal.core.surroundings import shield
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
 from hypogoal.settings import CONFIGS, TABLES
 
@@ -58,7 +57,6 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, stopping.stop)  # a cancelled job, too, leaves nothing half-written
         sys.unraisablehook = stopping.unraised
         open_streams()
-        shield()
     words = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in words
     words = [argument for argument in words if argument != "--debug"]

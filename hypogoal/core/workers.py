@@ -1,11 +1,12 @@
 """Work on several cores, in processes of its own, none of which outlives its parent."""
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
@@ -13,7 +14,6 @@ from typing import TypeVar
 from hypogoal.core import own_code
 from hypogoal.core.errors import Killed
 from hypogoal.core.own_code import users_own
-from hypogoal.core.surroundings import environment, shield
 
 T = TypeVar("T")
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # the same for a Python that multiprocessing starts
@@ -51,11 +51,11 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     before = set(multiprocessing.active_children())
     # Spawned, not forked: a fork would copy the caller's threads and locks.
     spawn = multiprocessing.get_context("spawn")
-    with environment(**SAFE_PATH):
+    with _environment(**SAFE_PATH):
         pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
         trusted = own_code.allowed()
-        with environment(**SAFE_PATH):
+        with _environment(**SAFE_PATH):
             futures = {pool.submit(_guarded, task, trusted): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
@@ -74,9 +74,21 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         pool.shutdown(cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    """Set environment variables within the block."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
+
+
 def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C; it sends SIGTERM
-    shield()
     die_with_parent()
     if os.getppid() != parent:
         os._exit(128 + KILLED)

@@ -81,7 +81,7 @@ class DoorKeyDomain(Domain):
     observation_shape = env.OBSERVATION_SHAPE
     config_class = DoorKeyConfig
     engine_settings = ("door_label", "wrong_key")
-    env_id = "hypogoal/DoorKey-8x8-v0"
+    env_id = "hypogoal.envs:hypogoal/DoorKey-8x8-v0"
     many_layouts = True
     defaults, sources = DEFAULTS, SOURCES
 

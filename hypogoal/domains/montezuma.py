@@ -133,7 +133,7 @@ class MontezumaDomain(Domain):
     usual_sub_goals = (CLIMB_DOWN.name,)
     observation_shape = OBSERVATION_SHAPE
     config_class = MontezumaConfig
-    env_id = "hypogoal/MontezumaLadder-v0"
+    env_id = "hypogoal.envs:hypogoal/MontezumaLadder-v0"
     starts = tuple(BEGINNINGS)
     many_starts = True
     kinds = KINDS

@@ -45,7 +45,7 @@ def test_an_agents_episodes_are_a_minari_dataset(agent: Path, there: Path) -> No
     dataset = minari.load_dataset("toy-v0")
     assert dataset.total_episodes == EPISODES
     assert re.search(rf"{EPISODES} episodes, {dataset.total_steps} steps", said)
-    env = gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=LAYOUT)
+    env = gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=LAYOUT)
     assert dataset.observation_space == env.observation_space
     assert dataset.action_space == env.action_space
     for episode in dataset.iterate_episodes():

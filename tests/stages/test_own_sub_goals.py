@@ -26,7 +26,7 @@ FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episode
 
 def walked(layout_seed: int, steps: int) -> np.ndarray:
     """What random play sees, uint8 (steps, 64, 64, 3)."""
-    env = gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=layout_seed)
+    env = gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=layout_seed)
     env.reset(seed=0)
     rng = np.random.default_rng(layout_seed)
     return np.stack([env.step(int(rng.integers(3)))[0] for _ in range(steps)])

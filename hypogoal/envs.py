@@ -1,0 +1,10 @@
+"""Register the environments with Gymnasium: ``gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0")``.
+
+Their modules are loaded when one is made. Since 1.0 Gymnasium asks no entry points of installed packages: who wants an
+environment imports a package, or names a module before the id.
+"""
+
+from gymnasium import register
+
+register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
+register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
