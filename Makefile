@@ -58,7 +58,7 @@ versions: ## the quick tests on the other versions of Python, where they are at 
 	@for version in $(OTHERS); do \
 		if python$$version -c "" 2>/dev/null; then \
 			$(MAKE) test PYTHON=python$$version VENV=.venv-$$version \
-				TESTS="tests/core tests/hypotheses tests/library tests/test_cli.py tests/test_dataset.py" || exit 1; \
+				TESTS="tests/core tests/hypotheses tests/library tests/test_cli.py tests/test_data.py" || exit 1; \
 		else echo "no Python $$version here"; fi; \
 	done
 

@@ -23,7 +23,8 @@ from robot_arm import FPS, HEIGHT, KEYS, WIDTH, play
 
 import hypogoal
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
-from hypogoal.dataset import digest, open_dataset
+from hypogoal.data import open_dataset
+from hypogoal.observations import digest
 
 GOAL = "block-in-bin"
 FEATURES = {key: {"dtype": "image", "shape": [HEIGHT, WIDTH, 3]} for key in KEYS} | {

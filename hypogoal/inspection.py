@@ -30,8 +30,9 @@ from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
-from hypogoal.dataset import PICTURE, SPLITS, open_dataset, type_text
+from hypogoal.data import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
+from hypogoal.observations import PICTURE, type_text
 
 # The numbers of logs and their titles, in the order in which they are shown.
 RESULTS = {"labelled": "labelled loss"}

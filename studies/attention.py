@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.compute import prepare
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import spread_rows
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE
 from hypogoal.domains.montezuma_emulator import observed_pixel
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
@@ -28,6 +27,7 @@ from hypogoal.hypotheses.deep_lift import attributed, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.observations import spread_rows
 from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 from studies.ladders import METHODS as OF_LADDERS
 from studies.ladders import states_of

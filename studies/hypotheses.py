@@ -30,7 +30,7 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected
+from hypogoal.data import Collected
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble

@@ -24,7 +24,7 @@ from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
 from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected
+from hypogoal.data import Collected
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
 from hypogoal.hypotheses.config import EnsembleConfig

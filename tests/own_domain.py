@@ -7,7 +7,7 @@ import numpy as np
 from corridor import LENGTH, Corridor
 
 from hypogoal.core.config import setting
-from hypogoal.dataset import Collected, States
+from hypogoal.data import Collected, States
 from hypogoal.domains.base import Domain
 
 

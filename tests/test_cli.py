@@ -14,7 +14,7 @@ from toy_data import reseal
 
 import hypogoal
 from hypogoal.core.config import describe
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.settings import CONFIGS
 from hypogoal.stages.sweep import config_class_of
 

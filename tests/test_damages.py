@@ -22,7 +22,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import set_attribute
 from hypogoal.core.manifests import MANIFEST
 from hypogoal.core.tensors import load_tensors
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.inspection import faults_of
 
 OBSERVATIONS, LABELS, ORIGIN = (f"labelled/one/{name}" for name in ("observations", "labels", "origin"))

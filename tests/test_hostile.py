@@ -18,7 +18,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
 from hypogoal.core.hdf5 import set_attribute, walk
 from hypogoal.core.tensors import load_fitting, load_tensors
-from hypogoal.dataset import Collected, States, open_dataset, write_dataset
+from hypogoal.data import Collected, States, open_dataset, write_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.named import EXPERIMENTS
 from hypogoal.experiments.planning import make_plan

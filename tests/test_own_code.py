@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from hypogoal.cli import main
 from hypogoal.core.errors import Complete
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 

@@ -24,7 +24,7 @@ from packaging.version import Version
 import hypogoal
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.seeding import torch_generator
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -286,7 +286,7 @@ def test_results_are_not_committed_by_mistake(tmp_path: Path) -> None:
     """data/ and runs/ are ignored but for their README; sources are not."""
     shutil.copy(ROOT / ".gitignore", tmp_path)
     subprocess.run(["git", "init", "-q", "."], cwd=tmp_path, check=True)
-    wanted = {"data/README.md", "runs/README.md", "hypogoal/dataset.py", "hypogoal/core/artefacts.py"}
+    wanted = {"data/README.md", "runs/README.md", "hypogoal/data.py", "hypogoal/core/artefacts.py"}
     unwanted = {"data/doorkey.h5", "runs/demo/manifest.json", ".venv/bin/python", "tests/__pycache__/a.pyc"}
     paths = "\n".join(wanted | unwanted)
     done = subprocess.run(["git", "check-ignore", "--stdin"], cwd=tmp_path, input=paths, capture_output=True, text=True)

@@ -11,7 +11,7 @@ import torch
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.manifests import LOG, MANIFEST, NUMBERS_CSV, sealed
 from hypogoal.core.tensors import save_tensors
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 
 SHAPE = (4, 5, 3)
 

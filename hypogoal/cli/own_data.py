@@ -74,7 +74,8 @@ def import_(
 
 def _print_observations(data: Path, resized: bool, quiet: bool) -> None:
     """Say how states were read, as pictures or numbers; of large pictures, how to import them smaller."""
-    from hypogoal.dataset import PICTURE, fields_of, open_dataset
+    from hypogoal.data import open_dataset
+    from hypogoal.observations import PICTURE, fields_of
 
     dataset = open_dataset(data)
     for key, (dtype, shape) in fields_of(dataset.observation_shape, dataset.observation_dtype).items():

@@ -134,7 +134,7 @@ def audit(
 
 def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, member: int | None) -> None:
     from hypogoal.core.artefacts import DATA, TO_FILL_IN, open_artefact
-    from hypogoal.dataset import open_dataset
+    from hypogoal.data import open_dataset
     from hypogoal.stages.audit_recorded import audit_recorded, lines_of
 
     if not Path(source).is_dir() or member is not None or call.settings or call.preset or call.how["resume"]:

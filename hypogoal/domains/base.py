@@ -15,8 +15,9 @@ from hypogoal.core.checkpoints import ANEW, Resumable
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import PICTURE, Collected, Observations, Standard
+from hypogoal.data import Collected
 from hypogoal.domains.observations import reading_of
+from hypogoal.observations import PICTURE, Observations, Standard
 
 if TYPE_CHECKING:
     import gymnasium

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hypogoal.core.config import setting
-from hypogoal.dataset import Collected, States, joined, leave_out, require_classes
+from hypogoal.data import Collected, States, joined, leave_out, require_classes
 from hypogoal.domains import doorkey_env as env
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey_defaults import DEFAULTS, SOURCES

@@ -15,9 +15,10 @@ from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import GET_MORE, Collected, Observations, States, Unmet, digest, require_classes
+from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
 from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
+from hypogoal.observations import Observations, digest
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 """How to play when collecting states: (environment, observation, random numbers) -> action."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest, mixed_type
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 from hypogoal.domains.observations import CLEARLY, Reading, reading_of, resized_picture
+from hypogoal.observations import NUMBERS, PICTURE, Observations, digest, mixed_type
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import digest
 from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.montezuma_emulator import RAM, Emulator, Position
 from hypogoal.domains.montezuma_ladders import (
@@ -28,6 +27,7 @@ from hypogoal.domains.montezuma_ladders import (
     within,
 )
 from hypogoal.domains.montezuma_sub_goals import FACT_BYTES, SubGoal
+from hypogoal.observations import digest
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DYING, ELSEWHERE = range(len(KINDS))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hypogoal.dataset import NUMBERS, PICTURE
+from hypogoal.observations import NUMBERS, PICTURE
 
 MOST_CHANNELS = 16  # an axis as short as this may hold channels or frames; the sides of a picture are longer
 CLEARLY = "Give pictures as uint8 (H, W, C), stacked frames among the channels, and numbers as one row of float32."

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.numbers import grouped
@@ -25,6 +24,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.episodes import Frame
+from hypogoal.observations import PICTURE
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, variants
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, attribution_image, brightness, flat, image_png, reduced, to_bytes
 from hypogoal.evaluation.table import Row
+from hypogoal.observations import PICTURE
 
 MOST_STATES = 300  # over all sub-goals: the page of the ladders has 1.4 MB
 MOST_OF_ONE = 180  # of one sub-goal

@@ -17,11 +17,12 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.dataset import Observations, States, fields_of, open_dataset
+from hypogoal.data import States, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
 from hypogoal.evaluation.run import Contents
 from hypogoal.evaluation.table import Row
+from hypogoal.observations import Observations, fields_of
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.curves import Run

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.dataset import States, spread_rows
+from hypogoal.data import States
 from hypogoal.evaluation.plots import PALETTE
+from hypogoal.observations import spread_rows
 
 if TYPE_CHECKING:
     from hypogoal.meta.episodes import Frame

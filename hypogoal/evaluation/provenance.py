@@ -7,7 +7,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import Block, Entry, Material

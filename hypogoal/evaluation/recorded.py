@@ -12,19 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from hypogoal.dataset import (
-    PICTURE,
-    Observations,
-    States,
-    fields_of,
-    numbers_of,
-    spread_rows,
-    standard_of,
-    standardised,
-)
+from hypogoal.data import States
 from hypogoal.domains.observations import resized_picture
 from hypogoal.evaluation.pictures import coloured, reduced
 from hypogoal.hypotheses.thresholds import log_odds_of
+from hypogoal.observations import PICTURE, Observations, fields_of, numbers_of, spread_rows, standard_of, standardised
 
 GRID = 16  # areas along a side of a picture, whose means are compared
 DIRECTIONS = 16  # of the states' largest variance

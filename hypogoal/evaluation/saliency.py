@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hypogoal.core.hdf5 import fixed
-from hypogoal.dataset import PICTURE, fields_of, open_dataset, spread_rows
+from hypogoal.data import open_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judgement, Work, parts_of
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, brightness, flat, image_png
 from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
 from hypogoal.evaluation.table import Row
+from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 SPREAD = "spread"  # a state as any other
 KINDS = {"true positive": "a true positive", "disagree": "members disagree", "false positive": "a false positive"}

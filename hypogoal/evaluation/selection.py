@@ -14,7 +14,6 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import variants, which
@@ -27,6 +26,7 @@ from hypogoal.evaluation.run import takes, thresholds_of, within
 from hypogoal.evaluation.table import Row, by_fields, by_run, rows_by_member, select
 from hypogoal.hypotheses.scores import member_scores, most_and_least, ratio
 from hypogoal.meta.config import layout_seeds
+from hypogoal.observations import PICTURE
 from hypogoal.options.tables import Choices
 
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth

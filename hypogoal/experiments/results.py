@@ -14,7 +14,7 @@ from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_text, write_table
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.evaluation import curves, distance
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.run import read_layout

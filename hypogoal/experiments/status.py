@@ -17,7 +17,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.manifests import digest_of
 from hypogoal.core.progress import duration
 from hypogoal.core.terminal import amount
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.evaluation.run import find
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.records import Record, is_running, last_line, log_of, read_plan, read_record

@@ -13,11 +13,12 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Observations, require_classes, values_in
+from hypogoal.data import require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
 from hypogoal.hypotheses.views import Origins, View
+from hypogoal.observations import Observations, values_in
 
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
 PLAIN = View()

@@ -22,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of
 from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
+from hypogoal.observations import NUMBERS, PICTURE, Observations, fields_of
 
 DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
 STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together

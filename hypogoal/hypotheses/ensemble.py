@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, packed, type_of, type_text, values_in
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import FULL
 from hypogoal.hypotheses.networks import (
@@ -31,6 +30,7 @@ from hypogoal.hypotheses.networks import (
     reordered,
 )
 from hypogoal.hypotheses.views import FullView, View, own_view, standard_shape
+from hypogoal.observations import NUMBERS, PICTURE, Observations, packed, type_of, type_text, values_in
 
 THRESHOLD = 0.5  # of the probability, unless another is set
 IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many

@@ -26,8 +26,8 @@ from torch.nn.utils import fuse_conv_bn_eval
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
 from hypogoal.core.tensors import KEPT
-from hypogoal.dataset import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
 from hypogoal.hypotheses.load import ByKey
+from hypogoal.observations import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations

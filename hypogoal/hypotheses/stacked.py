@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.compute import tensor
-from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.views import FullView
+from hypogoal.observations import Observations
 
 WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
 

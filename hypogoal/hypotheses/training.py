@@ -16,7 +16,6 @@ from torch.nn import functional
 from hypogoal.core.checkpoints import Checkpoints, Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
-from hypogoal.dataset import Observations
 from hypogoal.diversity import Context, load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -24,6 +23,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.teacher import taught_by
 from hypogoal.hypotheses.thresholds import PAPER, SPLIT, thresholds
 from hypogoal.hypotheses.views import StateOrigins, view_of
+from hypogoal.observations import Observations
 
 OnStep = Callable[[int, dict[str, float]], None]
 Look = Callable[[int, Ensemble], None]

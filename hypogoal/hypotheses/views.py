@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from hypogoal.core.config import from_values, parse_assignments
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_own
-from hypogoal.dataset import (
+from hypogoal.hypotheses.config import FULL, EnsembleConfig
+from hypogoal.observations import (
     NUMBERS,
     PICTURE,
     Observations,
@@ -26,7 +27,6 @@ from hypogoal.dataset import (
     standard_of,
     standardised,
 )
-from hypogoal.hypotheses.config import FULL, EnsembleConfig
 
 ENTRY_POINTS = "hypogoal.views"  # with which other packages add views
 Origins = Mapping[str, NDArray[np.int64]]

@@ -10,10 +10,10 @@ from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.dataset import Observations
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.training import ONE_LAYOUT, assemble, continue_with
+from hypogoal.observations import Observations
 from hypogoal.options.choosers import FILE
 from hypogoal.options.loop import OptionLoop, Transitions
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hypogoal.dataset import Standard
+from hypogoal.observations import Standard
 from hypogoal.options.networks import WIDTH, CellEmbedding, Embedding, LightNetwork, NumberEmbedding, OwnEmbedding
 
 

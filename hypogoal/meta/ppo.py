@@ -15,12 +15,12 @@ from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
-from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, meta_network
 from hypogoal.meta.smdp import smdp_advantages
+from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Ids, Offered, Outcome
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import apply_to_states

@@ -19,10 +19,10 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
-from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
+from hypogoal.observations import PICTURE, Standard, standard_of
 from hypogoal.options import choosers
 from hypogoal.options.config import STACK
 from hypogoal.options.learner import load_learner

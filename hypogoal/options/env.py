@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import as_number
-from hypogoal.dataset import Observations
 from hypogoal.domains.base import load_domain
 from hypogoal.domains.gymnasium_engine import begun, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
+from hypogoal.observations import Observations
 from hypogoal.options.learner import Policies
 from hypogoal.options.loop import offered_options
 

@@ -14,10 +14,10 @@ from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN
-from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon
+from hypogoal.observations import Observations
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration

@@ -19,11 +19,11 @@ from torch import Tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
-from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
+from hypogoal.observations import Observations
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions

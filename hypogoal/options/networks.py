@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import PICTURE, Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
+from hypogoal.observations import PICTURE, Standard, standard_of, standardised
 
 CELL = 8  # pixels
 WIDTH = 128  # of dense layers

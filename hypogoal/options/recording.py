@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import LAST, EpisodeRecorder
+from hypogoal.observations import Observations
 from hypogoal.options.choosers import Outcome
 from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 

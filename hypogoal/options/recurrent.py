@@ -21,10 +21,10 @@ from hypogoal.core.columns import Columns
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
-from hypogoal.dataset import PICTURE, Observations
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
+from hypogoal.observations import PICTURE, Observations
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected, Observations, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.domains.base import Domain, Engine
+from hypogoal.observations import Observations
 
 VISITED = "visited.h5"
 ORIGINS = ("action", "previous_action")  # that led to a state; -1 where there was none

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
-from hypogoal.dataset import NUMBERS, Dataset, Observations, fields_of
+from hypogoal.data import Dataset
+from hypogoal.observations import NUMBERS, Observations, fields_of
 from hypogoal.own_data.parts import Parts
 
 NEEDED = ("observations", "labels", "unlabelled")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, require_file
-from hypogoal.dataset import PICTURE
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
+from hypogoal.observations import PICTURE
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.parts import STACKED, Parts
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, json_lines, open_file, read_json, read_text
-from hypogoal.dataset import MAX_SIDE, NUMBERS, PICTURE, Observations
 from hypogoal.domains.observations import shrunk_sides
+from hypogoal.observations import MAX_SIDE, NUMBERS, PICTURE, Observations
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.images import FORMATS, MOST_PIXELS
 from hypogoal.own_data.parts import Resize, resize_of

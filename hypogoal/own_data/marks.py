@@ -14,10 +14,11 @@ import numpy as np
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text
-from hypogoal.dataset import NUMBERS, Collected, Dataset, States, digest, joined
+from hypogoal.data import Collected, Dataset, States, joined
+from hypogoal.observations import NUMBERS, digest
 
 # The picture's file, the label (1, 0 or nothing yet), the row among the unlabelled states and its
-# :func:`hypogoal.dataset.digest`, how much members disagree.
+# :func:`hypogoal.observations.digest`, how much members disagree.
 COLUMNS = ("name", "label", "row", "digest", "disagreement")
 REQUIRED = ("label", "row", "digest")
 MOST_BYTES = 1 << 26

@@ -13,8 +13,9 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import PICTURE, write_observations
+from hypogoal.data import write_observations
 from hypogoal.meta.episodes import Episode
+from hypogoal.observations import PICTURE
 from hypogoal.own_data.parts import Parts, Source
 from hypogoal.own_data.recordings import split_episodes
 

@@ -10,20 +10,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import (
-    NUMBERS,
-    PICTURE,
-    Collected,
-    States,
-    hard_to_judge,
-    hard_to_learn,
-    leave_out,
-    packed,
-    require_classes,
-    require_names,
-    type_text,
-)
+from hypogoal.data import Collected, States, hard_to_judge, hard_to_learn, leave_out, require_classes, require_names
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
+from hypogoal.observations import NUMBERS, PICTURE, packed, type_text
 from hypogoal.own_data.supervision import contradictions, looks_of, near_duplicates, require_own_pictures
 
 # Pictures (N, H, W, C) or (N, H, W), or numbers (N, *shape); such arrays by key; or mixed observations (N,).

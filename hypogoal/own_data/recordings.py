@@ -16,8 +16,8 @@ from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Fields, Observations, mixed_type
 from hypogoal.domains.observations import shrunk_picture
+from hypogoal.observations import Fields, Observations, mixed_type
 from hypogoal.own_data.marks import BYTE_ORDER
 from hypogoal.own_data.parts import Parts
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import checked, find, members, open_hdf5, read_array
-from hypogoal.dataset import NUMBERS, PICTURE, Observations
 from hypogoal.domains.observations import shrunk_sides
+from hypogoal.observations import NUMBERS, PICTURE, Observations
 from hypogoal.own_data.parts import Resize, resize_of
 from hypogoal.own_data.recordings import Recording, chosen_keys, kept
 

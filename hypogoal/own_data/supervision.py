@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import PICTURE, Observations, States, digest, spread_rows
+from hypogoal.data import States
 from hypogoal.domains.observations import resized_picture
+from hypogoal.observations import PICTURE, Observations, digest, spread_rows
 
 GRID = 16  # areas along each side of a picture, whose mean brightness is compared
 LEVELS = 8  # of 255: the most by which areas of nearly equal pictures differ, after equalising overall brightness

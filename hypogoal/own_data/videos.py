@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
-from hypogoal.dataset import PICTURE, Observations
 from hypogoal.domains.observations import shrunk_sides
+from hypogoal.observations import PICTURE, Observations
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.images import MOST_PIXELS
 from hypogoal.own_data.parts import Resize, resize_of

@@ -58,7 +58,7 @@ def named(stage: str) -> Any:
 def domain_of(source: Path, stage: str) -> str:
     """The domain of a stage's source, a data file or an ensemble."""
     from hypogoal.core.artefacts import open_artefact
-    from hypogoal.dataset import open_dataset
+    from hypogoal.data import open_dataset
 
     data = stage == "train-ensemble"
     return open_dataset(source).domain if data else str(open_artefact(source, "ensemble").config["domain"])

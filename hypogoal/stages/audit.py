@@ -15,7 +15,6 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.training import training
-from hypogoal.dataset import Standard
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation import exploits
 from hypogoal.evaluation.audit import POLICIES, Classifier, findings, member_of, own_classifier, random_play
@@ -24,6 +23,7 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.config import AuditConfig
 from hypogoal.meta.training import assemble, columns_of, description, start_arguments, train, write_trained
+from hypogoal.observations import Standard
 from hypogoal.options.tables import read_table
 from hypogoal.options.termination import ORACLE, Terminations, rule_of
 

@@ -14,12 +14,13 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import Observations, States, digest, joined, open_dataset, spread_rows
+from hypogoal.data import States, joined, open_dataset
 from hypogoal.evaluation import page, recorded
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Block
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
+from hypogoal.observations import Observations, digest, spread_rows
 from hypogoal.own_data.marks import COLUMNS
 
 COMPARED = 4_000  # unlabelled states, spread over the file

@@ -12,7 +12,7 @@ from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
-from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
+from hypogoal.data import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
 from hypogoal.domains.base import BUILT_IN, Domain
 from hypogoal.options.config import OptionConfig
 

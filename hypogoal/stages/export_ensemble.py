@@ -12,10 +12,10 @@ from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.drafts import draft, put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
-from hypogoal.dataset import fields_of
 from hypogoal.hypotheses import load
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.views import FullView
+from hypogoal.observations import fields_of
 
 CARD = """---
 library_name: hypogoal

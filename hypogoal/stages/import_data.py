@@ -11,7 +11,7 @@ from hypogoal.core.files import replacing
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.terminal import say
-from hypogoal.dataset import Collected, open_dataset, write_dataset
+from hypogoal.data import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays, write_arrays
 from hypogoal.own_data.images import read_images

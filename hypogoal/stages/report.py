@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text, replacing
-from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
+from hypogoal.observations import PICTURE
 
 if TYPE_CHECKING:
     from hypogoal.meta.episodes import Frame

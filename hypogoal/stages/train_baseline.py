@@ -10,10 +10,11 @@ from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
 from hypogoal.core.training import training
-from hypogoal.dataset import PICTURE, open_dataset, standard_of
+from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain, require_one_kind
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.meta.training import check_start, cut, played_world, write_layout
+from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options.tables import Episodes
 
 

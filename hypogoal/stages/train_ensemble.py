@@ -21,7 +21,7 @@ from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.training import training
 from hypogoal.core.workers import allowed, in_processes
-from hypogoal.dataset import Dataset, Observations, open_dataset, type_text
+from hypogoal.data import Dataset, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
@@ -31,6 +31,7 @@ from hypogoal.hypotheses.teacher import load_teacher
 from hypogoal.hypotheses.thresholds import threshold_rule
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.hypotheses.views import StateOrigins, own_view
+from hypogoal.observations import Observations, type_text
 from hypogoal.options.visited import VISITED
 
 HELDOUT, LOOKED_AT = "heldout", 100  # in what the stage returns; states of each class, cheap beside training

@@ -13,18 +13,9 @@ from hypogoal.core.config import from_values, meant, resolve
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import (
-    GET_MORE,
-    NUMBERS,
-    PICTURE,
-    Collected,
-    States,
-    Unmet,
-    hard_to_learn,
-    leave_out,
-    require_names,
-)
+from hypogoal.data import GET_MORE, Collected, States, Unmet, hard_to_learn, leave_out, require_names
 from hypogoal.domains.base import Domain, Engine, Step
+from hypogoal.observations import NUMBERS, PICTURE
 from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Test, Verdict, promise, run
 

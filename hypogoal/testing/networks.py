@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import NUMBERS, PICTURE, standard_of
 from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, build_network
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.views import FullView
+from hypogoal.observations import NUMBERS, PICTURE, standard_of
 from hypogoal.testing.verdict import Test, Verdict, promise, run
 
 CLOSE = 1e-4

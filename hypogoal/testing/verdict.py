@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.terminal import printable
-from hypogoal.dataset import Unmet
+from hypogoal.data import Unmet
 
 Test = tuple[str, Callable[[], str]]
 

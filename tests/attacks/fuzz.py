@@ -34,7 +34,7 @@ import numpy as np
 from hypogoal.core.artefacts import create_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.manifests import sealed
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from tests.attacks.mutations import (
     ENDLESS,
     Rng,

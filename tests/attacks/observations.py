@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium import spaces
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import PICTURE
 from hypogoal.domains.gymnasium_engine import reader_of
+from hypogoal.observations import PICTURE
 from hypogoal.own_data.images import read_image
 from hypogoal.own_data.parts import Parts, as_observations, collected_of
 

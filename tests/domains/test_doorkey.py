@@ -12,7 +12,7 @@ from minigrid.wrappers import RGBImgObsWrapper
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import Collected
+from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_engine import DROP, FORWARD, LEFT, PICKUP, TOGGLE, DoorKeyEngine

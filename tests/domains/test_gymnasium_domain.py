@@ -14,7 +14,7 @@ from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import Collected
+from hypogoal.data import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium_engine import GymnasiumEngine

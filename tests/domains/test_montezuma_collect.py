@@ -17,7 +17,7 @@ from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States, digest
+from hypogoal.data import Collected, States
 from hypogoal.domains import montezuma_states
 from hypogoal.domains.base import Domain, defaults_of, load_domain
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
@@ -52,6 +52,7 @@ from hypogoal.domains.montezuma_states import (
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN, SUB_GOALS
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig
+from hypogoal.observations import digest
 
 pytestmark = pytest.mark.atari
 

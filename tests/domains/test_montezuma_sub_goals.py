@@ -11,7 +11,7 @@ import pytest
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import Collected
+from hypogoal.data import Collected
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
 from hypogoal.domains.montezuma_emulator import DOWN, LEFT, NOOP, SPRITE_TOP, UP, Emulator
 from hypogoal.domains.montezuma_engine import MontezumaEngine

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from test_numbers import Says
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium_engine import reader_of
 from hypogoal.own_data.parts import Parts, as_observations, collected_of
 from tests.attacks.observations import DTYPES, drawn_observation, outcome_of

@@ -10,7 +10,7 @@ import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.options.tables import Episodes

@@ -9,7 +9,7 @@ from toy_data import fill
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.files import write_table
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey import DOMAIN as DOORKEY
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.evaluation.pictures import (
     BACKGROUND,
     CAPTION_HEIGHT,

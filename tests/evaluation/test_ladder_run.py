@@ -16,7 +16,7 @@ from rich.console import Console
 from toy_data import reseal
 
 from hypogoal.core.artefacts import find_artefacts, open_artefact
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.evaluation import judging
 from hypogoal.evaluation.questions import summary_table
 from hypogoal.hypotheses.ensemble import read_ensemble

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hypogoal.dataset import States, packed
+from hypogoal.data import States
 from hypogoal.evaluation.recorded import (
     density_of,
     disagreement,
@@ -17,6 +17,7 @@ from hypogoal.evaluation.recorded import (
     to_label,
     turning_patch,
 )
+from hypogoal.observations import packed
 
 
 def test_members_disagree_about_their_own_thresholds() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from hypogoal.dataset import States
+from hypogoal.data import States
 from hypogoal.evaluation.judging import Case, Judged, Judgement, Work
 from hypogoal.evaluation.pictures import attribution_image, image_png
 from hypogoal.evaluation.run import Contents

@@ -28,7 +28,7 @@ from hypogoal.core.artefacts import MANIFEST, create_artefact, sha256_of
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5, fixed, set_attribute
 from hypogoal.core.manifests import digest_of, sealed
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
 from hypogoal.evaluation.run import fitting, read_evaluation

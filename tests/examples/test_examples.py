@@ -20,7 +20,7 @@ from torch import nn
 from hypogoal import OptionEnv, load_ensemble, load_options
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.evaluation import explorer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

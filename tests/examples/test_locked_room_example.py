@@ -8,7 +8,7 @@ import pytest
 from minigrid.core.constants import COLOR_NAMES
 
 from hypogoal.cli import main
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from hypogoal.cli import main
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "robot_bin.py"
 pytestmark = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="no EGL (Debian: libegl1)")

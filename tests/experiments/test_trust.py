@@ -11,7 +11,7 @@ from toy_data import write
 
 from hypogoal.cli import main
 from hypogoal.core import own_code
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.records import last_line
 from hypogoal.experiments.toml_file import read_toml

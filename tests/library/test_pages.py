@@ -13,7 +13,7 @@ from command_line import run, settings
 from test_docs import blocks, commands
 
 from hypogoal.cli import main
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 
 ROOT = Path(__file__).parents[2]
 

@@ -17,7 +17,7 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import check_files, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.domains import base
 from hypogoal.hypotheses.deep_lift import mean_state
 from hypogoal.hypotheses.ensemble import Ensemble

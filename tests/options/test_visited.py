@@ -7,7 +7,7 @@ from command_line import refuses, run
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.options.visited import Visited

@@ -17,7 +17,7 @@ from command_line import refuses, run, settings
 from PIL import Image
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.own_data.arrays import read_arrays
 from hypogoal.own_data.images import read_image, read_images
 from hypogoal.own_data.parts import Parts, collected_of, held_out

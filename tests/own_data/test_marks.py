@@ -9,7 +9,8 @@ import pytest
 from command_line import run
 
 from hypogoal.cli import main
-from hypogoal.dataset import digest, open_dataset
+from hypogoal.data import open_dataset
+from hypogoal.observations import digest
 from tests.own_data import mixed
 
 TOKENS = [b"\xef\xbb\xbf", b"\xff\xfe", b"\0", b";", b",", b"\n", b'"', b"-1", b"999999999999", b"1e3", b"x", b"nan"]

@@ -19,12 +19,13 @@ import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import mixed_type, open_dataset, packed, type_of, type_text
+from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium_engine import reader_of
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, network_for
 from hypogoal.hypotheses.training import fit
 from hypogoal.hypotheses.views import full_view
+from hypogoal.observations import mixed_type, packed, type_of, type_text
 from tests.own_data.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
 
 GOAL = "door-open"

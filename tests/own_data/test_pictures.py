@@ -14,7 +14,7 @@ from PIL import Image
 from test_import import arrays, pictures, save_images, save_minari
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.own_data.images import read_image, read_images
 from hypogoal.own_data.parts import Parts, collected_of
 

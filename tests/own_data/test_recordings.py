@@ -16,7 +16,7 @@ pytest.importorskip("pyarrow", reason="the extra hypogoal[lerobot]")
 pytest.importorskip("av", reason="the extra hypogoal[lerobot]")
 
 from hypogoal.cli import main
-from hypogoal.dataset import Dataset, open_dataset
+from hypogoal.data import Dataset, open_dataset
 from hypogoal.own_data.recordings import kept
 from tests.own_data import robot_data
 from tests.own_data.robot_data import LENGTHS, STATE, TOP, WRIST

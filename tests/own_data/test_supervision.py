@@ -14,7 +14,7 @@ from test_import import arrays, at_right, pictures, save_images, save_minari
 
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.own_data.minari import read_minari
 from hypogoal.own_data.parts import Parts, collected_of
 

@@ -13,8 +13,9 @@ import pytest
 from command_line import refuses, run, settings
 
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
-from hypogoal.dataset import digest, open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.evaluation.recorded import picture_of
+from hypogoal.observations import digest
 from hypogoal.own_data.marks import read_marks
 from hypogoal.stages.audit_recorded import lines_of
 from tests.own_data import mixed

@@ -102,7 +102,7 @@ def test_cells_of_a_sweep_that_are_not_done_are_said(tiny_run, tmp_path):
 
 def test_members_are_judged_on_heldout_states(tiny_run, metrics):
     """Spec F1, F2: numbers of each ensemble, sub-goal and member, recomputed here from the file and the weights."""
-    from hypogoal.dataset import open_dataset
+    from hypogoal.data import open_dataset
     from hypogoal.hypotheses.ensemble import read_ensemble
 
     assert [(one["path"], one["name"]) for one in metrics["ensembles"]] == [

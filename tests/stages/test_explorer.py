@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from browser import document_of, needs_browser, title_of
 
-from hypogoal.dataset import open_dataset
+from hypogoal.data import open_dataset
 from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.evaluation.explorer import MOST_EXPLAINED, MOST_STATES
 

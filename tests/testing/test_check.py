@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import GET_MORE, Collected
+from hypogoal.data import GET_MORE, Collected
 from hypogoal.diversity import OBJECTIVES as OURS
 from hypogoal.diversity import Objective, dbat, load_objective, none
 from hypogoal.domains import base as bases

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States
+from hypogoal.data import Collected, States
 from hypogoal.domains.base import Domain, Engine, Plan, Scene, Step
 from hypogoal.domains.rooms import states
 from hypogoal.domains.rooms.states import FACTORS, SIDE, crossed_states, drawn

@@ -19,10 +19,10 @@ from hypogoal.core.checkpoints import Checkpoints, optimiser_snapshot, restore_o
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for
-from hypogoal.dataset import PICTURE
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import CELL, FEATURES, NETWORKS
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
+from hypogoal.observations import PICTURE
 
 LOG_INTERVAL = 5_000  # environment steps
 COUNTS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")

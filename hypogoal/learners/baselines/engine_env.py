@@ -9,9 +9,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from hypogoal.dataset import PICTURE, Observations, standardised
 from hypogoal.domains.base import Engine, step_of
 from hypogoal.learners.episodes import EpisodeRecorder
+from hypogoal.observations import PICTURE, Observations, standardised
 
 
 class EngineEnv(VecEnv):

@@ -9,7 +9,7 @@ from command_line import refuses, run
 from toy_data import write
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import Collected, States, open_dataset, write_dataset
+from hypogoal.data import Collected, States, open_dataset, write_dataset
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
