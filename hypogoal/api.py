@@ -95,7 +95,9 @@ def evaluate(run: Place, out: Place | None = None, **arguments: Any) -> Made:
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
     """Compare each evaluated run with the first. The result shows which wins, by how much, on what."""
     paths = [*map(Path, runs)]
-    call = partial(stages.named("compare"), paths, Path(out), force=force)
+    from hypogoal.tools.compare import compare as written
+
+    call = partial(written, paths, Path(out), force=force)
     return _called("compare", Path(out), call, {"runs": paths})
 
 

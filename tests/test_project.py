@@ -139,7 +139,7 @@ def test_versions_of_python_are_those_that_are_tested() -> None:
     told = {
         name for path in PACKAGE.rglob("*.py") for name in re.findall(r"hypogoal\[(\w+)\]", path.read_text("utf-8"))
     }
-    assert told == {"lerobot", "montezuma", "tensorboard"} and told <= PROJECT["optional-dependencies"].keys()
+    assert told == {"lerobot", "minari", "montezuma", "tensorboard"} and told <= PROJECT["optional-dependencies"].keys()
 
 
 def test_an_old_numpy_is_told_in_a_line(tmp_path: Path) -> None:
@@ -350,7 +350,7 @@ def test_one_way_to_print_and_one_to_open() -> None:
         "core/config.py", "core/drafts.py", "core/files.py", "core/locks.py",
         "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/records.py",
         "hypotheses/load.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
-        "own_data/videos.py", "stages/export_ensemble.py", "stages/train_ensemble.py",
+        "own_data/videos.py", "tools/export.py", "stages/train_ensemble.py",
     }  # fmt: skip
     found = set()
     for path in sorted((ROOT / "hypogoal").rglob("*.py")):

@@ -13,7 +13,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.progress import Progress
-from hypogoal.core.terminal import amount, give, say
+from hypogoal.core.terminal import give, say
 from hypogoal.settings import configuration
 
 LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
@@ -101,22 +101,11 @@ def export(
     States as NumPy arrays, episodes as a Minari dataset. 'import' reads both.
     Ensembles as a folder that torch and safetensors load without hypogoal.
     """
-    from hypogoal.core.artefacts import open_artefact
+    from hypogoal.tools.export import export as written
 
-    if source.is_dir() and open_artefact(source, ("meta", "ensemble")).kind == "ensemble":
-        from hypogoal.stages.export_ensemble import export_ensemble
-
-        export_ensemble(source, out, force=force)
-    elif source.is_dir():
-        from hypogoal.stages.export_episodes import export_episodes
-
-        steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
-        if not quiet:
-            say(f"{amount(episodes, 'episode')}, {amount(steps, 'step')}")
-    else:
-        from hypogoal.stages.import_data import export_data as stage
-
-        stage(source, out, force=force)
+    line = written(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
+    if line and not quiet:
+        say(line)
     give(out)
 
 

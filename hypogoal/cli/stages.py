@@ -117,7 +117,7 @@ def audit(
     """
     from hypogoal.core import own_code
     from hypogoal.evaluation.audit import lines_of
-    from hypogoal.stages.audit import audit as audited
+    from hypogoal.tools.audit import audit as audited
 
     if domain is None:
         _audit_recorded(call, classifier, sub_goal, member)
@@ -135,7 +135,7 @@ def audit(
 def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, member: int | None) -> None:
     from hypogoal.core.artefacts import DATA, TO_FILL_IN, open_artefact
     from hypogoal.data import open_dataset
-    from hypogoal.stages.audit_recorded import audit_recorded, lines_of
+    from hypogoal.tools.audit_recorded import audit_recorded, lines_of
 
     if not Path(source).is_dir() or member is not None or call.settings or call.preset or call.how["resume"]:
         do = "Give --domain and --sub-goal; or an ensemble's folder alone."
@@ -218,7 +218,7 @@ def compare(
 ) -> None:
     """Put evaluated runs side by side: what differs, who wins."""
     from hypogoal.inspection import outcome
-    from hypogoal.stages.compare import compare as compared
+    from hypogoal.tools.compare import compare as compared
 
     with tempfile.TemporaryDirectory() as folder:
         place = out or Path(folder, "comparison")

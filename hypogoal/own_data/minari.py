@@ -1,8 +1,7 @@
-"""Minari datasets: import of episodes, labelled by functions, and export of agents' episodes, without the package."""
+"""Minari datasets: import of episodes, labelled by functions, without the package."""
 
 import json
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +10,14 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array
+from hypogoal.core.hdf5 import find, members, open_hdf5, read_array
 from hypogoal.core.own_code import UsersCode
-from hypogoal.data import write_observations
-from hypogoal.meta.episodes import Episode
-from hypogoal.observations import PICTURE
 from hypogoal.own_data.parts import Parts, Source
 from hypogoal.own_data.recordings import split_episodes
 
 MINARI = Path("data") / "main_data.hdf5"  # in a dataset's folder
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
-MINARI_VERSION = "0.5.4"  # its layout is written
 
 Label = Callable[[Any], bool]  # from an observation, by key if it has several, to whether the sub-goal holds
 
@@ -96,44 +91,3 @@ def _labels(labels: Sequence[Label], states: Source) -> NDArray[np.bool_]:
         with UsersCode(f"the label function {getattr(label, '__name__', column)}", label) as code:
             truths[:, column] = [code.truth(label(observation), "the label") for observation in observations]
     return truths
-
-
-def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, actions: int, description: str) -> int:
-    """Write at least one episode as a Minari dataset of format ``hdf5``, pictures uncompressed; returns its steps.
-
-    ``name`` is the dataset's id, such as ``doorkey/options-v0``; ``actions`` is the number of primitive actions.
-    ``infos/option`` is the option that led to each state, -1 at the start.
-    """
-    seen: Any = None
-    total = count = 0
-    (folder / MINARI).parent.mkdir(parents=True)
-    with create_hdf5(folder / MINARI) as file:
-        for episode in episodes:
-            group, steps = file.create_group(f"episode_{count}"), len(episode.actions)
-            seen = episode.observations
-            group.attrs["id"], group.attrs["total_steps"] = count, steps
-            write_observations(group, episode.observations)
-            last = np.arange(steps) == steps - 1
-            group["actions"], group["rewards"] = episode.actions, episode.rewards
-            group["terminations"], group["truncations"] = last & episode.terminated, last & (not episode.terminated)
-            group["infos/option"] = np.concatenate([[-1], episode.options])
-            total, count = total + steps, count + 1
-    shape, bounds = seen.shape[1:], (0, 255) if seen.dtype == PICTURE else (-math.inf, math.inf)
-    spaces = {
-        "observation_space": {"type": "Box", "dtype": str(seen.dtype), "shape": list(shape)}
-        | {bound: np.full(shape, value).tolist() for bound, value in zip(("low", "high"), bounds, strict=True)},
-        "action_space": {"type": "Discrete", "dtype": "int64", "start": 0, "n": actions},
-    }
-    metadata = {
-        "total_episodes": count,
-        "total_steps": total,
-        "data_format": "hdf5",
-        "jpeg_encoding": False,
-        "dataset_id": name,
-        "minari_version": MINARI_VERSION,
-        "algorithm_name": "hypogoal",
-        "description": description,
-        **{name: json.dumps(space) for name, space in spaces.items()},
-    }
-    (folder / METADATA).write_text(json.dumps(metadata) + "\n", encoding="utf-8")
-    return total

@@ -5,15 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core import own_code
-from hypogoal.core.artefacts import ARRAYS, DATA, begins_as, claim
+from hypogoal.core.artefacts import DATA, begins_as, claim
 from hypogoal.core.errors import UserError, printable
-from hypogoal.core.files import replacing
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.terminal import say
 from hypogoal.data import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
-from hypogoal.own_data.arrays import read_arrays, write_arrays
+from hypogoal.own_data.arrays import read_arrays
 from hypogoal.own_data.images import read_images
 from hypogoal.own_data.lerobot import INFO, LeRobot
 from hypogoal.own_data.marks import with_marks
@@ -121,14 +120,3 @@ def _too_small(domain: str, states: Collected) -> list[str]:
     except UserError as error:
         return [str(error)]
     return []
-
-
-def export_data(data: Path, out: Path, *, force: bool = False) -> None:
-    """Write the states of a data file as ``.npz``, which ``import_data`` reads; see :func:`write_arrays`."""
-    if out.suffix != ".npz":
-        raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
-    out = claim(out, kind=ARRAYS, inputs=[data], force=force)
-    dataset = open_dataset(data)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as fresh:
-        write_arrays(fresh, dataset)

@@ -33,9 +33,9 @@ from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
 from hypogoal.evaluation.run import fitting, read_evaluation
 from hypogoal.options.tables import Choices, Episodes
-from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import draw_figures, report
+from hypogoal.tools.compare import compare
 
 FOLDERS = ('"><img src=x onerror=alert(1)>', "'-alert(1)-'", "a&b<b>")  # file systems take such names
 OPEN = re.compile(r"(config|versions|counts\.\w+|quantities|files)$")  # dictionaries with keys of any name

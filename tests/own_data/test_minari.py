@@ -15,7 +15,7 @@ import hypogoal  # noqa: F401 - registers the environments
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.own_data.minari import read_minari
-from hypogoal.stages.export_episodes import dataset_id
+from hypogoal.tools.export import dataset_id
 
 LAYOUT = 100
 EPISODES = 3

@@ -17,7 +17,7 @@ from hypogoal.data import open_dataset
 from hypogoal.evaluation.recorded import picture_of
 from hypogoal.observations import digest
 from hypogoal.own_data.marks import read_marks
-from hypogoal.stages.audit_recorded import lines_of
+from hypogoal.tools.audit_recorded import lines_of
 from tests.own_data import mixed
 
 GOAL = "door-open"

@@ -11,8 +11,8 @@ from toy_data import fill, reseal
 from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
 from hypogoal.core.files import write_table
 from hypogoal.evaluation.compare import labels_of
-from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate
+from hypogoal.tools.compare import compare
 
 STEPS = 3_000
 

@@ -1,0 +1,1 @@
+"""Tools beside the stages: audits of classifiers, runs side by side, exports for other software."""
