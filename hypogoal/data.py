@@ -1,4 +1,4 @@
-"""The HDF5 schema of collected states: labelled, unlabelled, held-out (Spec A1, A8).
+"""The HDF5 file of collected states: labelled, unlabelled, held-out (Spec A1, A8).
 
 ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``, ``heldout/<sub-goal>/{observations,labels}``
 and, beside each, ``origin/*`` per state. Sub-goals with the same states share one dataset on disk (hard links). The
@@ -10,38 +10,42 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core import hdf5
-from hypogoal.core.artefacts import DATA, claim, versions
-from hypogoal.core.commands import advice
+from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
+from hypogoal.core.files import FORMULA, NO_FILE_NAME, path_part, plain_name, plain_names, replacing
 from hypogoal.core.terminal import amount
-from hypogoal.observations import MAX_SIDE, NUMBERS, Observations, digest, fields_of, numbers_of, type_of, type_text
-
-if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # it promotes integers differently, which fails late
-    raise UserError("hypogoal needs NumPy 2", f"found {np.__version__}", "pip install 'numpy>=2,<3'")
+from hypogoal.observations import (
+    NUMBERS,
+    DType,
+    Observations,
+    Shape,
+    digest,
+    fields_of,
+    numbers_of,
+    spread_rows,
+    type_of,
+    type_text,
+)
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
-ATTRIBUTES = (
-    "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "versions", "complete",
-)  # fmt: skip
 RECOLLECT = "Collect it again."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
-BLOCK = 8  # states of a sample that are read together
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
-KINDS = "ufV"  # NumPy's letters of types of observations
+UNREADABLE = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError)  # h5py's, of a damaged file
+Labels: TypeAlias = NDArray[np.bool_]
+Integers: TypeAlias = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -55,11 +59,11 @@ class States:
     """
 
     observations: Observations
-    labels: NDArray[np.bool_]
-    origins: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    labels: Labels
+    origins: Mapping[str, Integers] = field(default_factory=dict)
 
-    def where(self, kept: NDArray[np.bool_]) -> States:
-        """The states that are ``kept``, bool (N,)."""
+    def where(self, kept: NDArray[Any]) -> States:
+        """The states that are ``kept``, bool (N,), or the rows of some, int (M,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         return States(self.observations[kept], self.labels[kept], origins)
 
@@ -68,7 +72,7 @@ class States:
 class Collected:
     """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any."""
 
-    observation_shape: tuple[int, ...]
+    observation_shape: Shape
     sub_goals: tuple[str, ...]
     labelled: States
     unlabelled: States
@@ -84,38 +88,41 @@ class Unmet(UserError):
 
 def leave_out(states: States, *training: Observations) -> States:
     """Spec B3: the states without those that look like one of ``training``, observations (M, ...) each."""
-    digests = {digest(observation) for observations in training for observation in observations}
-    return states.where(np.array([digest(observation) not in digests for observation in states.observations], np.bool_))
+    known: set[bytes] = set()
+    for observations in training:
+        known.update(map(digest, observations))
+    return states.where(np.array([digest(observation) not in known for observation in states.observations], np.bool_))
 
 
 def joined(parts: Sequence[States]) -> States:
     """The states of all parts, with the origins that the first part has."""
-    observations, labels = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("observations", "labels")
-    )
-    origins = {name: np.concatenate([part.origins[name] for part in parts]) for name in parts[0].origins}
+    observations = np.concatenate([part.observations for part in parts])
+    labels = np.concatenate([part.labels for part in parts])
+    origins = {}
+    for name in parts[0].origins:
+        origins[name] = np.concatenate([part.origins[name] for part in parts])
     return States(observations, labels, origins)
 
 
-def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
+def hard_to_learn(labels: Labels, goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal with few positives, or few negatives, among the labels (N, G)."""
     lines = []
     for goal, column in zip(goals, labels.T, strict=True):
         positives = int(column.sum())
-        fewest = min(positives, len(labels) - positives)
-        if fewest < max(FEW, RARE * len(labels)):
+        fewest = min(positives, len(column) - positives)
+        if fewest < max(FEW, RARE * len(column)):
             few = amount(fewest, "positive" if fewest == positives else "negative")
-            lines.append(f"{goal} has {few} among {len(labels)} labelled states: classes are unbalanced")
+            lines.append(f"{goal} has {few} among {len(column)} labelled states: classes are unbalanced")
     return lines
 
 
-def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
+def hard_to_judge(labels: Labels, goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal with one class only among the held-out labels (N, G)."""
     one_class = [goal for goal, column in zip(goals, labels.T, strict=True) if len(np.unique(column)) < 2]
     return [f"{goal} has one class only in the held-out states, so it cannot be judged by them" for goal in one_class]
 
 
-def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: object, do: str) -> None:
+def require_classes(labels: Labels, goals: Sequence[str], where: object, do: str) -> None:
     """Refuse (``Unmet``) labels (N, G) of labelled states that have one class only for some sub-goal."""
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
@@ -136,6 +143,50 @@ def require_names(sub_goals: Sequence[str]) -> None:
         raise UserError("two sub-goals have the same name", ", ".join(sub_goals), do)
 
 
+@contextlib.contextmanager
+def reading(path: Path, subject: str = "the data file", do: str = RECOLLECT) -> Iterator[Any]:
+    """An HDF5 file opened for reading; whatever cannot be read in the block is a ``UserError``."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            yield file
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise UserError(f"{subject} cannot be read: {error.strerror}", path, "Is it the right path?") from None
+    except UNREADABLE as error:
+        what = str(error)
+        if "h5clear" in what:
+            do = f"If no program writes it any more, one has crashed: h5clear -s {path}"
+        elif "unable to lock" in what:
+            do = "It is open in another program: close it there first."
+        raise UserError(f"{subject} cannot be read: {what}", path, do) from None
+
+
+@contextlib.contextmanager
+def create_hdf5(path: Path) -> Iterator[Any]:
+    """A fresh HDF5 file to fill, built in memory and written when the block ends.
+
+    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished bytes
+    ourselves raises a normal ``OSError``.
+    """
+    import h5py
+
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    with replacing(path) as fresh:
+        fresh.write_bytes(image)
+
+
+def fixed(text: str) -> NDArray[np.bytes_]:
+    """A text as a fixed-length UTF-8 string, stored in place; variable-length ones lie in HDF5's global heap."""
+    import h5py
+
+    data = text.encode()
+    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+
+
 def write_dataset(
     path: Path,
     collected: Collected,
@@ -150,52 +201,60 @@ def write_dataset(
     Raises ``UserError`` if a name cannot be a file name, labels are not truth values, or the file exists.
     """
     require_names(collected.sub_goals)
-    for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
-        if not path_part(origin):
-            raise UserError("an origin's name must be usable as a file name", repr(origin), "Leave out separators.")
-    path = claim(path, kind=DATA, force=force)
-    parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
+    if path.exists() and not force:
+        raise UserError("the output exists already", path, "Choose another place, or give force=True to replace it.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as fresh, hdf5.create_hdf5(fresh) as file:
-        hdf5.set_attribute(file, "format", DATA_FORMAT)
-        hdf5.set_attribute(file, "domain", domain)
-        hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
-        hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
-        hdf5.set_attribute(file, "observation_dtype", type_text(collected.unlabelled.observations.dtype))
-        hdf5.set_attribute(file, "config", json.dumps(dict(config)))
-        hdf5.set_attribute(file, "seed", seed)
-        hdf5.set_attribute(file, "versions", json.dumps(versions()))
-        hdf5.set_attribute(file, "complete", False)  # written first, so that a truncated file still has it
-        for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
-            _write_split(file, split, states, collected.sub_goals)
-        group = file.create_group("unlabelled")
-        write_observations(group, collected.unlabelled.observations)
-        _write_origins(group, collected.unlabelled.origins)
+    attributes: dict[str, Any] = {
+        "format": DATA_FORMAT,
+        "domain": domain,
+        "sub_goals": json.dumps(list(collected.sub_goals)),
+        "observation_shape": json.dumps(list(collected.observation_shape)),
+        "observation_dtype": type_text(collected.unlabelled.observations.dtype),
+        "config": json.dumps(dict(config)),
+        "seed": seed,
+        "versions": json.dumps(versions()),
+        "complete": False,
+    }
+    with create_hdf5(path) as file:
+        for name, value in attributes.items():
+            file.attrs[name] = fixed(value) if isinstance(value, str) else value
+        _write_split(file, "labelled", collected.labelled, collected.sub_goals)
+        _write_split(file, "heldout", collected.heldout, collected.sub_goals)
+        _write_states(file.create_group("unlabelled"), collected.unlabelled)
         if collected.features:  # a dataset, because they may exceed an attribute's size
-            file["features"] = hdf5.fixed(json.dumps(list(collected.features)))
+            file["features"] = fixed(json.dumps(list(collected.features)))
         file.attrs.modify("complete", True)
-
-
-def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ...]) -> None:
-    labels, shape = states.labels, (len(states.observations), len(sub_goals))
-    if getattr(labels, "dtype", None) != np.bool_ or labels.shape != shape:  # NumPy turns the text 'False' into True
-        kind = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
-        raise UserError(f"the domain's {split} labels are not truth values", kind, f"Give bool {shape}.")
-    first: Any = None
-    for index, sub_goal in enumerate(sub_goals):
-        group = file.create_group(f"{split}/{sub_goal}")
-        if first is None:
-            write_observations(group, states.observations)
-            _write_origins(group, states.origins)
-            first = group
-        else:
-            group.update({name: first[name] for name in ("observations", "origin") if name in first})
-        _write_column(group, "labels", labels[:, index])
 
 
 def write_observations(group: Any, observations: Observations) -> None:
     """Write ``observations`` to an HDF5 group, in compressed chunks of up to 64 states."""
     _store(group, "observations", observations, 64, compression="gzip", compression_opts=1)
+
+
+def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
+    """A group for each sub-goal; the same states are stored once, with a hard link in each group."""
+    labels = np.asarray(states.labels)
+    if labels.dtype != np.bool_:  # NumPy turns the text 'False' into True
+        raise UserError(f"the domain's {split} labels are not truth values", labels.dtype, "Give bool (N, sub-goals).")
+    first = None
+    for sub_goal, column in zip(sub_goals, labels.T, strict=True):
+        group = file.create_group(f"{split}/{sub_goal}")
+        if first is None:
+            first = group
+            _write_states(group, states)
+        else:
+            for name in ("observations", "origin"):
+                if name in first:
+                    group[name] = first[name]
+        _write_column(group, "labels", column)
+
+
+def _write_states(group: Any, states: States) -> None:
+    write_observations(group, states.observations)
+    for name, values in states.origins.items():
+        if not path_part(name):
+            raise UserError("an origin's name must be usable as a file name", repr(name), "Leave out separators.")
+        _write_column(group, f"origin/{name}", values)
 
 
 def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
@@ -205,65 +264,45 @@ def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
 
 def _store(group: Any, name: str, values: NDArray[Any], most: int, **filters: Any) -> None:
     """Write a dataset in chunks of up to ``most`` states."""
-    chunks = (min(most, len(values)), *values.shape[1:])
-    group.create_dataset(name, data=values, **({"chunks": chunks, **filters} if len(values) else {}))
+    if len(values):
+        filters["chunks"] = (min(most, len(values)), *values.shape[1:])
+    else:
+        filters.clear()
+    group.create_dataset(name, data=values, **filters)
 
 
-def _write_origins(group: Any, origins: Mapping[str, NDArray[np.int64]]) -> None:
-    for name, values in origins.items():
-        _write_column(group, f"origin/{name}", values)
-
-
+@dataclass(frozen=True)
 class Dataset:
-    """A complete data file, opened for reading. Use :func:`open_dataset`."""
+    """A complete data file, of which states are read when asked for. Use :func:`open_dataset`."""
 
-    def __init__(self, path: Path):
-        self.path = path
-        foreign = UserError("not a hypogoal data file", path, advice("How to make one", "collect", "--help"))
-        with self._file() as file:
-            version = hdf5.attribute(file, "format")
-            if not isinstance(version, int) or isinstance(version, bool):
-                raise foreign
-            if version > DATA_FORMAT:
-                raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
-            if version < DATA_FORMAT:
-                raise UserError(f"format {version} comes from an earlier hypogoal", path, RECOLLECT)
-            self.attributes = {name: hdf5.attribute(file, name) for name in ATTRIBUTES}
-        if not self.attributes["complete"]:
-            raise UserError("the data file is not complete", path, RECOLLECT)
-        self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
-        self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
-        try:
-            self.observation_dtype = type_of(self.attributes["observation_dtype"])
-        except ValueError:
-            raise foreign from None
-        self.config: dict[str, Any] = self._json("config", dict)
-        self.domain = self.attributes["domain"]
-        sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
-        names = plain_names(self.sub_goals)
-        fits = bool(self.observation_shape) != bool(self.observation_dtype.names)
-        if not (sizes and names and fits and isinstance(self.domain, str)):
-            raise foreign
-        self.observation_bytes = prod(self.observation_shape) * self.observation_dtype.itemsize  # of one observation
+    path: Path
+    domain: str
+    config: dict[str, Any]
+    seed: int
+    sub_goals: tuple[str, ...]
+    observation_shape: Shape
+    observation_dtype: DType
+
+    @property
+    def observation_bytes(self) -> int:
+        """Of one observation."""
+        return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     def features(self) -> list[str]:
         """The names of an observation's numbers, in order; ``x0``, ``x1``, ... if the file has no names.
 
         Of a mixed observation ``key[0]``, ``key[1]``, ..., and a picture's key alone.
         """
-        count = prod(self.observation_shape)
         if self.observation_dtype.names:
-            fields = fields_of((), self.observation_dtype).items()
-            rows = [(key, prod(shape) if dtype == NUMBERS else 1) for key, (dtype, shape) in fields]
-            return [f"{key}[{place}]" if size > 1 else key for key, size in rows for place in range(size)]
-        with self._file() as file:
-            if hdf5.find(file, "features") is None:
+            return _names_of_fields(self.observation_dtype)
+        count = prod(self.observation_shape)
+        with reading(self.path) as file:
+            if "features" not in file:
                 return [f"x{number}" for number in range(count)]
-            text = hdf5.read_array(file, "features", "S").tobytes().rstrip(b"\0").decode(errors="replace")
-        names = parse_json(text, self.path, "names of features are", RECOLLECT)
-        if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
-            raise UserError("the data file's feature names do not fit", self.path, RECOLLECT)
-        return names
+            names = json.loads(file["features"][()])
+            if len(names) != count:
+                raise ValueError(f"{len(names)} names for {count} features")
+            return [str(name) for name in names]
 
     def labelled(self, sub_goal: str) -> States:
         """The labelled states of one sub-goal."""
@@ -275,103 +314,105 @@ class Dataset:
 
     def unlabelled(self) -> Observations:
         """The unlabelled states: uint8 or float32 (M, *obs)."""
-        with self._file() as file:
-            return self._observations(file, "unlabelled")
+        with reading(self.path) as file:
+            return self._observations(file["unlabelled"])
+
+    def unlabelled_origins(self) -> dict[str, Integers]:
+        """The unlabelled states' origins, int64 (M,) by name; empty if the file has none."""
+        with reading(self.path) as file:
+            return _origins(file["unlabelled"])
 
     def some_heldout(self, sub_goal: str, count: int) -> States:
-        """About ``count`` held-out states of each class of a sub-goal, spread over the file; reads no others."""
-        base = f"heldout/{sub_goal}"
-        with self._file() as file:
-            labels = self._labels(file, base)
-            classes = (np.flatnonzero(labels), np.flatnonzero(~labels))
-            chosen = [rows[part] for rows in classes if len(rows) > count for part in _spread(len(rows), count)]
-            rows = np.sort(np.concatenate([*chosen, *(rows for rows in classes if len(rows) <= count)]))
-            origins = {name: values[rows] for name, values in self._origins(file, base, len(labels)).items()}
-            return States(self._observations(file, base, rows), labels[rows], origins)
-
-    def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
-        """The unlabelled states' origins, int64 (M,) by name; empty if the file has none."""
-        with self._file() as file:
-            return self._origins(file, "unlabelled", self._count(file, "unlabelled"))
+        """Up to ``count`` held-out states of each class of a sub-goal, spread over the file; reads no others."""
+        with reading(self.path) as file:
+            group = file[f"heldout/{sub_goal}"]
+            labels = _labels(group)
+            picked = []
+            for rows in (np.flatnonzero(labels), np.flatnonzero(~labels)):
+                picked.append(rows[spread_rows(len(rows), count)])
+            rows = np.sort(np.concatenate(picked))
+            origins = {name: values[rows] for name, values in _origins(group).items()}
+            return States(self._observations(group, rows), labels[rows], origins)
 
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""
-        with self._file() as file:
-            rows: dict[str, Any] = {"unlabelled": self._count(file, "unlabelled")}
+        with reading(self.path) as file:
+            counts: dict[str, Any] = {"unlabelled": len(file["unlabelled/observations"])}
             for split in SPLITS:
-                rows[split] = {}
+                counts[split] = {}
                 for goal in self.sub_goals:
-                    labels = self._labels(file, f"{split}/{goal}")
-                    rows[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
-        return rows
+                    labels = _labels(file[f"{split}/{goal}"])
+                    counts[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
+            return counts
 
     def _split(self, split: str, sub_goal: str) -> States:
         if sub_goal not in self.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {', '.join(self.sub_goals)}.")
-        base = f"{split}/{sub_goal}"
-        with self._file() as file:
-            observations = self._observations(file, base)
-            labels = self._labels(file, base)
-            return States(observations, labels, self._origins(file, base, len(observations)))
+        with reading(self.path) as file:
+            group = file[f"{split}/{sub_goal}"]
+            return States(self._observations(group), _labels(group), _origins(group))
 
-    def _labels(self, file: Any, base: str) -> NDArray[np.bool_]:
-        labels, states = hdf5.read_array(file, f"{base}/labels", "bui"), self._count(file, base)
-        if labels.shape != (states,):
-            raise hdf5.Foreign(f"{base}: labels of shape {labels.shape} for {states} states")
-        return labels.astype(np.bool_)
-
-    def _observations(self, file: Any, base: str, rows: slice | NDArray[np.int64] | None = None) -> Observations:
-        name, dtype = f"{base}/observations", self.observation_dtype
-        data = hdf5.checked(file, name, KINDS)
-        if data.shape[1:] != self.observation_shape or data.dtype != dtype:
-            raise hdf5.Foreign(f"{name!r} is {data.dtype} {data.shape}, not {dtype} (N, {self.observation_shape})")
-        values = hdf5.read_array(file, name, KINDS, rows)
+    def _observations(self, group: Any, rows: Any = ()) -> Observations:
+        data = group["observations"]
+        if data.shape[1:] != self.observation_shape or data.dtype != self.observation_dtype:
+            raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
+        values = data[rows]
         if not np.isfinite(numbers_of(values)).all():
-            raise hdf5.Foreign(f"{name!r} has numbers that are not finite")
+            raise ValueError(f"{data.name} has numbers that are not finite")
         return values
 
-    @staticmethod
-    def _count(file: Any, base: str) -> int:
-        shape = hdf5.checked(file, f"{base}/observations", KINDS).shape
-        if not shape:
-            raise hdf5.Foreign(f"{base}/observations is a single number")
-        return int(shape[0])
 
-    @staticmethod
-    def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:
-        group = hdf5.find(file, f"{base}/origin")
-        names = hdf5.members(group) if group is not None else []
-        origins = {name: hdf5.read_array(file, f"{base}/origin/{name}", "iub") for name in names}
-        for name, values in origins.items():
-            if values.shape != (count,):
-                raise hdf5.Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")
-        return {name: values.astype(np.int64) for name, values in origins.items()}
-
-    def _json(self, name: str, kind: type) -> Any:
-        parsed = self.attributes[name]
-        if isinstance(parsed, str):
-            parsed = parse_json(parsed, self.path, f"not a hypogoal data file, its attribute {name!r} is", RECOLLECT)
-        if not isinstance(parsed, kind):
-            do = f"Its attribute {name!r} is not a JSON {kind.__name__}."
-            raise UserError("not a hypogoal data file", self.path, do)
-        return parsed
-
-    def _file(self) -> contextlib.AbstractContextManager[Any]:
-        return hdf5.open_hdf5(self.path, "the data file", RECOLLECT)
+def _plain(attribute: Any) -> Any:
+    """An attribute as Python's own: a text, int, float or bool."""
+    value = np.asarray(attribute).item()
+    return value.decode() if isinstance(value, bytes) else value
 
 
-def _spread(length: int, count: int) -> list[slice]:
-    """Blocks of about ``count`` of ``length`` rows."""
-    blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # blocks do not overlap
-    starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
-    return [slice(start, start + min(count, BLOCK)) for start in starts]
+def _labels(group: Any) -> Labels:
+    return _column(group, "labels").astype(np.bool_)
+
+
+def _origins(group: Any) -> dict[str, Integers]:
+    names = group.get("origin", ())
+    return {name: _column(group, f"origin/{name}").astype(np.int64) for name in names}
+
+
+def _column(group: Any, name: str) -> NDArray[Any]:
+    """One value for each state of a group."""
+    values, states = group[name][()], len(group["observations"])
+    if values.shape != (states,):
+        raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
+    return values
+
+
+def _names_of_fields(dtype: DType) -> list[str]:
+    names = []
+    for key, (kind, shape) in fields_of((), dtype).items():
+        size = prod(shape) if kind == NUMBERS else 1
+        names += [f"{key}[{place}]" for place in range(size)] if size > 1 else [key]
+    return names
 
 
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
-    if path.is_dir():
-        do = "Give the .h5 file in it."
-        raise UserError("a folder where a data file is needed", path, do)
-    if not path.exists():
-        raise UserError("no such data file", path, advice("How to make it", "collect", "--help"))
-    return Dataset(path)
+    with reading(path) as file:
+        found = {name: _plain(value) for name, value in file.attrs.items()}
+        version = found.get("format")
+        if not isinstance(version, int):
+            raise UserError("not a hypogoal data file", path, "'hypogoal collect' and 'hypogoal import' make one.")
+        if version != DATA_FORMAT:
+            do = RECOLLECT if version < DATA_FORMAT else "Upgrade hypogoal."
+            raise UserError(f"the data file has format {version}, this hypogoal reads {DATA_FORMAT}", path, do)
+        if not found["complete"]:
+            raise UserError("the data file is not complete", path, RECOLLECT)
+        dataset = Dataset(
+            path=path,
+            domain=found["domain"],
+            config=json.loads(found["config"]),
+            seed=found["seed"],
+            sub_goals=tuple(json.loads(found["sub_goals"])),
+            observation_shape=tuple(json.loads(found["observation_shape"])),
+            observation_dtype=type_of(found["observation_dtype"]),
+        )
+    require_names(dataset.sub_goals)
+    return dataset

@@ -26,11 +26,10 @@ from hypogoal.core.artefacts import (
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
-from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
-from hypogoal.data import SPLITS, open_dataset
+from hypogoal.data import SPLITS, open_dataset, reading
 from hypogoal.domains.base import installed_domain
 from hypogoal.observations import PICTURE, type_text
 
@@ -49,7 +48,7 @@ def describe_path(path: Path) -> dict[str, Any]:
 def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
-        details = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
+        details: dict[str, Any] = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
         details |= {"observation_dtype": type_text(dataset.observation_dtype)}
         return {"kind": "data", "path": str(path), "counts": dataset.counts(), **details, "config": dataset.config}
     artefact = open_artefact(path)
@@ -297,9 +296,12 @@ def _read_lines(path: Path) -> None:
 
 
 def _read_arrays(path: Path) -> None:
-    with open_hdf5(path, "the file of arrays", AGAIN) as file:
-        for name in walk(file):
-            read_array(file, name, "uibfS")
+    with reading(path, "the file of arrays", AGAIN) as file:
+        names: list[str] = []
+        file.visit(names.append)
+        for name in names:
+            if hasattr(file[name], "shape"):
+                file[name][()]
 
 
 CONTENTS: dict[str, Callable[[Path], object]] = {

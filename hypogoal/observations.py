@@ -1,4 +1,8 @@
-"""What is a picture, what numbers: types of observations, several of both by key, numbers standardised."""
+"""What an observation is: a picture, numbers, or several of both by key; numbers in deviations from their mean.
+
+Pictures are bytes (H, W, C). Numbers are float32 of any shape; networks see them standardised. Several of both are
+mixed: of shape (), and of a structured type with a field for each key.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +17,13 @@ from numpy.typing import NDArray
 
 from hypogoal.core.files import plain_names
 
-MAX_SIDE = 1 << 16  # of an observation
-# Observations are pictures, bytes (H, W, C), or numbers of any shape, which networks see standardised, or several of
-# both by key: then of shape (), and of a structured type with a field for each key (:func:`mixed_type`).
 PICTURE, NUMBERS = np.dtype(np.uint8), np.dtype(np.float32)
-Observations: TypeAlias = NDArray[Any]  # of any of these types
-Fields: TypeAlias = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]  # type and shape, by key
+MAX_SIDE = 1 << 16
+DType: TypeAlias = np.dtype[Any]
+Shape: TypeAlias = tuple[int, ...]
+KINDS: dict[str, DType] = {"uint8": PICTURE, "float32": NUMBERS}
+Observations: TypeAlias = NDArray[Any]  # (N, *shape), of any of these types
+Fields: TypeAlias = dict[str, tuple[DType, Shape]]  # by key
 Standard: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]  # mean and deviation of numbers
 DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
 MOST_ROWS = 20_000  # states from which mean and deviation are computed
@@ -29,73 +34,88 @@ def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
     return blake2b(observation.tobytes() + labels, digest_size=16).digest()
 
 
-def fields_of(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Fields:
+def fields_of(shape: Shape, dtype: DType) -> Fields:
     """Type and shape of an observation's parts by key; of one that is not mixed, its only part's, without a key."""
-    return {key: (dtype[key].base, dtype[key].shape) for key in dtype.names} if dtype.names else {"": (dtype, shape)}
+    if not dtype.names:
+        return {"": (dtype, shape)}
+    return {key: (dtype[key].base, dtype[key].shape) for key in dtype.names}
 
 
-def values_in(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+def values_in(shape: Shape, dtype: DType) -> int:
     """How many values an observation has, bytes of pictures and numbers."""
     return sum(prod(size) for _, size in fields_of(shape, dtype).values())
 
 
-def mixed_type(fields: Fields) -> np.dtype[Any]:
+def mixed_type(fields: Fields) -> DType:
     """The type of observations with these parts, sorted by key; malformed ones are a ``ValueError``."""
-    sizes = [size for _, shape in fields.values() for size in (len(shape), *shape)]
-    if not plain_names(list(fields)) or not all(type(size) is int and 0 < size <= MAX_SIDE for size in sizes):
-        raise ValueError(fields)
+    if not plain_names(list(fields)) or not all(min(shape, default=0) > 0 for _, shape in fields.values()):
+        raise ValueError(f"malformed observations: {fields}")
     return np.dtype([(key, dtype.str, shape) for key, (dtype, shape) in sorted(fields.items())])
 
 
-def type_text(dtype: np.dtype[Any]) -> str:
+def type_text(dtype: DType) -> str:
     """An observation's type as files keep it: ``uint8``, ``float32``, or JSON of ``{key: [type, shape]}``."""
-    parts = {key: [str(kind), list(shape)] for key, (kind, shape) in fields_of((), dtype).items()}
-    return json.dumps(parts) if dtype.names else str(dtype)
+    if not dtype.names:
+        return str(dtype)
+    parts = {}
+    for key, (kind, shape) in fields_of((), dtype).items():
+        parts[key] = [str(kind), list(shape)]
+    return json.dumps(parts)
 
 
-def type_of(text: object) -> np.dtype[Any]:
+def type_of(text: str) -> DType:
     """The type that :func:`type_text` wrote; anything else is a ``ValueError``."""
-    plain = {str(dtype): dtype for dtype in (PICTURE, NUMBERS)}
-    if text in plain:
-        return plain[str(text)]
+    if text in KINDS:
+        return KINDS[text]
+    fields = {}
     try:
-        parts = json.loads(text) if isinstance(text, str) else {}
-        return mixed_type({key: (plain[kind], tuple(shape)) for key, (kind, shape) in parts.items()})
-    except (TypeError, KeyError, AttributeError, RecursionError):
-        raise ValueError(text) from None
+        for key, (kind, shape) in json.loads(text).items():
+            fields[key] = (KINDS[kind], tuple(shape))
+        return mixed_type(fields)
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise ValueError(f"observations of type {text}") from None
 
 
-def packed(parts: Mapping[str, Any], dtype: np.dtype[Any] | None = None) -> Observations:
+def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations:
     """Mixed observations (N,) from arrays (N, ...) by key, all that ``dtype`` has if given; else a ``ValueError``."""
-    arrays = {key: np.asarray(values) for key, values in parts.items()}
-    arrays = {key: values.astype(NUMBERS) if values.dtype == np.float64 else values for key, values in arrays.items()}
-    stored = mixed_type({key: (values.dtype, values.shape[1:]) for key, values in arrays.items()})
-    lengths = {len(values) for values in arrays.values()}
+    arrays = {}
+    for key, values in parts.items():
+        array = np.asarray(values)
+        arrays[key] = array.astype(NUMBERS) if array.dtype == np.float64 else array
+    fields = {key: (array.dtype, array.shape[1:]) for key, array in arrays.items()}
+    stored = mixed_type(fields)
+    lengths = set(map(len, arrays.values()))
     if len(lengths) > 1 or (dtype is not None and stored != dtype):
         raise ValueError(f"{type_text(stored)}, of lengths {lengths}")
     states = np.empty(lengths.pop(), stored)
-    for key, values in arrays.items():
-        states[key] = values
+    for key, array in arrays.items():
+        states[key] = array
     return states
 
 
 def numbers_of(observations: Observations) -> NDArray[np.float32]:
     """All numbers of observations (N, ...), in a row each, float32 (N, D)."""
-    rows = [
-        (observations[key] if key else observations).reshape(len(observations), prod(shape))
-        for key, (dtype, shape) in fields_of(observations.shape[1:], observations.dtype).items()
-        if dtype == NUMBERS
-    ]
-    return rows[0] if len(rows) == 1 else np.concatenate([np.zeros((len(observations), 0), NUMBERS), *rows], axis=1)
+    count = len(observations)
+    rows = []
+    for key, (dtype, shape) in fields_of(observations.shape[1:], observations.dtype).items():
+        if dtype == NUMBERS:
+            values = observations[key] if key else observations
+            rows.append(values.reshape(count, prod(shape)))
+    if len(rows) == 1:
+        return rows[0]
+    return np.concatenate([np.zeros((count, 0), NUMBERS), *rows], axis=1)
 
 
-def standard_of(shape: tuple[int, ...], *observations: Observations) -> Standard:
+def standard_of(shape: Shape, *observations: Observations) -> Standard:
     """Mean and deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary, or without any."""
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
-    sample = np.concatenate([np.zeros((int(not any(map(len, rows))), *shape), NUMBERS), *rows])
-    mean, deviation = sample.mean(0, dtype=np.float64), sample.std(0, dtype=np.float64)
-    deviation = np.where(deviation > 1e-6 * np.abs(mean), deviation, 1.0)
-    return mean.astype(NUMBERS), deviation.astype(NUMBERS)
+    if not any(map(len, rows)):
+        return np.zeros(shape, NUMBERS), np.ones(shape, NUMBERS)
+    sample = np.concatenate(rows)
+    mean = sample.mean(0, dtype=np.float64)
+    deviation = sample.std(0, dtype=np.float64)
+    varies = deviation > 1e-6 * np.abs(mean)
+    return mean.astype(NUMBERS), np.where(varies, deviation, 1.0).astype(NUMBERS)
 
 
 def standardised(observations: Any, mean: Any, deviation: Any) -> Any:

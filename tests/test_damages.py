@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import json
-import resource
 import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
-import numpy as np
 import pytest
 import torch
-from command_line import fails, refuses, run
+from command_line import fails, refuses
 from safetensors.torch import save_file
-from toy_data import SHAPE, fill, reseal, write
+from toy_data import fill, reseal, write
 
 from hypogoal.core.artefacts import create_artefact, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.core.hdf5 import set_attribute
 from hypogoal.core.manifests import MANIFEST
 from hypogoal.core.tensors import load_tensors
-from hypogoal.data import open_dataset
-from hypogoal.inspection import faults_of
-
-OBSERVATIONS, LABELS, ORIGIN = (f"labelled/one/{name}" for name in ("observations", "labels", "origin"))
-STATES = (7, *SHAPE)
-Damage = Callable[[h5py.File], Any]
 
 
 def faults_told(path: Path) -> str:
@@ -35,138 +25,6 @@ def faults_told(path: Path) -> str:
     said = fails("verify", path)
     assert said.err == ""
     return said.out
-
-
-def attribute(name: str, value: Any) -> Damage:
-    def damage(file: h5py.File) -> None:
-        file.attrs.pop(name, None)
-        if value is not None:
-            set_attribute(file, name, value)
-
-    return damage
-
-
-def dataset(make: Damage, place: str = OBSERVATIONS) -> Damage:
-    """Something else in place of one of the file's datasets or groups."""
-
-    def damage(file: h5py.File) -> None:
-        del file[place]
-        make(file)
-
-    return damage
-
-
-def observations(**about: Any) -> Damage:
-    """Other observations; of the shape that they had unless another is given."""
-    return dataset(lambda file: file.create_dataset(OBSERVATIONS, **{"shape": STATES, "dtype": "u1", **about}))
-
-
-def virtual(file: h5py.File) -> None:
-    layout = h5py.VirtualLayout(shape=STATES, dtype="u1")
-    layout[...] = h5py.VirtualSource("secret.h5", "x", shape=STATES)
-    file.create_virtual_dataset(OBSERVATIONS, layout)
-
-
-def small_lie(file: h5py.File) -> None:
-    """200,000 chunks, one of them written; its size in the file's index says that all are."""
-    made = file.create_dataset(OBSERVATIONS, shape=(200_000, 1, 1, 1), dtype="u1", chunks=(1, 1, 1, 1), shuffle=True)
-    made.id.write_direct_chunk((0, 0, 0, 0), bytes(200_000))
-
-
-def many_chunks(file: h5py.File) -> None:
-    about = {"shape": (7000, *SHAPE), "dtype": "u1", "chunks": (1, 1, 1, 1), "compression": "gzip"}
-    file.create_dataset(OBSERVATIONS, **about)[:50] = 1
-
-
-def single_label(file: h5py.File) -> None:
-    file[LABELS] = True
-
-
-def no_group(file: h5py.File) -> None:
-    file.create_dataset(ORIGIN, shape=(2**40,), dtype="u1")
-
-
-def linked(link: Any) -> Damage:
-    return dataset(lambda file: file.__setitem__(OBSERVATIONS, link))
-
-
-# What is wrong with a data file -> how it came to that, and the words for it: what ``show`` sees, and what it does not.
-SHOWN: dict[str, tuple[Damage, str]] = {
-    "newer": (attribute("format", 99), "newer"),
-    "no format": (attribute("format", "x"), "not a hypogoal data file"),
-    "older": (attribute("format", 1), "earlier"),
-    "not complete": (attribute("complete", False), "not complete"),
-    "no domain": (attribute("domain", None), "not a hypogoal data file"),
-    "sub-goals that are no JSON": (attribute("sub_goals", "{"), "not a hypogoal data file"),
-    "a shape that is none": (attribute("observation_shape", '"x"'), "not a hypogoal data file"),
-    "mark-up": (attribute("sub_goals", '["one\\"><img src=x onerror=alert(1)>", "two"]'), "not a hypogoal data file"),
-    "no config": (attribute("config", None), "not a hypogoal data file"),
-    # These lie in a heap that the HDF5 library, where it is damaged, may read for ever.
-    "texts of variable length": (
-        lambda file: file.attrs.__setitem__("domain", "toy"),
-        "neither a text of fixed length",
-    ),
-}
-PARTS: dict[str, tuple[Damage, str]] = {
-    "external link": (linked(h5py.ExternalLink("secret.h5", "/x")), "is a link"),
-    "soft link": (linked(h5py.SoftLink("/heldout/one/observations")), "is a link"),
-    "external storage": (observations(external=[("secret.h5", 0, h5py.h5f.UNLIMITED)]), "lie in another file"),
-    "virtual": (dataset(virtual), "lie in another file"),
-    "references": (observations(dtype=h5py.ref_dtype), "type"),
-    "floats": (observations(data=np.zeros(STATES), dtype="f8"), "is float64"),
-    "texts": (observations(dtype=h5py.string_dtype()), "type"),
-    "a filter": (observations(chunks=True, scaleoffset=0), "filter"),
-    "terabytes": (observations(shape=(2**40, *SHAPE)), "declares"),
-    "packed terabytes": (observations(shape=(2**40, *SHAPE), chunks=(64, *SHAPE), compression="gzip"), "declares"),
-    "a chunk for each byte": (dataset(many_chunks), "in 420000 chunks"),
-    "chunks that say that they are stored": (dataset(small_lie), "in 200000 chunks"),
-    "another shape": (observations(data=np.zeros((7, 9)), shape=(7, 9)), "not uint8"),
-    "a dataset in place of a group": (dataset(no_group, ORIGIN), "a group should be"),
-    "no labels": (lambda file: file.__delitem__(LABELS), f"no readable '{LABELS}'"),
-}
-
-
-@pytest.mark.parametrize("case", [*SHOWN, *PARTS])
-def test_data_files(tmp_path: Path, case: str) -> None:
-    """Spec A8, G2: found by ``verify``, refused by what reads it, with no memory for what is only declared."""
-    damage, words = (SHOWN | PARTS)[case]
-    path = write(tmp_path / "data.h5", domain="doorkey")
-    with h5py.File(path, "a") as file:
-        damage(file)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert words in faults_told(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
-    if case in SHOWN:
-        refuses(words, "show", path)
-        line = refuses(words, "train-ensemble", path, "--out", tmp_path / "out" / "ensemble", "-q")
-    else:
-        line = refuses(words, "export", path, "--out", tmp_path / "out" / "arrays.npz")
-    assert str(path) in line
-
-
-def test_data_files_that_were_cut_off(tmp_path: Path) -> None:
-    """Spec G2: wherever it ends, one line says to collect it again."""
-    path = write(tmp_path / "data.h5")
-    data = path.read_bytes()
-    for length in [*np.random.default_rng(0).integers(0, len(data), size=20), 0]:
-        path.write_bytes(data[:length])
-        assert faults_told(path).endswith(f"is truncated or not HDF5: {path}. Collect it again.\n")
-
-
-@pytest.mark.parametrize("name", ["labelled/two/labels", "labelled/one/origin/layout_seed", "heldout/one/observations"])
-def test_a_changed_byte_of_a_data_file(tmp_path: Path, name: str) -> None:
-    """Spec A8, G2: a label or origin, too, though any byte may stand there; what has no checksum is read."""
-    path = write(tmp_path / "data.h5")
-    with h5py.File(path, "r+") as file:
-        plain = file["unlabelled/origin/layout_seed"][()]
-        del file["unlabelled/origin/layout_seed"]
-        file["unlabelled/origin/layout_seed"] = plain
-        chunk = file[name].id.get_chunk_info(0)
-    run("verify", path)
-    whole = path.read_bytes()
-    place = chunk.byte_offset + chunk.size // 2
-    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-    assert name in faults_told(path)
 
 
 # Keys of a manifest, or all of its text, and the words for what is wrong with it.
@@ -326,10 +184,3 @@ def test_values_of_a_preset(tmp_path: Path, value: str) -> None:
     path.write_text(f"[train-ensemble]\nmembers = {value}\n")
     train = ["train-ensemble", write(tmp_path / "data.h5", domain="doorkey"), "--out", tmp_path / "out"]
     refuses("wrong type of value: members=", *train, "--preset", path)
-
-
-def test_labels_of_what_is_not_there(tmp_path: Path) -> None:
-    """Spec A1: another sub-goal's."""
-    with pytest.raises(UserError, match="unknown sub-goal"):
-        open_dataset(write(tmp_path / "data.h5")).labelled("three")
-    assert faults_of(tmp_path / "data.h5") == []

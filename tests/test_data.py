@@ -1,15 +1,31 @@
 """The data file: whole or refused in one line (Spec A1, A8, G2)."""
 
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from command_line import refuses, run
-from toy_data import write
+from command_line import fails, refuses, run
+from toy_data import SHAPE, write
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import Collected, States, open_dataset, write_dataset
+from hypogoal.data import Collected, States, fixed, open_dataset, reading, write_dataset
+
+OBSERVATIONS, LABELS = "labelled/one/observations", "labelled/one/labels"
+CRASH = """
+import h5py, os, sys
+file = h5py.File(sys.argv[1], "w", libver="latest")
+file["values"] = [1, 2, 3]
+file.flush()
+os._exit(1)
+"""
+Damage = Callable[[h5py.File], Any]
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
@@ -23,8 +39,117 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(dataset.heldout("two").origins["layout_seed"], np.arange(7))
     with h5py.File(path) as file:
         assert set(file["unlabelled"]) == {"observations", "origin"}
+        assert file[OBSERVATIONS].id == file["labelled/two/observations"].id
     with pytest.raises(UserError, match="unknown sub-goal"):
         dataset.labelled("three")
+
+
+def test_some_heldout_states_are_of_both_classes_and_as_in_the_file(tmp_path: Path) -> None:
+    """So many of each class, or all there are, of every part of the file."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, size=(3_000, *SHAPE), dtype=np.uint8)
+    labels = np.stack([rng.random(3_000) < 0.02, np.zeros(3_000, np.bool_)], axis=1)
+    states = States(images, labels, {"layout_seed": np.arange(3_000)})
+    collected = Collected(SHAPE, ("rare", "never"), states, states, states)
+    write_dataset(tmp_path / "data.h5", collected, domain="", config={}, seed=0)
+    dataset = open_dataset(tmp_path / "data.h5")
+    some = dataset.some_heldout("rare", 40)
+    rows = some.origins["layout_seed"]
+    np.testing.assert_array_equal(some.observations, images[rows])
+    np.testing.assert_array_equal(some.labels, labels[rows, 0])
+    assert some.labels.sum() == (~some.labels).sum() == 40 and rows[0] < 300 and rows[-1] > 2_700
+    assert len(dataset.some_heldout("never", 40).labels) == 40
+    assert dataset.some_heldout("rare", 10_000).labels.sum() == labels[:, 0].sum()
+
+
+@pytest.mark.parametrize(
+    ("name", "origin"),
+    [("../../x", "seed"), ("a/b", "seed"), ("", "seed"), ("a?", "seed"), ("=1+1", "seed"), ("one", "a/b")],
+)
+def test_names_become_files_and_groups(tmp_path: Path, name: str, origin: str) -> None:
+    """Spec G2: they are refused before anything is written."""
+    states = States(np.zeros((2, *SHAPE), np.uint8), np.zeros((2, 1), np.bool_), {origin: np.arange(2)})
+    with pytest.raises(UserError, match="name must be usable as a file name"):
+        write_dataset(
+            tmp_path / "data.h5", Collected(SHAPE, (name,), states, states, states), domain="", config={}, seed=0
+        )
+    assert not [*tmp_path.iterdir()]
+
+
+def test_labels_are_truth_values(tmp_path: Path) -> None:
+    """NumPy turns the text 'False' into True."""
+    states = States(np.zeros((2, *SHAPE), np.uint8), np.zeros((2, 1), np.bool_))
+    texts = replace(states, labels=np.array([["True"], ["False"]]))
+    with pytest.raises(UserError, match="the domain's heldout labels are not truth values: <U5"):
+        write_dataset(tmp_path / "a.h5", Collected(SHAPE, ("a",), states, states, texts), domain="", config={}, seed=0)
+
+
+def attribute(name: str, value: Any) -> Damage:
+    def damage(file: h5py.File) -> None:
+        file.attrs[name] = fixed(value) if isinstance(value, str) else value
+
+    return damage
+
+
+def instead(name: str, **about: Any) -> Damage:
+    """Another dataset in place of one; without any the name is missing."""
+
+    def damage(file: h5py.File) -> None:
+        del file[name]
+        if about:
+            file.create_dataset(name, **about)
+
+    return damage
+
+
+# What is wrong with a data file: how it came to that, and the words for it.
+DAMAGES: dict[str, tuple[Damage, str]] = {
+    "newer": (attribute("format", 99), "Upgrade hypogoal"),
+    "older": (attribute("format", 1), "format 1, this hypogoal reads 2"),
+    "foreign": (attribute("format", "x"), "not a hypogoal data file"),
+    "not complete": (attribute("complete", False), "not complete"),
+    "no domain": (lambda file: file.attrs.pop("domain"), "'domain'"),
+    "sub-goals that are no JSON": (attribute("sub_goals", "{"), "cannot be read"),
+    "names that are none": (attribute("sub_goals", json.dumps(["../x"])), "usable as a file name"),
+    "a type that is none": (attribute("observation_dtype", "int7"), "int7"),
+    "floats": (instead(OBSERVATIONS, data=np.zeros((7, *SHAPE))), f"{OBSERVATIONS} is float64"),
+    "another shape": (instead(OBSERVATIONS, data=np.zeros((7, 9), np.uint8)), f"{OBSERVATIONS} is uint8 (7, 9)"),
+    "no labels": (instead(LABELS), "'labels'"),
+    "too few labels": (instead(LABELS, data=np.zeros(3, np.bool_)), "labels of shape (3,) for 7 states"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGES)
+def test_damaged_files(tmp_path: Path, case: str) -> None:
+    """Spec A8, G2: found by ``verify``, refused by what reads it."""
+    damage, words = DAMAGES[case]
+    path = write(tmp_path / "data.h5", domain="doorkey")
+    with h5py.File(path, "a") as file:
+        damage(file)
+    assert words in fails("verify", path).out
+    refuses(words, "export", path, "--out", tmp_path / "out" / "arrays.npz")
+
+
+def test_files_that_are_no_data_files(tmp_path: Path) -> None:
+    """Each remedy fits its fault."""
+    whole = write(tmp_path / "data.h5").read_bytes()
+    for length in (0, 3, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.h5").write_bytes(whole[:length])
+        refuses("Collect it again.", "show", tmp_path / "cut.h5")
+    for path in (tmp_path / "missing.h5", tmp_path):
+        with pytest.raises(UserError, match="Is it the right path"):
+            open_dataset(path)
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["values"] = np.zeros(3)
+    refuses("not a hypogoal data file", "show", tmp_path / "foreign.h5")
+
+
+def test_a_crashed_programs_file_names_h5clear(tmp_path: Path) -> None:
+    """Its data are whole: the HDF5 tools take the mark away that it is open for writing."""
+    path = tmp_path / "crashed.h5"
+    subprocess.run([sys.executable, "-c", CRASH, path], check=False)
+    with pytest.raises(UserError, match=f"h5clear -s {path}"), reading(path):
+        pass
 
 
 def test_a_file_that_is_open_elsewhere_is_not_damaged(tmp_path: Path) -> None:
@@ -37,24 +162,33 @@ def test_a_file_that_is_open_elsewhere_is_not_damaged(tmp_path: Path) -> None:
     run("verify", path)
 
 
-def test_some_heldout_states_are_of_both_classes_and_as_in_the_file(tmp_path: Path) -> None:
-    """So many of each class, or all there are, of every part of the file."""
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, size=(3_000, 4, 5, 3), dtype=np.uint8)
-    labels = np.stack([rng.random(3_000) < 0.02, np.zeros(3_000, np.bool_)], axis=1)
-    states = States(images, labels, {"layout_seed": np.arange(3_000)})
-    write_dataset(
-        tmp_path / "data.h5",
-        Collected((4, 5, 3), ("rare", "never"), states, states, states),
-        domain="",
-        config={},
-        seed=0,
-    )
-    dataset = open_dataset(tmp_path / "data.h5")
-    some = dataset.some_heldout("rare", 40)
-    rows = some.origins["layout_seed"]
-    np.testing.assert_array_equal(some.observations, images[rows])
-    np.testing.assert_array_equal(some.labels, labels[rows, 0])
-    assert some.labels.sum() == (~some.labels).sum() == 40 and rows[0] < 300 and rows[-1] > 2_700
-    assert len(dataset.some_heldout("never", 40).labels) == 40
-    assert dataset.some_heldout("rare", 10_000).labels.sum() == labels[:, 0].sum()
+@pytest.mark.parametrize("name", [LABELS, "labelled/one/origin/layout_seed", "heldout/one/observations"])
+def test_a_changed_byte_is_found(tmp_path: Path, name: str) -> None:
+    """Spec A8, G2: of a label or origin, too, though any byte may stand there."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path) as file:
+        chunk = file[name].id.get_chunk_info(0)
+    whole = bytearray(path.read_bytes())
+    whole[chunk.byte_offset + chunk.size // 2] ^= 1
+    path.write_bytes(whole)
+    assert "cannot be read" in fails("verify", path).out
+
+
+def test_a_full_disk_is_an_error(tmp_path: Path) -> None:
+    """The HDF5 library alone would crash the process."""
+    code = f"""
+import resource
+from pathlib import Path
+import numpy as np
+from hypogoal.data import Collected, States, write_dataset
+states = States(np.random.default_rng(0).random((2000, 64)).astype("f4"), np.zeros((2000, 1), bool))
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    write_dataset(Path({str(tmp_path / "data.h5")!r}), Collected((64,), ("a",), states, states, states),
+                  domain="", config={{}}, seed=0)
+except OSError as error:
+    print(error.strerror)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout == "File too large\n", done.stderr
+    assert not [*tmp_path.iterdir()]

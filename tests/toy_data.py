@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.manifests import LOG, MANIFEST, NUMBERS_CSV, sealed
 from hypogoal.core.tensors import save_tensors
-from hypogoal.data import Collected, States, write_dataset
+from hypogoal.data import Collected, States, create_hdf5, write_dataset
 
 SHAPE = (4, 5, 3)
 

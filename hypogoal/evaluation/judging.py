@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.data import States, open_dataset
+from hypogoal.data import States, fixed, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
 from hypogoal.evaluation.run import Contents

@@ -36,7 +36,7 @@ def provenance(contents: Contents, data: list[Path]) -> dict[str, Any]:
             "domain": dataset.domain,
             "config": dataset.config,
             "counts": dataset.counts(),
-            "seed": dataset.attributes.get("seed"),
+            "seed": dataset.seed,
         }
         for path, dataset in zip(data, map(open_dataset, data), strict=True)
     ]

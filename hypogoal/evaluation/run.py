@@ -16,8 +16,8 @@ from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json
-from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
 from hypogoal.core.manifests import digest_of
+from hypogoal.data import reading
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
 FORMAT = 4  # of ``metrics.json``
@@ -114,11 +114,8 @@ def read_layout(path: Path) -> dict[str, Any]:
 
 def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
     """``terminations.h5``: option -> the last states in which its classifier ended it, (n, *obs)."""
-    with open_hdf5(path, "the file of terminations", AGAIN) as file:
-        try:
-            return {int(name): read_array(file, name, "uf") for name in members(file)}
-        except ValueError as error:  # a name that is no number
-            raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
+    with reading(path, "the file of terminations", AGAIN) as file:
+        return {int(name): states[()] for name, states in file.items()}
 
 
 @dataclass(frozen=True)
@@ -151,8 +148,11 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     source = next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
     metrics = read_numbers(source)
     metrics["missing"] = [*metrics["missing"], *_since(run, source)]
-    with open_hdf5(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
-        arrays = {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
+    with reading(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
+        names: list[str] = []
+        file.visit(names.append)
+        found = {name: file[name] for name in names if name.startswith(start)}
+        arrays = {name: np.asarray(item) for name, item in found.items() if hasattr(item, "shape")}
     return Evaluated(source, metrics, arrays)
 
 

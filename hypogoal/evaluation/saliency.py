@@ -10,8 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.core.hdf5 import fixed
-from hypogoal.data import open_dataset
+from hypogoal.data import fixed, open_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judgement, Work, parts_of
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.core.hdf5 import create_hdf5
+from hypogoal.data import create_hdf5
 from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.observations import Observations

@@ -38,7 +38,7 @@ def collect(
     identity: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
     if resume and out.exists() and not unfinished(out):
         existing = open_dataset(out)
-        before = {"domain": existing.domain, "config": existing.config, "seed": existing.attributes["seed"]}
+        before = {"domain": existing.domain, "config": existing.config, "seed": existing.seed}
         raise check_complete(before, identity, requested)
     if domain.doubt:
         say(f"hypogoal: {domain.doubt}", err=True)

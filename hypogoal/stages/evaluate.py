@@ -8,9 +8,9 @@ from typing import Any
 from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.files import write_table
-from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import cores
+from hypogoal.data import create_hdf5
 from hypogoal.evaluation.curves import SOLVED, group_runs, read_run
 from hypogoal.evaluation.distance import INSIDE, NEAR
 from hypogoal.evaluation.judging import Case, Work, cases_of, judgements, processes_for

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hypogoal.core.hdf5 import fixed
+from hypogoal.data import fixed
 
 Rng = random.Random
 # Files that a system calls regular, and that never end, wait, or have another size than they say.

@@ -12,9 +12,9 @@ from toy_data import files_of, reseal
 
 from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.data import create_hdf5
 
 
 def make(out: Path, kind: str = "meta", inputs: tuple[Path, ...] = (), force: bool = False) -> Path:

@@ -26,9 +26,8 @@ from toy_data import fill, reseal
 
 from hypogoal.core.artefacts import MANIFEST, create_artefact, sha256_of
 from hypogoal.core.files import write_table
-from hypogoal.core.hdf5 import create_hdf5, fixed, set_attribute
 from hypogoal.core.manifests import digest_of, sealed
-from hypogoal.data import Collected, States, write_dataset
+from hypogoal.data import Collected, States, create_hdf5, fixed, write_dataset
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
 from hypogoal.evaluation.run import fitting, read_evaluation
@@ -277,7 +276,7 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
     def draw(value):
         with h5py.File(data, "a") as file:
             for name, own in value["attributes"].items():
-                set_attribute(file, name, own if isinstance(own, str) else json.dumps(own))
+                file.attrs[name] = fixed(own if isinstance(own, str) else json.dumps(own))
         now = {before[data]: sha256_of(data)}
         for name, manifest in value["manifests"].items():
             inputs = [{**entry, "sha256": now.get(entry["sha256"], entry["sha256"])} for entry in manifest["inputs"]]

@@ -178,5 +178,5 @@ def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path, kind: st
     after = open_dataset(out)
     assert after.observation_shape == (160, 160 if kind == "minari" else 128, 3)
     for mine in ("domain", "seed", "sub_goals"):
-        assert before.attributes[mine] == after.attributes[mine]
+        assert getattr(before, mine) == getattr(after, mine)
     np.testing.assert_array_equal(labels, after.labelled(name).labels)
