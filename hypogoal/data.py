@@ -81,9 +81,7 @@ class Collected:
 
 
 class Unmet(UserError):
-    """Play did not reach the states needed; ``collected`` has those it reached, if known."""
-
-    collected: Collected | None = None
+    """Play did not reach the states needed."""
 
 
 def leave_out(states: States, *training: Observations) -> States:

@@ -12,14 +12,13 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
-from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import give, say
 from hypogoal.settings import configuration
 
 LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
 
 if TYPE_CHECKING:
-    from hypogoal.testing import Verdict
+    from hypogoal.check import Verdict
 
 
 @cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
@@ -127,35 +126,32 @@ def check(
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
-    passed = True
+    broken = False
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
         config = configuration("collect", domain, None, set_, {}, by_user=True) if domain else None
-        with Progress("check", total=1, quiet=domain is None) as progress:
-            options = {"layout_seed": layout_seed, "seed": seed, "progress": progress}
-            for verdict in _verdicts(domain, diversity, network, config, options):
-                with progress.paused():
-                    for line in verdict.lines:
-                        say(line)
-                passed &= verdict.ok
-    if not passed:
+        for verdict in _verdicts(domain, diversity, network, config, layout_seed, seed):
+            for line in verdict.lines:
+                say(line)
+            broken |= not verdict.ok
+    if broken:
         raise typer.Exit(2)
 
 
 def _verdicts(
-    domain: str | None, diversity: str | None, network: str | None, config: Any, options: dict[str, Any]
+    domain: str | None, diversity: str | None, network: str | None, config: Any, layout_seed: int, seed: int
 ) -> Iterator[Verdict]:
-    from hypogoal.testing import check_domain, check_network, check_objective
+    from hypogoal.check import check_domain, check_network, check_objective
 
-    seen: tuple[Any, ...] = ()
+    observations: tuple[Any, ...] = ()
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
         loaded = load_domain(domain, by_user=True)
-        yield from check_domain(loaded, config, **options)
-        seen = tuple(loaded.observation_shape), loaded.observation_dtype
+        yield from check_domain(loaded, config, layout_seed=layout_seed, seed=seed)
+        observations = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective
 
         yield from check_objective(load_objective(diversity))
     if network is not None:
-        yield from check_network(network, *seen)
+        yield from check_network(network, *observations)

@@ -183,18 +183,13 @@ class GymnasiumDomain(Domain):
             training.update(map(digest, sets[-1].observations))
         env.close()
         labelled, unlabelled, heldout = sets
-        collected = Collected(self.reader.shape, self.sub_goals, labelled, unlabelled, heldout, self.reader.features)
         where = f"steps={config.steps}"
-        try:
-            for part, name in ((unlabelled, "unlabelled"), (heldout, "held-out")):
-                if not len(part.observations):
-                    do = "Give other seeds, or more steps: states that look like training states do not count."
-                    raise Unmet(f"there are no {name} states", where, do)
-            require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
-        except Unmet as error:
-            error.collected = collected
-            raise
-        return collected
+        for part, name in ((unlabelled, "unlabelled"), (heldout, "held-out")):
+            if not len(part.observations):
+                do = "Give other seeds, or more steps: states that look like training states do not count."
+                raise Unmet(f"there are no {name} states", where, do)
+        require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
+        return Collected(self.reader.shape, self.sub_goals, labelled, unlabelled, heldout, self.reader.features)
 
 
 class _State(NamedTuple):

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from hypogoal.check.objectives import check_objective, context_of
+from hypogoal.check.verdict import require
 from hypogoal.core.errors import UserError
 from hypogoal.diversity import ENTRY_POINTS, OBJECTIVES, Context, Objective, PairLoss, load_objective
-from hypogoal.testing.objectives import check_objective, context_of
-from hypogoal.testing.verdict import require
 
 PAIRED = ("dbat", "mutual-information", "none")
 DIVERSE = [name for name in PAIRED if name != "none"]
@@ -201,7 +201,7 @@ def test_those_of_the_whole_ensemble_keep_the_laws(name: str) -> None:
 def batch(*members: Tensor, frozen: Tensor | None = None, **changes: Any) -> Context:
     """A context of members' logits (N, 2) on unlabelled states; what else it has is random."""
     unlabelled = torch.stack(members)
-    context = context_of(len(members), unlabelled.shape[1], dtype=unlabelled.dtype)
+    context = context_of(len(members), unlabelled.shape[1])
     none = unlabelled.new_zeros(0, *unlabelled.shape[1:])
     return replace(context, unlabelled=unlabelled, frozen=none if frozen is None else frozen, **changes)
 
@@ -252,7 +252,7 @@ def test_the_double_sum_by_hand() -> None:
     """Eq. (1), Spec C4: each pair in training counts in both orders, pairs with frozen members once."""
     logits = torch.stack([torch.full((1, 2), float(value)) for value in (1, 2, 4)])
     objective = Objective("distance", pair_loss=lambda a, b: (a - b).abs().mean())
-    context = context_of(3, 1, dtype=torch.float32)
+    context = context_of(3, 1)
     for trained, frozen, expected in ((3, 0, [2 * 1, 2 * 3, 2 * 2]), (1, 2, [1, 3]), (1, 0, [])):
         seen = replace(context, unlabelled=logits[:trained], frozen=logits[trained : trained + frozen])
         assert objective.losses(seen).tolist() == expected

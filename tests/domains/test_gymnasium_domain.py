@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
 
+from hypogoal.check import check_domain
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
@@ -20,7 +21,6 @@ from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium_engine import GymnasiumEngine
 from hypogoal.domains.observations import channels_first
 from hypogoal.stages.collect import collect
-from hypogoal.testing import check_domain
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 

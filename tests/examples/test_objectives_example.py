@@ -13,12 +13,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.check.objectives import check_objective, confident, context_of
+from hypogoal.check.verdict import require
 from hypogoal.diversity import Objective, load_objective
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.scores import mean_disagreement
 from hypogoal.hypotheses.training import fit
-from hypogoal.testing.objectives import check_objective, confident, context_of
-from hypogoal.testing.verdict import require
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("repulsive", "ace")
@@ -48,7 +48,7 @@ def test_members_that_differ_have_a_lower_loss(name: str) -> None:
     third = confident(0, 0, 0, 0)[None]
     losses = []
     for members in (agreeing, differing):
-        context = context_of(3, 4, dtype=torch.float32)
+        context = context_of(3, 4)
         losses.append(objective(name).losses(replace(context, unlabelled=torch.cat([members, third]))).item())
     assert losses[1] < losses[0]
 

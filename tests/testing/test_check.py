@@ -14,6 +14,7 @@ import pytest
 from command_line import fails, refuses, run, settings
 from corridor import Corridor
 from corridor_env import ALWAYS, NEVER, SUB_GOALS, CorridorEnv, all_labels, at_left, swift
+from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -27,7 +28,6 @@ from hypogoal.domains import base as bases
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.hypotheses.networks import NETWORKS
-from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
 from tests.attacks.own_code import FAMILIES
 
 TESTS = Path(__file__).parents[1]

@@ -1,0 +1,368 @@
+"""``hypogoal check``: what keeps its contract passes, and each broken law is named (Spec B6, C1, C2, C5)."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from command_line import fails, refuses, run, settings
+from corridor import Corridor
+from corridor_env import NEVER, SUB_GOALS, CorridorEnv, all_labels, at_left, swift
+from own_domain import CorridorConfig, CorridorDomain, TallCorridor
+from torch import Tensor, nn
+
+from hypogoal.check import Verdict, check_domain, check_network, check_objective, require
+from hypogoal.data import Collected
+from hypogoal.diversity import OBJECTIVES as OURS
+from hypogoal.diversity import Objective, dbat, load_objective, none
+from hypogoal.domains.base import Step
+from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.hypotheses.networks import NETWORKS
+from hypogoal.observations import mixed_type
+
+TESTS = Path(__file__).parents[1]
+SMALL = GymnasiumConfig(steps=150, heldout_seeds=(4, 5))
+NOBODYS, COUNT = np.random.default_rng(5), itertools.count()
+
+
+def domain_of(**engine_parts: Any) -> CorridorDomain:
+    """The corridor with an engine whose methods and attributes are replaced."""
+    engine = type("Broken", (TallCorridor,), engine_parts)
+
+    class Domain(CorridorDomain):
+        def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Any:
+            return engine(count, max_steps)
+
+    return Domain()
+
+
+def stepping(**changes: Any) -> CorridorDomain:
+    """The corridor with changed parts of its steps."""
+
+    def step(self: Any, actions: np.ndarray) -> Step:
+        found = Corridor.step(self, actions)
+        return found._replace(**{name: change(getattr(found, name)) for name, change in changes.items()})
+
+    return domain_of(step=step)
+
+
+def collecting(part: str, **changes: Any) -> CorridorDomain:
+    """The corridor with a part of its collected states changed."""
+
+    class Domain(CorridorDomain):
+        def collect(self, config: CorridorConfig, seed: int, progress: Any) -> Collected:
+            found = super().collect(config, seed, progress)
+            states = getattr(found, part)
+            new = {name: change(getattr(states, name)) for name, change in changes.items()}
+            return replace(found, **{part: replace(states, **new)})
+
+    return Domain()
+
+
+class Reordered(CorridorDomain):
+    """It collects other sub-goals than it has."""
+
+    usual_sub_goals = ("right-end", "left-end")
+
+
+def having(**parts: Any) -> CorridorDomain:
+    """The corridor with other attributes."""
+    domain = CorridorDomain()
+    vars(domain).update(parts)
+    return domain
+
+
+def first_fault(verdicts: Any) -> Verdict:
+    return next(verdict for verdict in verdicts if not verdict.ok)
+
+
+def never_ending(self: Any, actions: np.ndarray) -> Step:
+    self.max_steps = 10_000
+    return Corridor.step(self, actions)
+
+
+def forgetful(self: Any, snapshot: dict[str, Any]) -> None:
+    Corridor.restore(self, snapshot | {"ids": np.full_like(snapshot["ids"], 4)})
+
+
+def wandering(self: Any, actions: np.ndarray) -> Step:
+    return Corridor.step(self, NOBODYS.integers(2, size=len(actions)))
+
+
+def moody(self: Any, ids: np.ndarray) -> np.ndarray:
+    return Corridor.labels(self, ids) | [False, next(COUNT) % 2 == 0]
+
+
+BROKEN = [
+    (having(sub_goals=("a/b", "c")), "settings", "a/b"),
+    (having(defaults={"train-ensemble": {"memberz": 4}}), "settings", "memberz"),
+    (having(defaults={"train_ensemble": {"members": 4}}), "settings", "'train_ensemble', which is not a stage"),
+    (domain_of(images=lambda self, ids, out=None: np.zeros((len(ids), 64, 64, 3), np.float32)), "steps", "float32"),
+    (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "steps", "does not fill out"),
+    (domain_of(images=lambda self, ids, out=None: 1 // 0), "steps", "ZeroDivisionError"),
+    (stepping(rewards=lambda values: values.astype(np.float64)), "steps", "float64"),
+    (stepping(rewards=lambda values: values * np.nan), "steps", "finite"),
+    (stepping(terminated=lambda values: values.astype(np.int64)), "steps", "terminated: int64 (3,) instead of bool"),
+    (stepping(succeeded=lambda _: [False] * 3), "steps", "succeeded"),
+    (domain_of(step=never_ending), "steps", "went on after max_steps"),
+    (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "steps", "(3, 1)"),
+    (domain_of(labels=moody), "labels", "asked twice in the same state, labels differ: right-end"),
+    (domain_of(step=wandering), "two engines", "differ in step"),
+    (domain_of(restore=forgetful), "restore", "differ in step"),
+    (Reordered(), "collect", "sub_goals are ('left-end'"),
+    (collecting("labelled", labels=lambda labels: labels.astype(int)), "collect", "labels of labelled: int64"),
+    (collecting("labelled", labels=np.zeros_like), "collect", "left-end has no positives"),
+    (collecting("heldout", observations=lambda some: some[:0], labels=lambda some: some[:0]), "collect", "no heldout"),
+    (collecting("unlabelled", observations=NOBODYS.permutation), "collect", "unlabelled states differ"),
+]
+
+
+@pytest.mark.parametrize(("domain", "law", "fault"), BROKEN)
+def test_each_broken_law_of_a_domain_is_named(domain: CorridorDomain, law: str, fault: str) -> None:
+    """Spec B6: which law, and what was found."""
+    found = first_fault(check_domain(domain))
+    assert found.name == law and fault in found.text
+    with pytest.raises(AssertionError, match=f"FAIL {law}"):
+        require(check_domain(domain))
+
+
+def test_domains_that_keep_the_contract_pass() -> None:
+    """Spec B6: one of an engine, one of an environment."""
+    defaults = {"train-ensemble": {"members": 4}, "collect": {"copies": 2}, "train-baseline": {}}
+    found = [*check_domain(having(defaults=defaults))]
+    require(found)
+    assert [verdict.name for verdict in found] == ["settings", "steps", "labels", "two engines", "restore", "collect"]
+    assert not any(verdict.warnings for verdict in found)
+    both = GymnasiumDomain(CorridorEnv, ("left-end", "right-end"), labels=all_labels, success=swift)
+    require(check_domain(both, SMALL))
+
+
+def test_what_may_surprise_is_a_warning() -> None:
+    """Spec B6: labels that pictures do not show, training that cannot be resumed, states that play did not reach."""
+
+    def hidden(self: Any, ids: np.ndarray) -> np.ndarray:
+        return np.stack([ids == 0, np.full(len(ids), self.elapsed[0] % 2 == 0)], axis=1)
+
+    surprises = [
+        (check_domain(domain_of(labels=hidden)), "labels", "have different labels"),
+        (check_domain(domain_of(resumes=False)), "restore", "cannot be resumed"),
+        (check_domain(NEVER, SMALL), "collect", "on-the-moon has no positives"),
+    ]
+    for found, law, warning in surprises:
+        verdicts = {verdict.name: verdict for verdict in found}
+        require(verdicts.values())
+        assert warning in verdicts[law].warnings[0]
+
+
+def test_a_label_of_the_way_there_is_named() -> None:
+    """Spec B6: a label that keeps what it was asked before, in a function of its own or in one for all."""
+    met: list[int] = []
+
+    def all_but_odd(env: Any) -> dict[str, bool]:
+        met.append(env.unwrapped.cell)
+        return {"left-end": at_left(env), "odd": len(met) % 2 == 1}
+
+    for domain in (
+        GymnasiumDomain(CorridorEnv, ("left-end", "odd"), labels=all_but_odd),
+        GymnasiumDomain(CorridorEnv, {"left-end": at_left, "odd": lambda env: all_but_odd(env)["odd"]}),
+    ):
+        assert "labels differ: odd" in first_fault(check_domain(domain, SMALL)).text
+
+
+def _drops(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+    return self.env.reset(options=options)
+
+
+def _takes_none(self: Any) -> Any:
+    return self.env.reset()
+
+
+def _gives_one(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+    return self.env.reset(seed=seed)[0]
+
+
+def _gives_four(self: Any, action: int) -> Any:
+    return self.env.step(action)[:4]
+
+
+def _raises(self: Any, action: int) -> Any:
+    raise KeyError(action)
+
+
+@pytest.mark.parametrize("method", [_drops, _takes_none, _gives_one, _gives_four, _raises])
+def test_gymnasiums_own_checker_is_asked(method: Any) -> None:
+    """Spec B6: a wrapper that breaks the contract, below one that does not."""
+    name = "step" if method in (_gives_four, _raises) else "reset"
+    bad = type("Bad", (gymnasium.Wrapper,), {name: method})
+    domain = GymnasiumDomain(lambda: gymnasium.wrappers.OrderEnforcing(bad(CorridorEnv())), SUB_GOALS)
+    fault = first_fault(check_domain(domain, SMALL))
+    assert fault.name == "gymnasium" and "\n" not in fault.text
+    assert method is not _raises or f"test_check.py, line {_raises.__code__.co_firstlineno + 1}" in fault.text
+
+
+@pytest.mark.parametrize("name", [name for name in OURS if name != "none"])
+def test_our_objectives_keep_the_laws(name: str) -> None:
+    """Spec C2."""
+    require(check_objective(load_objective(name)))
+
+
+def _positives(a: Tensor, b: Tensor) -> Tensor:
+    return torch.stack([logits.softmax(-1)[..., 1] for logits in (a, b)])
+
+
+def _from_probabilities(a: Tensor, b: Tensor) -> Tensor:
+    p, q = _positives(a, b)
+    return -(p * (1 - q) + (1 - p) * q).log().sum(-1) / max(p.shape[-1], 1)
+
+
+def _as_printed(a: Tensor, b: Tensor) -> Tensor:
+    p, q = _positives(a, b)
+    return -(p * q + (1 - p) * (1 - q)).clamp(min=1e-9).log().sum(-1) / max(p.shape[-1], 1)
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return -(a.softmax(-1) - b.softmax(-1)).square().sum((-2, -1)) / max(a.shape[-2], 1)
+
+
+PAIRS = [
+    (none.pair_loss, "gradients"),
+    (_from_probabilities, "extreme logits"),
+    (_as_printed, "disagreement"),
+    (_distance, "disagreement"),
+    (lambda a, b: dbat.pair_loss(a.detach(), b), "gradients"),
+    (lambda a, b: a.square().mean(-1), "shape"),
+    (lambda a, b: dbat.pair_loss(a, b) * a.shape[-2] / a.shape[-2], "shape"),
+    (lambda a, b: dbat.pair_loss(a, b) + 0.1 * a.square().sum((-2, -1)), "order"),
+]
+ENSEMBLES: list[tuple[Any, str]] = [
+    (lambda context: context.unlabelled.mean((1, 2)), "shape"),
+    (lambda context: context.unlabelled.square().sum() / context.unlabelled.shape[1], "shape"),
+    (lambda context: context.unlabelled[0].square().sum(), "order"),
+    (lambda context: -(context.unlabelled.softmax(-1)[..., 0] / 1e9).log().sum(), "extreme logits"),
+    (lambda context: context.unlabelled.detach().square().sum(), "extreme logits"),
+]
+OBJECTIVES = [(Objective("broken", pair_loss=loss), law) for loss, law in PAIRS]
+OBJECTIVES += [(Objective("broken", ensemble_loss=loss), law) for loss, law in ENSEMBLES]
+
+
+@pytest.mark.parametrize(("objective", "law"), OBJECTIVES)
+def test_each_broken_law_of_an_objective_is_named(objective: Objective, law: str) -> None:
+    """Spec C1, C2: Eq. (1) as printed, probabilities instead of logits, and other ways to go wrong."""
+    assert first_fault(check_objective(objective)).name == law
+
+
+def squeezed(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [nn.Conv2d(channels, 4, 8, 8), nn.Sigmoid()], (8,)
+
+
+def frozen(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [nn.Conv2d(channels, 4, 8, 8).requires_grad_(False), nn.ReLU()], (8,)
+
+
+def spread(channels: int) -> nn.Module:
+    return nn.Sequential(nn.Conv2d(channels, 4, 8, 8), nn.Flatten(), nn.Softmax(0))
+
+
+class Detached(nn.Conv2d):
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(input).detach()
+
+
+def dead(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [Detached(channels, 4, 8, 8), nn.ReLU()], (8,)
+
+
+SHARED = nn.Conv2d(3, 4, 8, 8)
+
+
+def shared(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [SHARED, nn.ReLU()], (8,)
+
+
+def tied(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    layer = nn.Conv2d(channels, 4, 8, 8)
+    layer.weight = SHARED.weight
+    return [layer, nn.ReLU()], (8,)
+
+
+def seeded_elsewhere(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    layer = nn.Conv2d(channels, 4, 8, 8)
+    layer.weight.data += float(NOBODYS.random())
+    return [layer, nn.ReLU()], (8,)
+
+
+def changing(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [nn.Threshold(0.5, 0.0, inplace=True), nn.Conv2d(channels, 4, 8, 8)], (8,)
+
+
+class Counting(nn.Conv2d):
+    calls = 0
+
+    def forward(self, input: Tensor) -> Tensor:
+        self.calls += 1
+        return super().forward(input) + self.calls
+
+
+def counting(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [Counting(channels, 4, 8, 8)], (8,)
+
+
+NETWORK_FAULTS = [
+    ("missing", "logits", "no attribute 'missing'"),
+    ("changing", "logits", "changes its input"),
+    ("shared", "members", "share modules or weights"),
+    ("tied", "members", "share modules or weights"),
+    ("seeded_elsewhere", "members", "of one seed differ"),
+    ("dead", "gradients", "gets no gradient"),
+    ("spread", "answers", "among others differ"),
+    ("counting", "answers", "among others differ"),
+]
+
+
+@pytest.mark.parametrize(("name", "law", "fault"), NETWORK_FAULTS)
+def test_each_broken_law_of_a_network_is_named(
+    name: str, law: str, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec C5: members that are one object, that change what the next one sees, that cannot learn or be asked."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", f"test_check:{name}")
+    found = first_fault(check_network(f"test_check:{name}"))
+    assert found.name == law and fault in found.text
+
+
+@pytest.mark.parametrize("name", [*NETWORKS, "test_check:squeezed", "test_check:frozen"])
+def test_networks_that_keep_the_contract_pass(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5, F2: ours and own ones, some with frozen weights, and how they are explained."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", name)
+    found = [*check_network(name)]
+    require(found)
+    assert ("integrated gradients" if name.endswith("squeezed") else "DeepLift") in found[0].text
+
+
+def test_networks_of_numbers_and_of_mixed_observations_pass() -> None:
+    """Spec C5."""
+    require(check_network("mlp", (11,), np.dtype(np.float32)))
+    both = mixed_type({"front": (np.dtype(np.uint8), (64, 64, 3)), "joints": (np.dtype(np.float32), (7,))})
+    require(check_network("front=tiles", (), both))
+
+
+def test_the_command_prints_a_line_for_each_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6: exit code 0 where all are kept, 2 where one is not; what the user named needs no permission."""
+    monkeypatch.chdir(TESTS)
+    small = settings("steps=150", "heldout_seeds=4,5")
+    told = run("check", "corridor_env:DOMAIN", *small).out.splitlines()
+    assert len(told) == 7 and all(line.startswith("ok   ") for line in told)
+    told = fails("check", "corridor_env:RESTLESS", *small).out.splitlines()
+    assert told[-1].startswith("FAIL two engines") and "np_random" in told[-1]
+    told = run("check", "corridor_env:SENSED", *small, "--network", "mlp").out.splitlines()
+    assert len(told) == 12 and not any(line.startswith("FAIL") for line in told)
+    told = fails("check", "corridor_env:SENSED", *small, "--network", "doorkey").out.splitlines()
+    assert told[-1].startswith("FAIL logits: the network 'doorkey' does not take these observations")
+    monkeypatch.chdir(TESTS.parent / "examples")
+    run("check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide")
+    refuses("nothing to check", "check")
