@@ -1,4 +1,4 @@
-"""Progress on stderr: a rich bar with rate and time left in a terminal, plain lines elsewhere."""
+"""Progress on stderr, a bar in a terminal and plain lines elsewhere; and the log of a training."""
 
 import json
 import math
@@ -8,76 +8,49 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Self
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.terminal import printable, say, screen
+from hypogoal.core.terminal import say, screen
 
-FIRST_SECONDS, PLAIN_INTERVAL_SECONDS = 2.0, 10.0  # until the first line, and between lines
+LINE_SECONDS = 10.0  # between plain lines
 LOOK_SECONDS = 1.0
 
 
 class Progress:
-    """``with Progress("train-meta", total=300_000) as progress: progress.advance(32, success=0.5)``."""
+    """``with Progress("train-meta", total=300_000) as progress: progress.advance(32, success=0.5)``.
+
+    ``total`` may be set later, where it is not known at the beginning.
+    """
 
     def __init__(self, title: str, total: int, quiet: bool = False):
         self.title, self.total, self.quiet = title, total, quiet
-        self.done = self._before = 0
-        self._begin()
-        self._numbers: dict[str, float] = {}
-        self._bar: Any = None
-        self._task: Any = None
+        self.done = 0
+        self._terminal = sys.stderr.isatty()
+        self._bar = _bar()
+        self._bar.add_task(title, total=total, numbers="")
+        self._task = self._bar.tasks[0]
+        self._said = time.monotonic()
 
     def __enter__(self) -> Self:
-        if not self.quiet and sys.stderr.isatty():
-            from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Bar
-            from rich.text import Text
-
-            class Pace(ProgressColumn):
-                def render(column, task: Any) -> Text:
-                    return Text(self.pace(), "progress.data.speed")
-
-            columns = (
-                TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=10),
-                MofNCompleteColumn(),
-                Pace(),
-                TextColumn("{task.fields[numbers]}", markup=False),
-                TimeRemainingColumn(),
-            )
-            self._bar = Bar(*columns, console=screen(err=True))
+        if self._terminal and not self.quiet:
             self._bar.start()
-            self._task = self._bar.add_task(printable(self.title), total=self.total, numbers="")
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        if self._bar is not None:
+        if self.quiet:
+            return
+        if self._terminal:
             self._bar.stop()
-        elif not self.quiet and kind is None and self.done:
-            self._line(f"done in {duration(time.monotonic() - self._start)}")
-
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """Hide the bar within the block, in which something else is printed."""
-        if self._bar is not None:
-            self._bar.stop()
-        yield
-        if self._bar is not None:
-            self._bar.start()
-
-    def expect(self, total: int) -> None:
-        """Set the total number of units, if it becomes known only now."""
-        self.total = total
-        if self._bar is not None:
-            self._bar.update(self._task, total=total)
+        elif kind is None and self.done:
+            self._line(f"done in {duration(self._task.elapsed)}")
 
     def resume(self, done: int) -> None:
         """``done`` units were done before this moment."""
-        self._before = done
-        self._begin()
-        self.update(done)
+        self.done = done
+        self._bar.reset(self._task.id, completed=done)
 
     def advance(self, n: int = 1, **numbers: float) -> None:
         """``n`` more units are done; ``numbers`` are shown beside the bar, except NaN (not known yet)."""
@@ -86,16 +59,14 @@ class Progress:
     def update(self, done: int, **numbers: float) -> None:
         """``done`` units are done in total."""
         self.done = done
-        if self.quiet:
-            return
-        numbers = self._numbers = numbers or self._numbers
-        text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value))
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, numbers=text)
-        elif done < self.total:
-            first = done > self._before and not self._said  # the first line estimates the time left
-            if time.monotonic() - self._last >= (FIRST_SECONDS if first else PLAIN_INTERVAL_SECONDS):
-                self._line(text)
+        if numbers:
+            known = [f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value)]
+            self._task.fields["numbers"] = " ".join(known)
+        self._bar.update(self._task.id, completed=done, total=self.total)
+        overdue = time.monotonic() - self._said >= LINE_SECONDS
+        if overdue and done < self.total and not self.quiet and not self._terminal:
+            left = f"{duration(self._task.time_remaining)} left"
+            self._line(" ".join([left, self._task.fields["numbers"]]))
 
     @contextmanager
     def following(self, count: Callable[[], int]) -> Iterator[None]:
@@ -115,32 +86,28 @@ class Progress:
             thread.join()
         self.update(count())
 
-    def pace(self) -> str:
-        """The rate, ``12/s`` or ``3 s each``; before anything is done, the time spent."""
-        seconds = max(time.monotonic() - self._start, 1e-9)
-        rate = max(self.done - self._before, 0) / seconds
-        return f"{rate:,.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else f"{duration(seconds)} so far"
-
-    def _begin(self) -> None:
-        self._start = self._last = time.monotonic()
-        self._said = False
-
     def _line(self, text: str) -> None:
-        self._last, self._said = time.monotonic(), True
-        seconds = max(self._last - self._start, 1e-9)
-        rate = max(self.done - self._before, 0) / seconds
-        left = self.total - self.done
-        estimate = f" ({self.pace()}, {duration(left / rate)} left)" if rate and left > 0 else ""
-        say(f"{self.title}: {self.done}/{self.total}{estimate}{f', {text}' if text else ''}", err=True)
+        self._said = time.monotonic()
+        say(f"{self.title}: {self.done}/{self.total}, {text}", err=True)
 
 
-def duration(seconds: float) -> str:
-    """Seconds in readable units: 12 min, 3.4 h."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    if seconds < 90 * 60:
-        return f"{round(seconds / 60)} min"
-    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} days"
+def _bar() -> Any:
+    """rich's bar, which also knows how much time is left where it is not drawn."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=10),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[numbers]}", markup=False),
+        TimeRemainingColumn(),
+        console=screen(err=True),
+    )
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds as ``0:01:30``; None, not known yet, as a question mark."""
+    return "?" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
 class MetricsLog:
@@ -177,8 +144,6 @@ class MetricsLog:
 
     def restore(self, snapshot: int) -> None:
         """Truncate the file to the length of a ``snapshot``."""
-        if not 0 <= snapshot <= self._path.stat().st_size:
-            raise ValueError(f"the log has fewer bytes than {snapshot}")
         os.truncate(self._path, snapshot)
 
 

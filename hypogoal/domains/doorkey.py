@@ -98,7 +98,7 @@ class DoorKeyDomain(Domain):
         only among the labelled states is a ``UserError``.
         """
         heldout_seeds = _heldout_seeds(config)
-        progress.expect(1 + len(config.unlabelled_seeds) + len(heldout_seeds))
+        progress.total = 1 + len(config.unlabelled_seeds) + len(heldout_seeds)
         labelled = _sweep(config, [config.labelled_seed], progress)
         unlabelled = _sweep(config, config.unlabelled_seeds, progress)
         heldout = _sweep(config, heldout_seeds, progress)

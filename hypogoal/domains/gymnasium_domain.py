@@ -168,7 +168,7 @@ class GymnasiumDomain(Domain):
         """
         seeds_of_sets = [getattr(config, name) for name in SEEDS]
         env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
-        progress.expect(config.steps * sum(map(len, seeds_of_sets)))
+        progress.total = config.steps * sum(map(len, seeds_of_sets))
         training: set[bytes] = set()  # digests of labelled and unlabelled states
         sets: list[States] = []
         for seeds in seeds_of_sets:

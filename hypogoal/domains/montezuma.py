@@ -188,7 +188,7 @@ class MontezumaDomain(Domain):
                 job = partial(draw, room, wanted, seed, ("montezuma", name, *stream), sub_goals=sub_goals)
                 tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None)))
             expected += wanted * len(rooms)
-        progress.expect(expected)
+        progress.total = expected
         gathered = {number: states for number, task in enumerate(tasks) if (states := task.load())}
         for loaded in gathered.values():
             progress.advance(len(loaded.ram))

@@ -256,8 +256,6 @@ def train(
             else:
                 progress.update(recorder.steps - begin)
             checkpoints.offer(state)
-    if solved:
-        progress.expect(recorder.steps - begin)
     return solved
 
 

@@ -128,7 +128,7 @@ class RoomsDomain(Domain):
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and fully crossed held-out states, the latter in 20 parts by ``layout_seed``."""
         names, column = config.factors, _column(config.factors, config.truth)
-        progress.expect(1)
+        progress.total = 1
         scenes = [
             states.labelled_states(config.labelled, seed, names),
             states.unlabelled_states(config.unlabelled, config.mix, seed, names),
