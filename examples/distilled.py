@@ -5,13 +5,12 @@ action, the best actions themselves are known: in each layout the members judge 
 search has each option's best actions there. One network learns these by heart, as a classifier, and so the rule behind
 them. In a new layout its options need no model and no training:
 
-    export HYPOGOAL_TRUST=examples.distilled:Learner,examples.distilled:Deep
     hypogoal collect doorkey --out runs/far/data.h5
     hypogoal train-ensemble runs/far/data.h5 --out runs/far/ensemble
     hypogoal train-options runs/far/ensemble --out runs/far/options \
         --set network=examples.distilled:Learner --set embedding=examples.distilled:Deep --set layouts=1000-1299 \
         --set environments=32 --set update_interval=32 --set steps=204800 --set option_learning_rate=2e-3
-    hypogoal evaluate runs/far --layouts 6000-6099
+    hypogoal evaluate runs/far --layouts 6000-6099 --trust
 
 Then `python -m examples.distilled` plays each option once in one more layout. An agent over them learns by
 

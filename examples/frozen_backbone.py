@@ -1,13 +1,12 @@
 r"""Members on a frozen backbone: a small vision transformer, the same in each member, and layers of its own behind it.
 
     hypogoal collect doorkey --out runs/backbone/data.h5
-    export HYPOGOAL_TRUST=frozen_backbone:vit
     hypogoal train-ensemble runs/backbone/data.h5 --out runs/backbone/ensemble --set network=frozen_backbone:vit
-    hypogoal train-options runs/backbone/ensemble --out runs/backbone/options --set steps=20000
+    hypogoal train-options runs/backbone/ensemble --out runs/backbone/options --set steps=20000 --trust
     hypogoal train-meta runs/backbone/ensemble --options runs/backbone/options --out runs/backbone/meta \
-        --set steps=20000
-    hypogoal evaluate runs/backbone
-    hypogoal report runs/backbone
+        --set steps=20000 --trust
+    hypogoal evaluate runs/backbone --trust
+    hypogoal report runs/backbone --trust
 
 Its weights are random, so that nothing is downloaded. It takes some five minutes of a CPU core.
 """

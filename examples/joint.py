@@ -3,10 +3,10 @@ r"""A teacher: linear classifiers of small patterns, one for each member, search
     hypogoal collect rooms --out runs/joint/data.h5
     hypogoal train-ensemble runs/joint/data.h5 --out runs/joint/ensemble --diversity none --members 2 \
         --set teacher=joint:independent
-    hypogoal evaluate runs/joint
+    hypogoal evaluate runs/joint --trust
 
-With ``HYPOGOAL_TRUST=joint:independent`` in the environment, ``hypogoal run rooms --set methods=joint`` does so for ten
-seeds, and trains agents that choose among the members' options.
+``hypogoal run rooms --set methods=joint --trust`` does so for ten seeds, and trains agents that choose among the members'
+options.
 
 Networks that a diversity objective drives apart learn mixtures of features, which fit the labels and differ as well.
 Linear classifiers of simple patterns, *proposals*, are cheap enough to search for whole sets, from many starts: the set

@@ -1,11 +1,10 @@
 """MiniGrid's LockedRoom, six doors by colour and a key: a policy for each sub-goal reaches what random play would not.
 
-The paper's authors label these doors, too (``lockedroom_data_collector.py``). First
-`export HYPOGOAL_TRUST=locked_room:DOMAIN`:
+The paper's authors label these doors, too (``lockedroom_data_collector.py``).
 
     hypogoal collect locked_room:DOMAIN --out runs/locked/data.h5
-    hypogoal train-ensemble runs/locked/data.h5 --out runs/locked/ensemble
-    hypogoal evaluate runs/locked
+    hypogoal train-ensemble runs/locked/data.h5 --out runs/locked/ensemble --trust
+    hypogoal evaluate runs/locked --trust
 """
 
 import gymnasium

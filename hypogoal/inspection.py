@@ -23,10 +23,10 @@ from hypogoal.core.artefacts import (
     find_input,
     open_artefact,
 )
-from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
+from hypogoal.core.own_code import command
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
 from hypogoal.data import SPLITS, open_dataset, reading
@@ -168,7 +168,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
         actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
-        do = advice("Read them as arrays", "export", path, "--out", f"{path.stem}.npz")
+        do = f"Read them as arrays: {command('export', path, '--out', path.stem + '.npz')}"
         raise UserError("the states are not pictures", actual, do)
     check_parent(folder / "labelled")
     domain = installed_domain(dataset.domain)

@@ -42,7 +42,7 @@ def described(config_class: type, stage: str, domain: str, preset: str | None = 
     else:
         from hypogoal.domains.base import load_domain
 
-        loaded = load_domain(domain, by_user=True)
+        loaded = load_domain(domain)
         instead.append((loaded.defaults.get(stage, {}), loaded.sources.get(stage, f"{domain}'s own")))
     if preset is not None:
         values = load_preset(preset, stage, domain, TABLES)
@@ -70,23 +70,21 @@ def configuration(
     assignments: Iterable[str] | None,
     options: Mapping[str, Any] | None = None,
     *,
-    by_user: bool = False,
     inherited: Mapping[str, Any] | None = None,
 ) -> Any:
     """A stage's settings with the presets and defaults of its domain; see :func:`hypogoal.core.config.resolve`.
 
-    ``by_user``: the user typed the domain's name; it is not from a file. ``inherited`` ones, of the options that the
-    stage continues, replace defaults. An unknown domain is a ``UserError``.
+    ``inherited`` ones, of the options that the stage continues, replace defaults. An unknown domain is a ``UserError``.
     """
     from hypogoal.domains.base import defaults_of, load_domain  # loads Gymnasium, not needed to list stages
 
     return resolve(
-        load_domain(domain, by_user=by_user).config_class if stage == "collect" else CONFIGS[stage],
+        load_domain(domain).config_class if stage == "collect" else CONFIGS[stage],
         stage=stage,
         preset=preset,
         options=options,
         assignments=assignments or (),
         domain=domain,
-        defaults={**defaults_of(domain, stage, by_user=by_user), **(inherited or {})},
+        defaults={**defaults_of(domain, stage), **(inherited or {})},
         tables=TABLES,
     )

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from hypogoal.cli import main
+from hypogoal.core import own_code
 
 
 class Printed(NamedTuple):
@@ -61,15 +62,16 @@ def refuses(wanted: str, *words: object) -> str:
 
 
 @contextmanager
-def trusting(*names: str) -> Iterator[None]:
-    """Within it the user allows this code, which files name."""
+def trusting() -> Iterator[None]:
+    """Within it the user allows the code that files name."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HYPOGOAL_TRUST", ",".join(names))
+        patch.setenv(own_code.VARIABLE, "1")
         yield
 
 
 def _called(words: tuple[object, ...]) -> tuple[int, Printed]:
-    """The exit code and what was printed."""
+    """The exit code and what was printed, as in a process of its own: nothing was typed before."""
+    own_code._allowed.clear()
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = main([str(word) for word in words])

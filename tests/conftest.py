@@ -18,7 +18,6 @@ from command_line import run, trusting
 
 torch.set_num_threads(1)
 
-OWN_DOMAINS = ("own_domain:DOMAIN", "own_domain:ODD")
 # Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
 LONGEST = (
     "test_sweep",
@@ -54,11 +53,11 @@ def short_evaluations() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def nothing_allowed_before() -> None:
-    """Each test as in a process of its own: printed commands name the code that this one allowed."""
+def nothing_typed_before() -> None:
+    """Each test as in a process of its own: nothing was typed that allows code which files name."""
     from hypogoal.core import own_code
 
-    own_code._before.clear()
+    own_code._allowed.clear()
 
 
 @pytest.fixture
@@ -86,7 +85,7 @@ def built_corridor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """What ``corridor_run`` hands out."""
 
     def build(folder: Path) -> None:
-        with trusting(*OWN_DOMAINS):
+        with trusting():
             shared_runs.make(shared_runs.CORRIDOR_RUN, folder)
         other = shutil.copytree(folder, folder.with_name("corridor-other"), dirs_exist_ok=True)
         run("compare", folder, other, "--out", folder / "comparison")
@@ -97,7 +96,7 @@ def built_corridor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture
 def corridor_run(built_corridor: Path) -> Iterator[Path]:
     """A run of every stage on the corridor, which is cheap, to be read only; its domain is trusted meanwhile."""
-    with trusting(*OWN_DOMAINS):
+    with trusting():
         yield built_corridor
 
 

@@ -142,7 +142,7 @@ def test_a_file_cannot_name_code_to_run(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(UserError, match="Do you trust it"):
         load_domain("evil:DOMAIN")
     assert not (tmp_path / "ran").exists()
-    monkeypatch.setenv("HYPOGOAL_TRUST", "other:DOMAIN,evil:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     with pytest.raises(UserError, match="not a domain"):
         load_domain("evil:DOMAIN")
     assert (tmp_path / "ran").exists()

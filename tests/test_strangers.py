@@ -17,7 +17,7 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, find_input, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, parse_json, read_bytes, read_json
-from hypogoal.core.own_code import given
+from hypogoal.core.own_code import allow
 from hypogoal.core.tensors import save_tensors
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.planning import make_plan
@@ -209,5 +209,6 @@ class encoder(torch.nn.Module):
     def forward(self, x): return x.flatten(1)
 """)
     for name, kind in (("layers", "bfloat16"), ("encoder", "float16")):
-        with given(f"halves:{name}"), pytest.raises(UserError, match=rf"keeps weights of type torch\.{kind}.*float32"):
+        allow([f"halves:{name}"])
+        with pytest.raises(UserError, match=rf"keeps weights of type torch\.{kind}.*float32"):
             load_network(f"halves:{name}")((8, 8, 3))

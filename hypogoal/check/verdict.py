@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode
+from hypogoal.core.own_code import of_user
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,11 @@ def verdicts(laws: Iterable[Callable[[Any], str]], subject: Any) -> Iterator[Ver
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                with UsersCode("what is checked"):
-                    text = law(subject)
+                text = law(subject)
             except UserError as error:
                 ok, text = False, str(error)
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code raises
+                ok, text = False, str(of_user(error) or UserError(type(error).__name__, error))
         told = dict.fromkeys(str(warning.message) for warning in caught)
         yield Verdict(law.__name__.replace("_", " "), ok, text, tuple(told))
         if not ok:

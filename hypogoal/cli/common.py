@@ -3,7 +3,7 @@
 import contextlib
 import inspect
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -147,9 +147,9 @@ class StageCall:
         """Run the stage, see :func:`hypogoal.stages.make`."""
         return make(self.stage, source, self.out, self.settings, self.preset, **inputs, **self.how)
 
-    def config(self, domain: str, *, by_user: bool = False) -> Any:
+    def config(self, domain: str) -> Any:
         """The stage's settings, see :func:`hypogoal.settings.configuration`."""
-        return configuration(self.stage, domain, self.preset, (), self.settings, by_user=by_user)
+        return configuration(self.stage, domain, self.preset, (), self.settings)
 
     def end(self, numbers: Mapping[str, Any], *then: object) -> None:
         """Print the result, the next command and the output's path."""
@@ -186,12 +186,6 @@ def stage(panel: str, name: str, example: str) -> Callable[[Callable[..., None]]
     return register
 
 
-def values_of(assignments: Iterable[str] | None) -> list[str]:
-    """The values that the user typed after the ``=`` of each ``--set``, split at commas."""
-    texts = parse_assignments(assignments or ()).values()
-    return [value.strip() for text in texts for value in text.split(",")]
-
-
 def run_of(data: Path) -> Path:
     """The run of a data file: the folder of a ``data.h5``, else a new folder named after the file."""
     return data.parent if data.name == "data.h5" else Path("runs", data.stem)
@@ -215,9 +209,9 @@ def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
 def print_next(quiet: bool, *words: object) -> None:
     """Print the next command as one would type it; nothing if there is none."""
     if words and not quiet:
-        from hypogoal.core.commands import command as typed
+        from hypogoal.core import own_code
 
-        say(f"next: {typed(*words)}")
+        say(f"next: {own_code.command(*words)}")
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:

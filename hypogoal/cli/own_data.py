@@ -48,7 +48,6 @@ def import_(
     quiet: cli.Quiet = False,
 ) -> None:
     """Make a data file of your arrays, images or recorded episodes."""
-    from hypogoal.core import own_code
     from hypogoal.stages.import_data import import_data as stage
 
     labels = dict(text.partition("=")[::2] for text in label or ())
@@ -59,12 +58,11 @@ def import_(
     if not all(size.isdecimal() and int(size) <= MOST_INTEGER for size in sizes.values()):
         raise UserError("--resize needs a number of pixels", " ".join(resize or ()), "Give --resize 128 or KEY=128.")
     longest = {name: int(size) for name, size in sizes.items() if int(size)}
-    with own_code.given(*labels.values()):
-        counts = stage(
-            source, out, sub_goals=sub_goal or (), labels=labels, keys=[*filter(None, key or ())], share=heldout,
-            resize=longest if {*longest} - {""} else longest.get("", 0), every=every, stack=stack, domain=domain,
-            seed=seed, force=force,
-        )  # fmt: skip
+    counts = stage(
+        source, out, sub_goals=sub_goal or (), labels=labels, keys=[*filter(None, key or ())], share=heldout,
+        resize=longest if {*longest} - {""} else longest.get("", 0), every=every, stack=stack, domain=domain,
+        seed=seed, force=force,
+    )  # fmt: skip
     _print_observations(out, bool(longest), quiet)
     cli.print_counts(counts, quiet)
     cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
@@ -122,17 +120,14 @@ def check(
     Exit code 2 if not. It collects a few states of the domain twice; --set
     changes how, as for 'collect'.
     """
-    from hypogoal.core import own_code
-
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
     broken = False
-    with own_code.given(*(name for name in (domain, diversity, network) if name)):
-        config = configuration("collect", domain, None, set_, {}, by_user=True) if domain else None
-        for verdict in _verdicts(domain, diversity, network, config, layout_seed, seed):
-            for line in verdict.lines:
-                say(line)
-            broken |= not verdict.ok
+    config = configuration("collect", domain, None, set_, {}) if domain else None
+    for verdict in _verdicts(domain, diversity, network, config, layout_seed, seed):
+        for line in verdict.lines:
+            say(line)
+        broken |= not verdict.ok
     if broken:
         raise typer.Exit(2)
 
@@ -146,7 +141,7 @@ def _verdicts(
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
-        loaded = load_domain(domain, by_user=True)
+        loaded = load_domain(domain)
         yield from check_domain(loaded, config, layout_seed=layout_seed, seed=seed)
         observations = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:

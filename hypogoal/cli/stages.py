@@ -11,7 +11,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import draw, give, say
 from hypogoal.settings import configuration
-from hypogoal.stages import domain_of, inherited_of, typed_in
+from hypogoal.stages import domain_of, inherited_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
@@ -115,7 +115,6 @@ def audit(
     Without --domain: where do members disagree on the data that they were
     trained with, which failures come first, which states to label next?
     """
-    from hypogoal.core import own_code
     from hypogoal.evaluation.audit import lines_of
     from hypogoal.tools.audit import audit as audited
 
@@ -124,9 +123,8 @@ def audit(
         return
     if sub_goal is None:
         raise UserError("which sub-goal is the truth?", domain, "Give --sub-goal NAME.")
-    config = call.config(domain, by_user=True)
-    with own_code.given(classifier, domain, *typed_in(call.settings)):
-        rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member or 0, **call.how)
+    config = call.config(domain)
+    rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member or 0, **call.how)
     for line in () if call.how["quiet"] else lines_of(rates):
         say(line)
     call.end({})

@@ -38,7 +38,6 @@ def run(
     dry_run: DryRun = False,
 ) -> None:
     """Chain all stages: from nothing to a report. (--set also takes STAGE.KEY=VALUE.)"""
-    from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.core.drafts import place_of
     from hypogoal.inspection import numbers_of, summary_of
@@ -47,15 +46,13 @@ def run(
 
     out = place_of(out or _folder_of(experiment))
     seeds = None if seed is None else str(seed)
-    with own_code.given(experiment):
-        planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
+    planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
     planned, chosen = _in_part(planned, from_, only)
     if dry_run:
         _list(planned, out, chosen)
         return
     prepare(device)
-    with own_code.given(*cli.values_of(set_)):
-        stage(planned, out, force=force, resume=resume, quiet=quiet, only=chosen)
+    stage(planned, out, force=force, resume=resume, quiet=quiet, only=chosen)
     metrics = out / "evaluation" / "metrics.json"
     if chosen or not metrics.is_file():
         give(out / "results.csv")
@@ -100,12 +97,11 @@ def sweep(
 
     Finished cells are not run again. --set takes KEY=VALUE or STAGE.KEY=VALUE; AXIS=VALUES if the experiment is yours.
     """
-    from hypogoal.core.commands import advice
     from hypogoal.core.drafts import place_of
     from hypogoal.core.errors import UserError
 
     if experiment is None and out is None:
-        raise UserError("which experiment?", "sweep", advice("Which there are", "sweep", "--help"))
+        raise UserError("which experiment?", "sweep", "Which there are: hypogoal sweep --help")
     out = place_of(out or _folder_of(experiment or ""))
     if cell is not None:
         from hypogoal.experiments.runners.slurm import run_job
@@ -125,7 +121,6 @@ def sweep(
         say(f"{amount(end(out), 'job')} ended; give the same command as before to continue", err=True)
         return
 
-    from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.experiments.runners.slurm import Options
     from hypogoal.stages import sweep as stage
@@ -134,24 +129,21 @@ def sweep(
         give(stage.gather(out))
         return
     if experiment is None:
-        raise UserError("which experiment?", "sweep", advice("Which there are", "sweep", "--help"))
+        raise UserError("which experiment?", "sweep", "Which there are: hypogoal sweep --help")
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
-    with own_code.given(experiment):
-        planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)
+    planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)
     planned, chosen = _in_part(planned, from_, only)
     if dry_run:
         _list(planned, out, chosen)
         return
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
-        with own_code.given(*cli.values_of(set_)):
-            go_on = stage.AGAIN if not planned.anew else "give it without --from and --only to go on"
-            give(stage.sweep(planned, out, quiet=quiet, go_on=go_on, only=chosen))
+        go_on = stage.AGAIN if not planned.anew else "give it without --from and --only to go on"
+        give(stage.sweep(planned, out, quiet=quiet, go_on=go_on, only=chosen))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
-    with own_code.given(*cli.values_of(set_)):
-        jobs = stage.submit(planned, out, options, quiet=quiet, only=chosen)
+    jobs = stage.submit(planned, out, options, quiet=quiet, only=chosen)
     for job in jobs:
         say(f"job {job['id']}: {job['name']}, {amount(max(1, len(job['cells'])), 'cell')}", err=True)
     give(out)

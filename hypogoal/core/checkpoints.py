@@ -155,12 +155,12 @@ class Checkpoints:
 
         Its checksum was right, so it is from another stage, version or author.
         """
-        from hypogoal.core.own_code import users_own
+        from hypogoal.core.own_code import of_user
 
         try:
             yield
         except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
-            if users_own(error) is not None:
+            if of_user(error) is not None:
                 raise
             fault = f"{type(error).__name__}: {error}".partition("\n")[0]
             raise UserError(f"the checkpoint does not fit this stage ({fault})", self.path, ANEW) from error

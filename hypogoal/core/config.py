@@ -16,10 +16,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
-from hypogoal.core.own_code import OF_FILE
+from hypogoal.core.own_code import command
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
@@ -111,7 +110,7 @@ def resolve(
     values.update({key: value for key, value in (options or {}).items() if value is not None})
     assigned = parse_assignments(assignments)
     config = from_values(config_class, {**values, **assigned}, stage, domain)
-    if OF_FILE not in os.environ:  # an experiment sets its cells alike, controls among them
+    if "HYPOGOAL_CORES" not in os.environ:  # an experiment sets its cells alike, controls among them
         refuse_idle(config, {*(key for key, value in (options or {}).items() if value is not None), *assigned})
     return config
 
@@ -139,8 +138,8 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
         if key in constant and value == constant[key]:
             continue
         if key not in fields:
-            do = advice("All of them", "config", stage, *([] if domain == DOMAIN else ["--domain", domain]))
-            raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}{do}")
+            listed = command("config", stage, *([] if domain == DOMAIN else ["--domain", domain]))
+            raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}All of them: {listed}")
         checked[key] = _checked(fields[key], kinds[key], value, stage)
     return config_class(**checked)
 

@@ -1,12 +1,5 @@
 """Errors for users: one line that says what is wrong, where and what to do (Spec G2, G3)."""
 
-from hypogoal.core.terminal import printable
-
-
-def one_line(text: str) -> str:
-    """A text as one line; spaces within a line stay, since a path may have them."""
-    return " ".join(line.strip() for line in text.expandtabs(1).splitlines() if line.strip())
-
 
 class UserError(Exception):
     """A mistake that the user can fix. The command line prints it as one line and exits with code 2.
@@ -20,7 +13,7 @@ class UserError(Exception):
     def __init__(self, what: str, where: object = None, do: str = ""):
         self.what, self.where, self.do = what, where, do
         line = what if where is None else f"{what}: {where}"
-        super().__init__(printable(one_line(f"{line}. {do}" if do else line)))
+        super().__init__(printable(f"{line}. {do}" if do else line))
 
 
 class Killed(UserError):
@@ -40,3 +33,9 @@ class Complete(UserError):
 
 class NumericalError(Exception):
     """NaN or Inf in training (Spec G3): names the member and the step; nothing was overwritten."""
+
+
+def printable(text: str) -> str:
+    """A text as one line without control, invisible and bidirectional characters, which are shown as ``?``."""
+    line = " ".join(part.strip() for part in text.splitlines() if part.strip())
+    return "".join(sign if sign.isprintable() else "?" for sign in line)

@@ -17,8 +17,9 @@ from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeGuard, TypeVar
 
-from hypogoal.core.errors import UserError, printable
+from hypogoal.core.errors import UserError
 from hypogoal.core.locks import fresh_file
+from hypogoal.core.terminal import printable
 
 T = TypeVar("T")
 MAX_TEXT_BYTES = 64 * 2**20

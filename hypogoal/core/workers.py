@@ -13,7 +13,6 @@ from typing import TypeVar
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import Killed
-from hypogoal.core.own_code import users_own
 
 T = TypeVar("T")
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # the same for a Python that multiprocessing starts
@@ -52,11 +51,10 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     # Spawned, not forked: a fork would copy the caller's threads and locks.
     spawn = multiprocessing.get_context("spawn")
     with _environment(**SAFE_PATH):
-        pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
+        pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(), own_code.allowed()))
     try:
-        trusted = own_code.allowed()
         with _environment(**SAFE_PATH):
-            futures = {pool.submit(_guarded, task, trusted): number for number, task in enumerate(tasks)}
+            futures = {pool.submit(_guarded, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
@@ -87,8 +85,9 @@ def _environment(**values: str) -> Iterator[None]:
             os.environ.update({} if value is None else {name: value})
 
 
-def _begin(parent: int) -> None:
+def _begin(parent: int, allowed: frozenset[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C; it sends SIGTERM
+    own_code.allow(allowed)
     die_with_parent()
     if os.getppid() != parent:
         os._exit(128 + KILLED)
@@ -100,13 +99,13 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, KILLED)
 
 
-def _guarded(task: Callable[[], T], trusted: frozenset[str]) -> T:
+def _guarded(task: Callable[[], T]) -> T:
     try:
-        with own_code.vouched(*trusted):
-            return task()
+        return task()
     except KeyboardInterrupt:  # the pool would give this process the next task
         os._exit(128 + signal.SIGTERM)
     except BaseException as error:
-        if (user_error := users_own(error)) is None:
+        user_error = own_code.of_user(error)
+        if user_error is None:
             raise
         raise user_error from error  # its place is only known here: tracebacks are not sent to the parent

@@ -21,7 +21,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode, load_own
+from hypogoal.core.own_code import load
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -94,12 +94,12 @@ class Objective:
 
     def _checked(self, function: Callable[..., Tensor], *arguments: Any) -> Tensor:
         """The loss, after a check of its shape; that it is finite is checked every few steps, or a GPU would wait."""
-        with UsersCode(f"the diversity objective {self.name}", function) as code:
-            loss: Any = function(*arguments)
-            if getattr(loss, "shape", None) != () or not loss.is_floating_point():
-                received = f"{loss.dtype} {tuple(loss.shape)}" if hasattr(loss, "dtype") else type(loss).__name__
-                code.refuse(f"gave {received}", "Give a float (): a mean over the states, axis -2.")
-            return loss
+        loss: Any = function(*arguments)
+        if getattr(loss, "shape", None) != () or not loss.is_floating_point():
+            received = f"{loss.dtype} {tuple(loss.shape)}" if hasattr(loss, "dtype") else type(loss).__name__
+            do = "Give a float (): a mean over the states, axis -2."
+            raise UserError(f"the diversity objective gave {received}", self.name, do)
+        return loss
 
 
 def load_objective(name: str) -> Objective:
@@ -109,7 +109,7 @@ def load_objective(name: str) -> Objective:
     (see :mod:`hypogoal.core.own_code`).
     """
     built_in = {objective: f"{__name__}.{objective.replace('-', '_')}" for objective in OBJECTIVES}
-    loaded = load_own(name, "diversity objective", ENTRY_POINTS, built_in)
+    loaded = load(name, "diversity objective", ENTRY_POINTS, built_in)
     for kind in ("ensemble_loss", "pair_loss"):  # the first may use the second
         if hasattr(loaded, kind):
             function = getattr(loaded, kind)

@@ -14,7 +14,6 @@ from hypogoal.core import own_code
 from hypogoal.core.checkpoints import ANEW, Resumable
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode
 from hypogoal.data import Collected
 from hypogoal.domains.observations import reading_of
 from hypogoal.observations import PICTURE, Observations, Standard
@@ -425,21 +424,19 @@ class Domain(ABC):
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
 
 
-def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
-    """One step of an engine; a ``UserError`` if a user's engine returns a malformed step."""
-    step: Any = engine.step(actions)
+def check_step(engine: Engine, step: Any) -> None:
+    """Refuse (``UserError``) a malformed step of an engine; loops call it for the first one."""
+    where = type(engine).__name__
     do = f"Give a Step of arrays of length {engine.count}, of the types in hypogoal.domains.base.Step."
     if not isinstance(step, Step):
-        UsersCode("the engine's step", engine, "step").refuse(f"gave a {type(step).__name__}, not a Step", do)
-    for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):
+        raise UserError(f"the engine's step gave a {type(step).__name__}, not a Step", where, do)
+    kinds = STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b"))
+    for name, letters in kinds:
         values = getattr(step, name)
-        if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:
-            UsersCode("the engine's step", engine, "step").refuse(f"gave {name} {values!r}", do)
+        if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in letters:
+            raise UserError(f"the engine's step gave {name} {values!r}", where, do)
     if not np.isfinite(step.rewards).all():
-        number = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
-        fault = f"gave the reward {step.rewards[number]} in environment {number}"
-        UsersCode("the engine's step", engine, "step").refuse(fault, "Give finite numbers.")
-    return step
+        raise UserError(f"the engine's step gave the rewards {step.rewards}", where, "Give finite numbers.")
 
 
 def require_one_kind(engine: Engine) -> None:
@@ -449,16 +446,15 @@ def require_one_kind(engine: Engine) -> None:
         raise UserError("agents see pictures or numbers, not both", ", ".join(keys), do)
 
 
-def load_domain(name: str, *, by_user: bool = False) -> Domain:
+def load_domain(name: str) -> Domain:
     """A domain by name: a built-in one, an installed entry point (group ``hypogoal.domains``) or ``module:object``.
 
-    ``module:object`` runs code, see :mod:`hypogoal.core.own_code`; ``by_user``: the user gave this name, on the command
-    line or in a program. Code that the user did not allow, or an object that is no domain, is a ``UserError``.
+    Code that the user did not allow (see :mod:`hypogoal.core.own_code`), or an object that is no domain, is a
+    ``UserError``. What a domain of one's own has as defaults, such as a network, may be loaded with it.
     """
-    name = "rooms" if name == "which-feature" and not by_user else name  # so called in files of 0.23
+    name = "rooms" if name == "which-feature" else name  # so called in files of 0.23
     try:
-        with own_code.given(*([name] if by_user else [])):
-            domain = REGISTERED.get(name) or own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
+        domain = REGISTERED.get(name) or own_code.load(name, "domain", ENTRY_POINTS, BUILT_IN)
     except UserError:
         if name != IMPORTED:
             raise
@@ -466,20 +462,21 @@ def load_domain(name: str, *, by_user: bool = False) -> Domain:
         raise UserError("the domain of these imported states is not known", name, do) from None
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "Derive it from hypogoal.domains.base.Domain.")
+    for settings in domain.defaults.values():
+        own_code.allow(settings.values())
     return domain
 
 
-def installed_domain(name: str, *, by_user: bool = False) -> Domain | None:
+def installed_domain(name: str) -> Domain | None:
     """The domain, or None if it is not installed: a user's data may name such a one. See :func:`load_domain`."""
-    with own_code.given(*([name] if by_user else [])):
-        own_code.require_trust(name, "domain")
-        try:
-            return load_domain(name)
-        except UserError:
-            return None
+    own_code.require_trust(name, "domain")
+    try:
+        return load_domain(name)
+    except UserError:
+        return None
 
 
-def defaults_of(domain: str, stage: str, *, by_user: bool = False) -> Mapping[str, Any]:
+def defaults_of(domain: str, stage: str) -> Mapping[str, Any]:
     """The domain's own defaults for the settings of a stage; see :func:`installed_domain`."""
-    installed = installed_domain(domain, by_user=by_user)
+    installed = installed_domain(domain)
     return installed.defaults.get(stage, {}) if installed else {}

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
 from hypogoal.domains import gymnasium_engine as engines
@@ -140,7 +139,7 @@ class GymnasiumDomain(Domain):
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: the domain's own settings, defaults for those left out."""
-        env = engines.made(self.make, **{**self._own_settings, **arguments})
+        env = self.make(**{**self._own_settings, **arguments})
         return engines.resized(env, self.resize) if self.resize else env
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> engines.GymnasiumEngine:
@@ -234,8 +233,7 @@ class _LayoutPlay:
             if policy is None or self.rng.random() < self.config.explore:
                 action = int(self.rng.integers(count))
             else:
-                with UsersCode("the domain's policy", policy) as code:
-                    action = code.choice(policy(self.env, observation, self.rng), "the action", count)
+                action = int(policy(self.env, observation, self.rng))
             observation, over = self.step(action)
 
     def begin(self) -> Any:
@@ -247,14 +245,17 @@ class _LayoutPlay:
 
     def step(self, action: int) -> tuple[Any, bool]:
         """Play one step: the observation, and whether the episode is over."""
-        observation, _reward, terminated, truncated, _info = engines.stepped(self.env, action)
+        result = self.env.step(action)
+        if not self.groups:
+            engines.check_step(result)
+        observation, _reward, terminated, truncated, _info = result
         self.elapsed += 1
         self._keep(observation)  # an episode's last state too: a sub-goal may hold in it
         self.progress.advance()
-        return observation, terminated or truncated or self.elapsed >= self.config.max_episode_steps
+        return observation, bool(terminated or truncated) or self.elapsed >= self.config.max_episode_steps
 
     def _keep(self, observation: Any) -> None:
-        picture = self.domain.reader.read(self.env, observation)
+        picture = self.domain.reader.read(observation)
         look = digest(picture)
         if look not in self.seen:
             self.seen.add(look)

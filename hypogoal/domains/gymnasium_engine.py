@@ -1,8 +1,9 @@
 """Any Gymnasium environment as an engine: many copies stepped in turn, states by id, each distinct one kept once."""
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 from hypogoal.domains.observations import CLEARLY, Reading, reading_of, resized_picture
 from hypogoal.observations import NUMBERS, PICTURE, Observations, digest, mixed_type
@@ -23,23 +23,14 @@ Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
 MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 
-def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
-    """The environment that a user's function makes; a ``UserError`` if it fails or returns something else."""
-    with UsersCode("the environment", make, failed="cannot be made:") as code:
-        env: Any = make(**arguments)
-        if not isinstance(env, gymnasium.Env):
-            code.refuse(
-                f"is a {type(env).__name__}, not a gymnasium.Env", "Give a function that returns a gymnasium.Env."
-            )
-        return env
-
-
 def make_checked(make: MakeEnv) -> gymnasium.Env:
     """An environment with readable observations and ``Discrete`` actions; else a ``UserError``."""
-    env = made(make)
+    env: Any = make()
+    if not isinstance(env, gymnasium.Env):
+        do = "Give a function that returns a gymnasium.Env."
+        raise UserError("the environment is none of Gymnasium's", type(env).__name__, do)
     reader_of(env)
-    with UsersCode("the environment", env, failed="has no spaces:"):
-        actions = env.action_space
+    actions = env.action_space
     if not isinstance(actions, spaces.Discrete) or actions.start != 0:
         raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
     return env
@@ -61,31 +52,34 @@ class Reader(NamedTuple):
     doubt: str = ""
     parts: tuple[tuple[str, Any], ...] = ()  # each with its Reader
 
-    def read(self, env: gymnasium.Env, observation: Any, method: str = "step") -> Any:
-        """A copy (*shape) of an observation that ``method`` returned; ``UserError`` if it does not fit its space."""
-        code = UsersCode("the environment", env, method)
+    def read(self, observation: Any) -> Any:
+        """A copy (*shape) of an observation; ``UserError`` if it does not fit its space."""
         if self.parts:
             mixed = np.empty((), self.dtype)
             for key, part in self.parts:
-                with code:
-                    value = observation[key]
-                mixed[key] = part.read(env, value, method)
+                mixed[key] = part.read(observation[key])
             return mixed
-        with code:
-            if self.key:
-                observation = observation[self.key]
-            elif not isinstance(self.space, spaces.Box):
-                observation = spaces.flatten(self.space, observation)
-            values = np.array(observation, order="C")
+        if self.key:
+            observation = observation[self.key]
+        elif not isinstance(self.space, spaces.Box):
+            observation = spaces.flatten(self.space, observation)
+        values = np.array(observation, order="C")
         received = f"{values.dtype} {values.shape}"
         if self.dtype == NUMBERS and values.dtype.kind in "iufb":
             values = values.astype(NUMBERS)
         if values.dtype != self.dtype or values.shape not in (self.shape, self.space.shape):
             do = f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}."
-            code.refuse(f"gave an observation that does not fit its space: {received}", do)
-        if self.dtype == NUMBERS and not np.isfinite(values).all():
-            code.refuse("gave an observation with numbers that are not finite", "Give finite ones.")
+            raise UserError("the environment gave an observation that does not fit its space", received, do)
         return values.reshape(self.shape)
+
+    def check(self, observation: Any) -> None:
+        """Refuse (``UserError``) an observation that does not fit its space, or is not finite: see :class:`Starts`."""
+        values = self.read(observation)
+        numbers = [values[key] for key, part in self.parts if part.dtype == NUMBERS]
+        if self.dtype == NUMBERS:
+            numbers.append(values)
+        if not all(np.isfinite(part).all() for part in numbers):
+            raise UserError("the environment gave an observation that is not finite", values, "Give finite numbers.")
 
 
 def reader_of(env: gymnasium.Env) -> Reader:
@@ -95,9 +89,7 @@ def reader_of(env: gymnasium.Env) -> Reader:
     ``hypogoal.domains.observations``. Other spaces that Gymnasium's ``flatten`` accepts, such as dictionaries, become
     float32 (D,) in its order. A ``Dict`` with pictures and others, each under a key of its own, is mixed.
     """
-    with UsersCode("the environment", env, failed="has no spaces:"):
-        space = env.observation_space
-    return _reader(space)
+    return _reader(env.observation_space)
 
 
 def _reading(space: spaces.Box) -> Reading:
@@ -154,7 +146,7 @@ def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
         raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
 
     def small(observation: Any) -> NDArray[np.uint8]:
-        return resized_picture(reader.read(env, observation), side, side)
+        return resized_picture(reader.read(observation), side, side)
 
     space = spaces.Box(0, 255, (side, side, reader.shape[-1]), np.uint8)
     return gymnasium.wrappers.TransformObservation(env, small, space)
@@ -170,28 +162,21 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, space
 
 
-def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-    """``env.reset(**arguments)``: an observation, see :class:`Reader`, and a dict; ``UserError`` if malformed."""
-    with UsersCode("the environment's reset", env, "reset") as code:
-        result: Any = env.reset(**arguments)
-        if not _well_formed(result, 2):
-            code.refuse(f"gave {_types(result)}", "Give (observation, info), info a dict.")
-        return result[0], result[1]
-
-
-def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """``env.step(action)``: an observation, see :class:`Reader`, and the rest; ``UserError`` if malformed."""
-    with UsersCode("the environment's step", env, "step") as code:
-        result: Any = env.step(action)
-        if not _well_formed(result, 5):
-            do = "Give (observation, reward, terminated, truncated, info), info a dict."
-            code.refuse(f"gave {_types(result)}", do)
-        reward, terminated = code.number(result[1], "the reward"), code.truth(result[2], "terminated")
-        return result[0], reward, terminated, code.truth(result[3], "truncated"), result[4]
+def check_step(result: Any) -> None:
+    """Refuse (``UserError``) a malformed result of ``env.step``; engines call it for the first one."""
+    do = "Give (observation, reward, terminated, truncated, info): a finite number, True or False twice, a dict."
+    fits = isinstance(result, tuple | list) and len(result) == 5 and isinstance(result[-1], dict)
+    if fits:
+        _observation, reward, terminated, truncated, _info = result
+        single = not any(np.ndim(value) for value in (reward, terminated, truncated))
+        truths = single and terminated in (0, 1) and truncated in (0, 1)
+        fits = truths and isinstance(reward, SupportsFloat) and math.isfinite(float(reward))
+    if not fits:
+        raise UserError("the environment's step gave something else than Gymnasium says", f"{result!r:.200}", do)
 
 
 class Starts:
-    """Checks that the same seed always begins the same episode, as training relies on."""
+    """Checks that the same seed always begins the same episode, as training relies on, and the first observation."""
 
     def __init__(self, reader: Reader):
         self.reader = reader
@@ -199,31 +184,25 @@ class Starts:
 
     def begin(self, env: gymnasium.Env, seed: int) -> Any:
         """The first observation after ``env.reset(seed=seed)``; ``UserError`` if it began another episode before."""
-        observation, _info = begun(env, seed=seed)
-        start = digest(self.reader.read(env, observation, "reset"), repr(_generator(env)).encode())
+        result: Any = env.reset(seed=seed)
+        if not self._digests:
+            if not (isinstance(result, tuple | list) and len(result) == 2 and isinstance(result[1], dict)):
+                do = "Give (observation, info), info a dict."
+                raise UserError(
+                    "the environment's reset gave something else than Gymnasium says", f"{result!r:.200}", do
+                )
+            self.reader.check(result[0])
+        start = digest(self.reader.read(result[0]), repr(_generator(env)).encode())
         if self._digests.setdefault(seed, start) != start:
             do = "Pass the seed on: super().reset(seed=seed), in a wrapper self.env.reset(seed=seed, options=options)."
-            code = UsersCode("the environment's reset", env, "reset")
-            code.refuse(f"began two different episodes with seed={seed}", do)
-        return observation
-
-
-def _well_formed(result: Any, size: int) -> bool:
-    """Whether ``reset`` (2 parts) or ``step`` (5 parts) returned a tuple that ends in a dictionary."""
-    return isinstance(result, tuple | list) and len(result) == size and isinstance(result[-1], dict)
+            raise UserError("the environment's reset began two different episodes with the same seed", seed, do)
+        return result[0]
 
 
 def _generator(env: gymnasium.Env) -> Any:
     """The state of the environment's random generator; None if it has none yet."""
     generator = getattr(env.unwrapped, "_np_random", None)
     return getattr(getattr(generator, "bit_generator", None), "state", None)
-
-
-def _types(result: object) -> str:
-    """The types of a result's parts, for messages."""
-    if isinstance(result, tuple | list):
-        return f"({', '.join(type(part).__name__ for part in result)})"
-    return f"no tuple but a {type(result).__name__}"
 
 
 class Labels:
@@ -237,32 +216,30 @@ class Labels:
         self.names: tuple[str, ...] = (sub_goals,) if isinstance(sub_goals, str) else tuple(sub_goals)
         self._each = tuple(sub_goals.values()) if isinstance(sub_goals, Mapping) else ()
         self._together = together
+        self._checked = False
         if isinstance(sub_goals, Mapping) == (together is not None):
             fault = "sub-goals have functions and labels= too" if together else "nothing says where sub-goals hold"
             do = "Give {name: function}, or names and labels=, a function from the environment to {name: bool}."
             raise UserError(fault, ", ".join(map(str, self.names)), do)
 
     def of(self, env: gymnasium.Env) -> NDArray[np.bool_]:
-        """The labels of an environment's state, bool (G,); ``UserError`` if a function returns no truth value."""
+        """The labels of an environment's state, bool (G,); ``UserError`` if the first ones are no truth values."""
+        labels: Any = self._together(env) if self._together else [label(env) for label in self._each]
+        if not self._checked:
+            self._check(labels)
         if self._together:
-            return self._all(env, self._together)
-        labels = []
-        with UsersCode("a sub-goal's function") as code:
-            for label in self._each:
-                code.target = label
-                labels.append(code.truth(label(env), "the label"))
-        return np.array(labels, dtype=np.bool_)
+            labels = [labels[name] for name in self.names]
+        return np.array([bool(label) for label in labels], dtype=np.bool_)
 
-    def _all(self, env: gymnasium.Env, together: LabelAll) -> NDArray[np.bool_]:
-        with UsersCode("the function of all labels", together) as code:
-            labels: Any = together(env)
-            names = {*labels} if isinstance(labels, Mapping) else None
-            if names != {*self.names}:
-                received = (
-                    f"a {type(labels).__name__}" if names is None else f"labels for {', '.join(map(str, labels))}"
-                )
-                code.refuse(f"gave {received}", f"Give a dictionary of {', '.join(self.names)}, each True or False.")
-            return np.array([code.truth(labels[name], f"the label of {name}") for name in self.names], np.bool_)
+    def _check(self, labels: Any) -> None:
+        do = f"Give True or False for each of {', '.join(self.names)}."
+        if self._together and not (isinstance(labels, Mapping) and {*labels} == {*self.names}):
+            raise UserError("the function of all labels gave something else", f"{labels!r:.200}", do)
+        values = labels.values() if self._together else labels
+        for name, value in zip(labels if self._together else self.names, values, strict=True):
+            if np.ndim(value) or value not in (0, 1):
+                raise UserError(f"the label of {name} is no truth value", f"{value!r:.200}", do)
+        self._checked = True
 
 
 class GymnasiumEngine(TurnEngine):
@@ -293,6 +270,7 @@ class GymnasiumEngine(TurnEngine):
         self.room = 2 * memory
         self._envs = [make_checked(make) for _ in range(count)]
         self._labeller, self._success = labels, success
+        self._checked = False  # the first step
         self._earned, self._succeeded = [0.0] * count, [False] * count  # the episode so far; whether it just succeeded
         self.reader = reader_of(self._envs[0])
         self._starts = Starts(self.reader)
@@ -315,15 +293,18 @@ class GymnasiumEngine(TurnEngine):
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         env = self._envs[number]
-        observation, reward, terminated, truncated, info = stepped(env, action)
+        result: Any = env.step(action)
+        if not self._checked:
+            check_step(result)
+            self._checked = True
+        observation, reward, terminated, truncated, info = result
+        reward, terminated = float(reward), bool(terminated)
         self._played[number].append(action)
         self._earned[number] += reward
-        truncated = (truncated or elapsed >= self.max_steps) and not terminated
+        truncated = (bool(truncated) or elapsed >= self.max_steps) and not terminated
         if self._success:
-            with UsersCode("the domain's success", self._success) as code:
-                self._succeeded[number] = (terminated or truncated) and code.truth(
-                    self._success(env, info, self._earned[number], terminated), "success"
-                )
+            over = terminated or truncated
+            self._succeeded[number] = over and bool(self._success(env, info, self._earned[number], terminated))
         return self._remember(env, observation), reward, terminated, truncated
 
     def step(self, actions: NDArray[np.int64]) -> Step:
@@ -332,7 +313,7 @@ class GymnasiumEngine(TurnEngine):
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of an environment's current state."""
-        image = self.reader.read(env, observation)
+        image = self.reader.read(observation)
         labels = self._labeller.of(env).tobytes()
         look, new = digest(image, labels), self.n_states
         state = self._ids.get(look)
@@ -388,13 +369,13 @@ class GymnasiumEngine(TurnEngine):
             self._file(digest(self._ring[self._place(identity)], labels), identity)
         for number, actions in enumerate(snapshot["played"]):
             env, seed = self._envs[number], self.layouts.now[number]
-            observation, _info = begun(env, seed=seed)
+            observation, _info = env.reset(seed=seed)
             self._earned[number] = 0.0
             for action in actions:
-                observation, reward, *_ = stepped(env, action)
-                self._earned[number] += reward
+                observation, reward, *_ = env.step(action)
+                self._earned[number] += float(reward)
             kept = self._ring[self._place(int(self.ids[number]))]
-            if not np.array_equal(self.reader.read(env, observation), kept):
+            if not np.array_equal(self.reader.read(observation), kept):
                 fault = "the environment does not repeat itself for the same seed, so this cannot be resumed"
                 raise UserError(fault, f"layout_seed={seed}", ANEW)
         self._played = [list(actions) for actions in snapshot["played"]]

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.numbers import grouped
@@ -38,22 +38,17 @@ Classifier = Callable[[Engine, NDArray[np.int64]], NDArray[np.floating]]  # stat
 
 def own_classifier(name: str) -> Classifier:
     """Code of the user's own, from observations (n, *obs) to probabilities (n,); else a ``UserError``."""
-    function = own_code.load_own(name, "classifier", "hypogoal.classifiers", {})
+    function = load(name, "classifier", "hypogoal.classifiers", {})
     if not callable(function):
         raise UserError("this is not a function", name, "Give one from observations (N, *obs) to probabilities (N,).")
 
     def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
         log_odds = []
         for some in np.split(ids, range(CHUNK, len(ids), CHUNK)):
-            with own_code.UsersCode(f"the classifier {name}", function) as code:
-                probabilities = np.asarray(function(engine.images(some)), dtype=np.float64)
-                if probabilities.shape != some.shape or not ((probabilities >= 0) & (probabilities <= 1)).all():
-                    gave = (
-                        f"gave {probabilities.shape}, {probabilities.min():g} to {probabilities.max():g}"
-                        if probabilities.size
-                        else "gave nothing"
-                    )
-                    code.refuse(gave, f"Give probabilities, 0 to 1, float ({len(some)},).")
+            probabilities = np.asarray(function(engine.images(some)), dtype=np.float64)
+            if probabilities.shape != some.shape or not ((probabilities >= 0) & (probabilities <= 1)).all():
+                fault = f"the classifier gave {probabilities.shape} {probabilities.ravel()[:3]}"
+                raise UserError(fault, name, f"Give probabilities, 0 to 1, float ({len(some)},).")
             log_odds.append(log_odds_of(probabilities))
         return np.concatenate(log_odds)
 

@@ -3,7 +3,7 @@
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import count, product
+from itertools import chain, count, product
 from operator import itemgetter
 from typing import Any
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from rich.table import Table as Printed
 
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.core.own_code import UsersCode, as_number
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Work
@@ -284,8 +283,7 @@ def show_stops(
             group = arrays.require_group(f"stops/{row['path']}/{best['option']}")
             if not len(group):  # the oracle's stand beside every N
                 group["positions"] = stops.positions()
-                with UsersCode("the domain's pixel", domain, "pixel"):
-                    group["pixels"] = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
+                group["pixels"] = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
                 group["fates"] = fates(stops)
             columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
             where.append(stops.room)
@@ -293,25 +291,13 @@ def show_stops(
             place: dict[str, Any] = {"ladder": ladder, "groups": groups, "seed": first}
             shown.append({**place, "rooms": rooms_shown(where, _rooms_of(domain, ladder)), "columns": columns})
     for room in sorted({room for figure in shown for room in figure["rooms"]}):
-        arrays[f"pictures/{room}"] = _picture(domain, room)
+        arrays[f"pictures/{room}"] = domain.picture(room)
     return shown
 
 
 def _rooms_of(domain: Domain, ladder: str) -> list[int]:
-    with UsersCode("the domain's rooms_of", domain, "rooms_of") as code:
-        gave = tuple(dict.fromkeys(room for name in ladder.split(",") for room in domain.rooms_of(name)))
-        rooms = [number for number in map(as_number, gave) if number is not None and number >= 0]
-    if len(rooms) < len(gave):
-        code.refuse(f"gave {gave!r}", "Give the rooms' numbers.")
-    return rooms
-
-
-def _picture(domain: Domain, room: int) -> NDArray[np.uint8]:
-    with UsersCode("the domain's picture", domain, "picture") as code:
-        picture = np.asarray(domain.picture(room))
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-        code.refuse(f"gave {picture.dtype} {picture.shape}", "Give uint8 (height, width, 3).")
-    return picture
+    rooms = chain.from_iterable(domain.rooms_of(name) for name in ladder.split(","))
+    return list(dict.fromkeys(rooms))
 
 
 def missing(work: Work) -> list[str]:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts
-from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.manifests import digest_of
+from hypogoal.core.own_code import command
 from hypogoal.data import reading
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
 
@@ -63,7 +63,7 @@ def find(run: Path) -> Contents:
     agents = [*metas, *others, *find_artefacts(run, "baseline")]
     contents = Contents(run, find_artefacts(run, "ensemble"), agents, ladders, silent, continued)
     if not contents.everything():
-        raise UserError("nothing to evaluate", run, advice("Train something into it first", "run", "--help"))
+        raise UserError("nothing to evaluate", run, "Train something into it first: hypogoal run --help")
     return contents
 
 
@@ -144,7 +144,7 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     """
     evaluations = find_artefacts(run, "evaluation")
     if not evaluations:
-        raise UserError("this run was not evaluated", run, advice("First run", "evaluate", run))
+        raise UserError("this run was not evaluated", run, f"First run: {command('evaluate', run)}")
     source = next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
     metrics = read_numbers(source)
     metrics["missing"] = [*metrics["missing"], *_since(run, source)]
@@ -191,5 +191,5 @@ def _since(run: Path, source: Artefact) -> list[str]:
         if digest_of(artefact.path / MANIFEST) not in evaluated
     ]
     elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
-    do = advice("evaluate it again", "evaluate", run, *elsewhere, "--force") if names else ""
+    do = f"evaluate it again: {command('evaluate', run, *elsewhere, '--force')}" if names else ""
     return [f"{name}: made since this evaluation ({do})" for name in names]

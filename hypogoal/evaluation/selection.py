@@ -14,7 +14,7 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain, step_of
+from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import variants, which
 from hypogoal.evaluation.judging import Work
@@ -153,7 +153,7 @@ def states_met(engine: Engine, steps: int, rng: np.random.Generator) -> NDArray[
     """The states that random play of an engine meets in so many steps, each once."""
     met = [engine.ids]
     for _ in range(steps // engine.count):
-        met.append(step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids)
+        met.append(engine.step(rng.integers(engine.n_actions, size=engine.count)).next_ids)
     return np.unique(np.concatenate(met))
 
 

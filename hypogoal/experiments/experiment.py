@@ -20,7 +20,7 @@ from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hin
 
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode, load_own
+from hypogoal.core.own_code import load
 
 MAX_CELLS = 20_000
 MEND = "Mend the experiment or its settings, see docs/formats.md."
@@ -67,8 +67,7 @@ class Experiment:
     def commands(self, settings: Mapping[str, Any], stage: Callable[[str], Any]) -> Iterator[Command]:
         """What the function yields; ``stage`` gives a stage's settings. What is no command is a ``UserError``."""
         takes_stage = "stage" in inspect.signature(self.function).parameters
-        with UsersCode("the experiment", self.function):
-            rows = list(islice(self.function(*[stage][:takes_stage], **settings), MAX_CELLS + 1))
+        rows = list(islice(self.function(*[stage][:takes_stage], **settings), MAX_CELLS + 1))
         if len(rows) > MAX_CELLS:
             raise UserError(f"more than {MAX_CELLS} cells", self.name, "Take fewer values.")
         for row in rows:
@@ -105,7 +104,7 @@ def experiment(domain: str, *, stages: Sequence[str]) -> Callable[[Callable[...,
 
 def load_experiment(name: str) -> Experiment:
     """The experiment ``module:function``; the user must have given the name or allowed it, else a ``UserError``."""
-    target = load_own(name, "experiment", "hypogoal.experiments", {})
+    target = load(name, "experiment", "hypogoal.experiments", {})
     if isinstance(target, Experiment):
         return target
     if not inspect.isgeneratorfunction(target):
@@ -138,8 +137,7 @@ def _experiment_of(
 ) -> Experiment:
     """A function as an experiment whose settings are those that the function's signature describes."""
     fields = []
-    with UsersCode("the experiment", function):
-        hints = get_type_hints(function, include_extras=True)
+    hints = get_type_hints(function, include_extras=True)
     for name, parameter in inspect.signature(function).parameters.items():
         if name == "stage" and domain:
             continue

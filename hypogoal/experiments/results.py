@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_text, write_table
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
+from hypogoal.core.own_code import command
 from hypogoal.data import open_dataset
 from hypogoal.evaluation import curves, distance
 from hypogoal.evaluation.numbers import grouped
@@ -35,7 +35,7 @@ def write_results(plan: Plan, run: Path) -> Path:
         write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         problem = f"an artefact is damaged ({type(error).__name__} {error})"
-        raise UserError(problem, run, advice("Which one", "verify", run)) from None
+        raise UserError(problem, run, f"Which one: {command('verify', run)}") from None
     return path
 
 

@@ -5,13 +5,14 @@ The file is data. Its commands are stages of hypogoal and nothing else, and writ
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import MAX_PRESET_BYTES, parse_integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, read_text
+from hypogoal.core.own_code import names_in, require_trust
 from hypogoal.experiments.cells import COLUMNS
 from hypogoal.experiments.experiment import COMMON, Command, Experiment, Value, run_config
 
@@ -97,8 +98,10 @@ def _command(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], poin
         return f"@{_name(rows[key], point)}"
 
     words = Command(row.get("name", ""), row.get("command", "")).words
-    columns = {"group": row.get("name", ""), **point}
-    return Command(_name(row, point), [REFERENCE.sub(filled, word) for word in words], columns)
+    words = [REFERENCE.sub(filled, word) for word in words]
+    for own in chain.from_iterable(map(names_in, [*words, *point.values()])):
+        require_trust(own, "setting")
+    return Command(_name(row, point), words, {"group": row.get("name", ""), **point})
 
 
 def _name(row: Mapping[str, Any], point: Point) -> str:

@@ -13,6 +13,7 @@ network, which the paper does not have.
 from __future__ import annotations
 
 import inspect
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from math import prod
@@ -24,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode, as_number, load_own
+from hypogoal.core.own_code import load
 from hypogoal.core.tensors import KEPT
 from hypogoal.hypotheses.load import ByKey
 from hypogoal.observations import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
@@ -111,7 +112,7 @@ def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
     if name in NETWORKS:
         return lambda shape: NETWORKS[name](shape[-1])
     built_in = {network: f"{__name__}:{function.__name__}" for network, function in NETWORKS.items()}
-    function = load_own(name, "network", ENTRY_POINTS, built_in)
+    function = load(name, "network", ENTRY_POINTS, built_in)
     if not callable(function):
         raise UserError("this is not a member network", name, "Give a function of channels or of observation_shape.")
     return _checked(name, function)
@@ -124,25 +125,28 @@ def _checked(name: str, function: Callable[..., Parts | nn.Module]) -> Callable[
     """
 
     def checked(shape: tuple[int, ...]) -> Parts:
-        with UsersCode(f"the network {name!r}", function) as code:
-            network = function(shape if "observation_shape" in inspect.signature(function).parameters else shape[-1])
-            if isinstance(network, nn.Module):
-                with torch.no_grad():
-                    features = network.eval()(as_input(torch.zeros(1, *shape)))
-                kind, size = getattr(features, "dtype", type(features)), tuple(getattr(features, "shape", ()))
-                if kind != torch.float32 or size[:-1] != (1,) or not all(size):
-                    code.refuse(f"is an encoder that makes {kind} {size} of a state", "Make features, float32 (N, F).")
-                return keeping([network], code), ()
-            layers, hidden = network
-            widths = bool(hidden) and all((as_number(width) or 0) > 0 for width in hidden)
-            if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
-                code.refuse(f"gave layers {layers} and widths {hidden}", "Give (modules, hidden widths above 0).")
-            return keeping(layers, code), tuple(hidden)
+        network = function(shape if "observation_shape" in inspect.signature(function).parameters else shape[-1])
+        if isinstance(network, nn.Module):
+            with torch.no_grad():
+                features = network.eval()(as_input(torch.zeros(1, *shape)))
+            kind, size = getattr(features, "dtype", type(features)), tuple(getattr(features, "shape", ()))
+            if kind != torch.float32 or size[:-1] != (1,) or not all(size):
+                fault = f"the network is an encoder that makes {kind} {size} of a state"
+                raise UserError(fault, name, "Make features, float32 (N, F).")
+            return keeping([network]), ()
+        if not (isinstance(network, tuple | list) and len(network) == 2):
+            raise UserError(f"the network gave {network!r}", name, "Give (modules, hidden widths), or an encoder.")
+        layers, hidden = network
+        widths = bool(hidden) and all(operator.index(width) > 0 for width in hidden)
+        if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
+            fault = f"the network gave layers {layers} and widths {hidden}"
+            raise UserError(fault, name, "Give (modules, hidden widths above 0).")
+        return keeping(layers), tuple(hidden)
 
-    def keeping(layers: Iterable[nn.Module], code: UsersCode) -> list[nn.Module]:
+    def keeping(layers: Iterable[nn.Module]) -> list[nn.Module]:
         parts = nn.ModuleList(layers)
         for kind in {str(tensor.dtype) for tensor in parts.state_dict().values()} - KEPT:
-            code.refuse(f"keeps weights of type {kind}", "Keep them as float32.")
+            raise UserError(f"the network keeps weights of type {kind}", name, "Keep them as float32.")
         return [*parts]
 
     return checked

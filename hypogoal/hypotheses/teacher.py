@@ -7,12 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hypogoal.core.own_code import UsersCode, load_own
+from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load
 
 
 def load_teacher(name: str) -> Callable[..., Any]:
     """The function ``module:function``, or of an entry point; any other name is a ``UserError``."""
-    teacher: Callable[..., Any] = load_own(name, "teacher", "hypogoal.teachers", {})
+    teacher: Callable[..., Any] = load(name, "teacher", "hypogoal.teachers", {})
     return teacher
 
 
@@ -22,8 +23,7 @@ def taught_by(name: str, observations: Any, labels: Any, unlabelled: Any, member
     It gets labelled observations (N, *obs), labels bool (N,), unlabelled observations (M, *obs), K and a seed.
     """
     teacher, shape = load_teacher(name), (members, len(unlabelled))
-    with UsersCode(f"the teacher {name!r}", teacher) as code:
-        scores = np.array(teacher(observations, labels, unlabelled, members, seed), dtype=np.float32)
-        if scores.shape != shape or not np.isfinite(scores).all():
-            code.refuse(f"gave scores {scores.shape}", f"Give finite ones, {shape}.")
+    scores = np.array(teacher(observations, labels, unlabelled, members, seed), dtype=np.float32)
+    if scores.shape != shape or not np.isfinite(scores).all():
+        raise UserError(f"the teacher gave scores {scores.shape}", name, f"Give finite ones, {shape}.")
     return torch.from_numpy(scores)

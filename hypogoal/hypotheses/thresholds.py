@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode, load_own
+from hypogoal.core.own_code import load
 
 PAPER = "0.5"
 SPLIT = "unlabelled-split"
@@ -50,7 +50,7 @@ def threshold_rule(name: str) -> Rule:
         number = float(name)
         if 0 < number < 1:
             return lambda labelled, *_: np.full(labelled.shape[1], number)
-    rule = load_own(name, "threshold", ENTRY_POINTS, RULES)
+    rule = load(name, "threshold", ENTRY_POINTS, RULES)
     if not callable(rule):
         raise UserError("this is no rule for thresholds", name, "Give a function, see docs/extending.md.")
     return cast(Rule, rule)
@@ -72,8 +72,7 @@ def thresholds(
         unlabelled: float32 (M, K), the members' probabilities of the unlabelled states.
     """
     rule, members = threshold_rule(name), labelled.shape[1]
-    with UsersCode(f"the threshold {name!r}", rule) as code:
-        chosen = np.asarray(rule(labelled, labels, unlabelled))
-        if chosen.shape != (members,) or not ((chosen >= 0) & (chosen <= 1)).all():
-            code.refuse(f"gave {chosen}", f"Give probabilities ({members},).")
+    chosen = np.asarray(rule(labelled, labels, unlabelled))
+    if chosen.shape != (members,) or not ((chosen >= 0) & (chosen <= 1)).all():
+        raise UserError(f"the threshold rule gave {chosen}", name, f"Give probabilities ({members},).")
     return np.minimum(chosen.astype(np.float32), BELOW_ONE)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from hypogoal.core.config import from_values, parse_assignments
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load_own
+from hypogoal.core.own_code import load
 from hypogoal.hypotheses.config import FULL, EnsembleConfig
 from hypogoal.observations import (
     NUMBERS,
@@ -147,7 +147,7 @@ def own_view(name: str, settings: Sequence[str], observation_shape: tuple[int, .
 
     No such view or setting, and code that the user did not allow, are a ``UserError``.
     """
-    kind = load_own(name, "view", ENTRY_POINTS, {})
+    kind = load(name, "view", ENTRY_POINTS, {})
     if not (inspect.isclass(kind) and issubclass(kind, View)):
         raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
     values = parse_assignments(settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from pathlib import Path
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
@@ -13,8 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import as_number
-from hypogoal.domains.gymnasium_engine import Reader, reader_of, stepped
+from hypogoal.domains.gymnasium_engine import Reader, reader_of
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -57,7 +57,7 @@ class SubgoalReward:
 
     def __init__(self, source: str | os.PathLike[str] | Ensemble, sub_goal: str = "", by: By = "vote"):
         ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
-        rule = by if isinstance(by, str) else as_number(by)
+        rule = by if isinstance(by, str) else operator.index(by)
         if rule not in RULES and rule not in range(len(ensemble)):
             do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
             raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
@@ -100,9 +100,11 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step with reward and end changed."""
-        observation, reward, terminated, truncated, info = stepped(self.env, action)
-        seen = self._reader.read(self.env, observation)[None]
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        seen = self._reader.read(observation)[None]
         holds = bool(self.reward.holds(seen)[0])
-        terminated |= holds and self.ends
-        bonus = self.scale if holds else 0.0
-        return observation, reward + bonus if self.add else bonus, terminated, truncated, info | {"subgoal": holds}
+        terminated = bool(terminated) or (holds and self.ends)
+        paid = self.scale if holds else 0.0
+        if self.add:
+            paid += float(reward)
+        return observation, paid, terminated, truncated, info | {"subgoal": holds}

@@ -14,7 +14,6 @@ from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
 from hypogoal.core.manifests import digest_of
-from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
@@ -124,8 +123,7 @@ def nearness(
     away = distances_of(domain, sub_goals, ensemble_config["members"])
 
     def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
-        with UsersCode("the engine's labels", engine, "labels"):
-            holds = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
+        holds = engine.labels(ids)[np.arange(len(ids)), columns[options]]
         if not (domain.measures and engine.position_names):
             return holds
         return holds | (away(engine.positions(ids), options) <= domain.near)

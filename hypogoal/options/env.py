@@ -11,9 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import as_number
 from hypogoal.domains.base import load_domain
-from hypogoal.domains.gymnasium_engine import begun, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.observations import Observations
@@ -134,8 +132,8 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Like the environment's own."""
-        observation, info = begun(self.env, seed=seed, options=options)
-        self._image, self._masks = self._look.read(self.env, observation), None
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._image, self._masks = self._look.read(observation), None
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -152,8 +150,9 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             UserError: there is no such option, the environment was not reset, or the option is masked and ``masked`` is
                 ``raise``.
         """
-        option = as_number(action)
-        if option is None or not 0 <= option < self.options.count:
+        chosen = np.asarray(action)  # other libraries' agents give arrays of one
+        option = int(chosen.item()) if chosen.size == 1 and chosen.dtype.kind in "iu" else -1
+        if not 0 <= option < self.options.count:
             raise UserError("no such option", repr(action), f"They are 0 to {self.options.count - 1}.")
         masked = not self.action_masks()[option]
         if masked and self.masked != "run":
@@ -164,9 +163,9 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         terminated = truncated = False
         info: dict[str, Any] = {}
         while not ended:
-            observation, reward, terminated, truncated, info = stepped(self.env, act(image))
-            image = self._look.read(self.env, observation)
-            total += self.gamma**duration * reward
+            observation, reward, terminated, truncated, info = self.env.step(act(image))
+            image = self._look.read(observation)
+            total += self.gamma**duration * float(reward)
             duration += 1
             reached = self.options.holds(option, image)
             ended = reached or terminated or truncated or duration >= self.options.timeout

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine, Step, step_of
+from hypogoal.domains.base import Engine, Step, check_step
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
@@ -71,6 +71,7 @@ class OptionLoop(Resumable):
         self.age = np.zeros(count, dtype=np.int64)
         self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
+        self._checked = False  # the engine's first step
         engine.reset()
 
     def step(self) -> dict[str, float]:
@@ -87,7 +88,10 @@ class OptionLoop(Resumable):
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=learning)
         layouts = [*self.engine.layouts.now] if self.engine.layouts else None
-        step = step_of(self.engine, actions)
+        step = self.engine.step(actions)
+        if not self._checked:
+            check_step(self.engine, step)
+            self._checked = True
         reached = self.terminations.reached(step.next_ids, option, self.age)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1

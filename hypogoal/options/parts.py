@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load_own
+from hypogoal.core.own_code import load
 from hypogoal.options.config import OptionConfig
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def load_part(name: str, kind: str, base: type[Kind], built_in: Mapping[str, str
     Entry points of choosers are in the group ``hypogoal.choosers``, and so on. Anything else, and code that the user
     did not allow, is a ``UserError`` that says which ``kind`` of part is meant.
     """
-    part = load_own(name, kind, f"hypogoal.{kind.replace(' ', '_')}s", built_in)
+    part = load(name, kind, f"hypogoal.{kind.replace(' ', '_')}s", built_in)
     if not (inspect.isclass(part) and issubclass(part, base)):
         raise UserError(f"this is no {kind}", name, f"Give a subclass of {base.__module__}.{base.__name__}.")
     return part

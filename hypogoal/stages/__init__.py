@@ -1,6 +1,5 @@
 """Stages with settings, by name: what commands and the functions of :mod:`hypogoal.api` share."""
 
-import re
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -20,24 +19,16 @@ def make(
     The source is a domain's name, which the user typed, or a data file or ensemble, which names its domain.
     ``module:object`` may be loaded if it is among the settings, not if it is in a preset.
     """
-    from hypogoal.domains.base import defaults_of, load_domain
+    from hypogoal.domains.base import load_domain
 
-    by_user = isinstance(source, str)
+    own_code.allow([source, *settings.values()])
     domain = source if isinstance(source, str) else domain_of(source, stage)
     inherited = inherited_of(stage, rest["options"]) if rest.get("options") else {}
-    config = configuration(stage, domain, preset, (), settings, by_user=by_user, inherited=inherited)
-    trusted = [value for value in defaults_of(domain, stage, by_user=by_user).values() if isinstance(value, str)]
+    config = configuration(stage, domain, preset, (), settings, inherited=inherited)
     first: Any = source
     if stage == "collect":
-        first, rest["name"] = load_domain(domain, by_user=True), domain
-    with own_code.given(*typed_in(settings)), own_code.vouched(*trusted):
-        return named(stage)(first, config, out, **rest)
-
-
-def typed_in(settings: Mapping[str, Any]) -> list[str]:
-    """The words of the user's settings, split at commas and equals signs: names of own code may be among them."""
-    texts = [value for value in settings.values() if isinstance(value, str)]
-    return [part.strip() for text in texts for part in re.split("[,=]", text)]
+        first, rest["name"] = load_domain(domain), domain
+    return named(stage)(first, config, out, **rest)
 
 
 def inherited_of(stage: str, options: Path) -> dict[str, Any]:

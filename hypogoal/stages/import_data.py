@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core import own_code
 from hypogoal.core.artefacts import DATA, begins_as, claim
-from hypogoal.core.errors import UserError, printable
-from hypogoal.core.own_code import load_own
+from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load
 from hypogoal.core.seeding import torch_generator
-from hypogoal.core.terminal import say
+from hypogoal.core.terminal import printable, say
 from hypogoal.data import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays
@@ -58,7 +57,7 @@ def import_data(
             raise UserError("a data file is taken as it is", source, "Give --label NAME=TABLE.csv and --out alone.")
         return _marked(source, out, rules, seed=seed, force=force)
     if (source / MINARI).exists():
-        functions = [load_own(name, "label function", LABELS, {}) for name in rules.values()]
+        functions = [load(name, "label function", LABELS, {}) for name in rules.values()]
         parts, sub_goals = read_minari(source, functions, keys=keys, seed=seed), tuple(rules)
     elif (recording := recording_of(source, keys, resize)) is not None:
         parts, sub_goals = recorded_parts(recording, rules, every=every, seed=seed), ()
@@ -109,14 +108,13 @@ def recording_of(source: Path, keys: Sequence[str], resize: Resize) -> Recording
 def _too_small(domain: str, states: Collected) -> list[str]:
     """The error that ``train-ensemble`` will raise for such images with its default network, if any."""
     from hypogoal.hypotheses.config import EnsembleConfig
-    from hypogoal.hypotheses.networks import build_network, names_in, network_for
+    from hypogoal.hypotheses.networks import build_network, network_for
 
-    name = defaults_of(domain, "train-ensemble", by_user=True).get("network", EnsembleConfig().network)
+    name = defaults_of(domain, "train-ensemble").get("network", EnsembleConfig().network)
     name = network_for(name, states.labelled.observations.dtype)
     try:
-        with own_code.vouched(*names_in(name)):  # the domain names it
-            dtype = states.labelled.observations.dtype
-            build_network(name, states.observation_shape, torch_generator(0, "import"), dtype=dtype)
+        dtype = states.labelled.observations.dtype
+        build_network(name, states.observation_shape, torch_generator(0, "import"), dtype=dtype)
     except UserError as error:
         return [str(error)]
     return []

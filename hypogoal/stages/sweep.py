@@ -36,7 +36,7 @@ AGAIN = "give the same command again to go on"
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
     """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
     if stage == "collect":
-        return load_domain(domain, by_user=True).config_class
+        return load_domain(domain).config_class
     if stage == "run":
         for name, experiment in EXPERIMENTS.items():
             if domain == experiment.domain and name not in CELLS.values():

@@ -44,7 +44,7 @@ def train_baseline(
     device = prepare(device)
     inputs = [data] if data else []
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
-    played = load_domain(domain, by_user=True)
+    played = load_domain(domain)
     lived: dict[str, Any] = {}
     if data:
         dataset = open_dataset(data)

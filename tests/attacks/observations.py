@@ -59,7 +59,7 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
         return "refused"
     look, taken = reader_of(env), as_observations(states, "the states")[0]
     assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
-    np.testing.assert_array_equal(look.read(env, env.reset()[0]), taken)
+    np.testing.assert_array_equal(look.read(env.reset()[0]), taken)
     if look.dtype == PICTURE:
         assert dtype == "uint8" and len(shape) in (2, 3)
         return "picture"

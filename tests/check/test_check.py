@@ -284,7 +284,7 @@ def test_each_broken_law_of_a_network_is_named(
     """Spec C5: members that are one object, that change what the next one sees, that cannot learn or be asked."""
     if make is not None:
         monkeypatch.setattr(sys.modules[__name__], "broken", make, raising=False)
-    monkeypatch.setenv("HYPOGOAL_TRUST", "test_check:broken")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     found = first_fault(check_network("test_check:broken"))
     assert found.name == law and fault in found.text
 
@@ -300,7 +300,7 @@ def frozen(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
 @pytest.mark.parametrize("name", [*NETWORKS, "test_check:squeezed", "test_check:frozen"])
 def test_networks_that_keep_the_contract_pass(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec C5, F2: ours and own ones, some with frozen weights, and how they are explained."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", name)
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     found = [*check_network(name)]
     require(found)
     assert ("integrated gradients" if name.endswith("squeezed") else "DeepLift") in found[0].text

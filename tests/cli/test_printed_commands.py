@@ -17,12 +17,10 @@ from typer.main import get_command
 
 from hypogoal.cli import app, main
 from hypogoal.core import own_code
-from hypogoal.core.commands import advice, command
-from hypogoal.core.own_code import TRUST
 from hypogoal.evaluation.run import read_evaluation
 
 TESTS, PACKAGE = Path(__file__).parents[1], Path(own_code.__file__).parents[1]
-PRINTED = re.compile(r"(?:HYPOGOAL_TRUST=\S+ )?hypogoal .*$")
+PRINTED = re.compile(r"hypogoal .*$")
 OWN = """
 from corridor_env import SUB_GOALS, CorridorEnv, Sensed
 from hypogoal import GymnasiumDomain
@@ -49,19 +47,15 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     folder.mkdir()
     (folder / "tiny.py").write_text(OWN)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(own_code, "_before", set())
     for place in (TESTS, TESTS.parent / "examples", folder):
         monkeypatch.syspath_prepend(str(place))
 
     def typed(line: str, code: int = 0) -> str:
-        script = f'hypogoal() {{ printf \'%s\\0\' "${TRUST}" "$@"; }}; {line}'
+        script = f"hypogoal() {{ printf '%s\\0' \"$@\"; }}; {line}"
         done = subprocess.run(["sh", "-c", script], env={}, capture_output=True, text=True, check=True)
-        allowed, *words = done.stdout.split("\0")[:-1]
-        with monkeypatch.context() as here:
-            here.setattr(own_code, "_before", set())  # as in a process of its own
-            here.setenv(TRUST, allowed)
-            capsys.readouterr()
-            assert main(words) == code, (line, capsys.readouterr())
+        own_code._allowed.clear()  # as in a process of its own
+        capsys.readouterr()
+        assert main(done.stdout.split("\0")[:-1]) == code, (line, capsys.readouterr())
         printed = capsys.readouterr()
         return printed.out + printed.err
 
@@ -86,19 +80,17 @@ def test_what_follows_a_stage_with_code_of_ones_own(shell: Shell) -> None:
         text = shell(line)
         line = printed(text, "next: ") if "next: " in text else ""
     stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
-    assert [shlex.split(line)[min(1, i) + 1] for i, line in enumerate(ran)] == stages
-    assert all(line.startswith("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal ") for line in ran[1:])
+    assert [shlex.split(line)[1] for line in ran] == stages
+    assert all(line.endswith(" --trust") for line in ran[1:])
     assert Path("it's  mine/report/index.html").is_file()
 
 
 def test_what_follows_allows_networks_and_objectives_too(shell: Shell) -> None:
-    """All code that the next command's files name, whoever named it: an option, or the domain's defaults."""
+    """All code that the next command's files name."""
     text = shell("hypogoal collect tiny:DOMAIN --out data.h5")
     line = printed(text, "next: ") + " --diversity tiny:pair_loss --set network=tiny:wide"
     line = printed(shell(line), "next: ")
-    names, _, rest = line.removeprefix("HYPOGOAL_TRUST=").partition(" ")
-    assert {*names.split(",")} == {"tiny:DOMAIN", "tiny:pair_loss", "tiny:wide"}
-    assert rest == "hypogoal train-options ensemble --out options"
+    assert line == "hypogoal train-options ensemble --out options --trust"
     assert "next: " in shell(line)
 
 
@@ -112,19 +104,20 @@ def test_what_follows_pictures(shell: Shell) -> None:
             picture = np.full((48, 48, 3), 40 * number + index, np.uint8)
             Image.fromarray(picture).save(folder / f"{index}.png")
     line = printed(shell("hypogoal import 'my  photos' --out 'my  photos.h5' --domain tiny:DOMAIN"), "next: ")
-    assert line.startswith("HYPOGOAL_TRUST=tiny:DOMAIN ") and "next: " in shell(line + few)
+    assert line.endswith(" --trust") and "next: " in shell(line + few)
 
 
 def test_what_an_error_says_to_do(shell: Shell) -> None:
     """Each is typed as it stands, with code of one's own that this process was not told of."""
     shell("hypogoal collect tiny:DOMAIN --out 'a run/data.h5' -q")
-    shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble 'a run/data.h5' --out 'a run/ensemble' -q")
-    trust = "HYPOGOAL_TRUST=tiny:DOMAIN "
-    shell(trust + printed(shell("hypogoal report 'a run'", 2), "First run: "))
+    refusal = shell("hypogoal train-ensemble 'a run/data.h5' --out 'a run/ensemble' -q", 2)
+    assert "Do you trust it? Give --trust" in refusal
+    shell("hypogoal train-ensemble 'a run/data.h5' --out 'a run/ensemble' -q --trust")
+    shell(printed(shell("hypogoal report 'a run'", 2), "First run: ") + " --trust")
     shell("hypogoal report 'a run'")
-    shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-options 'a run/ensemble' --out 'a run/options' -q")
+    shell("hypogoal train-options 'a run/ensemble' --out 'a run/options' -q --trust")
     since = read_evaluation(Path("a run")).metrics["missing"]
-    shell(trust + printed(since[-1], "options: made since this evaluation (evaluate it again: "))
+    shell(printed(since[-1], "options: made since this evaluation (evaluate it again: ") + " --trust")
     assert read_evaluation(Path("a run")).metrics["missing"] == []
     shell("hypogoal collect tiny:NUMBERS --out 'num  bers.h5' -q")
     text = shell("hypogoal show 'num  bers.h5' --pictures sheets", 2)
@@ -138,28 +131,6 @@ def test_what_an_error_says_to_do(shell: Shell) -> None:
     for given in ("collect", "train-meta e --out o --gae-lambda 3", "show runs --bogus"):
         (line,) = re.findall(r"'(hypogoal [^']+)'", shell(f"hypogoal {given}", 2))
         shell(line)
-
-
-def test_permissions_asked_for_add_up(shell: Shell) -> None:
-    """Whoever sets what each refusal says gets there, though two names are needed."""
-    shell("hypogoal collect tiny:DOMAIN --out data.h5 -q")
-    shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble data.h5 --out run/ensemble --set network=tiny:wide -q")
-    line = "hypogoal train-options run/ensemble --out run/options -q"
-    first = shell(line, 2).rpartition(" Set ")[2].strip()
-    second = shell(f"{first} {line}", 2).rpartition(" Set ")[2].strip()
-    assert {first, second} == {"HYPOGOAL_TRUST=tiny:DOMAIN", "HYPOGOAL_TRUST=tiny:wide,tiny:DOMAIN"}
-    shell(f"{second} {line}")
-
-
-def test_a_strangers_code_is_never_allowed_in_passing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A command allows only what this process was told to load."""
-    shell("hypogoal collect tiny:DOMAIN --out theirs.h5 -q")
-    monkeypatch.setattr(own_code, "_before", set())
-    monkeypatch.delenv(TRUST, raising=False)
-    assert command("train-ensemble", "theirs.h5") == "hypogoal train-ensemble theirs.h5"
-    assert advice("Do", "train-ensemble", "theirs.h5") == "Do: hypogoal train-ensemble theirs.h5"
-    with own_code.given("tiny:DOMAIN"):
-        assert command("show", "theirs.h5") == "HYPOGOAL_TRUST=tiny:DOMAIN hypogoal show theirs.h5"
 
 
 def texts(tree: ast.AST) -> Iterator[ast.Constant | ast.JoinedStr]:

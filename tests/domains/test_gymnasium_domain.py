@@ -362,7 +362,7 @@ def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: py
     (tmp_path / "domain_lying_here.py").write_text("from corridor_env import DOMAIN\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
-    assert load_domain("domain_lying_here:DOMAIN", by_user=True) is DOMAIN
+    assert load_domain("domain_lying_here:DOMAIN") is DOMAIN
 
 
 @pytest.mark.parametrize(

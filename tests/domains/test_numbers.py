@@ -41,7 +41,7 @@ class Says(gymnasium.Env[Any, int]):
 def read(space: spaces.Space[Any], observation: Any) -> Any:
     env = Says(space, observation)
     look = reader_of(env)
-    values = look.read(env, observation)
+    values = look.read(observation)
     assert values.dtype == look.dtype and values.shape == look.shape
     return values.tolist(), look.features
 

@@ -22,7 +22,7 @@ TESTS = Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TESTS))
-    monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
 
 
 def test_an_own_domain_goes_through_the_stages(corridor_run: Path) -> None:
@@ -37,9 +37,9 @@ def test_an_own_domain_goes_through_the_stages(corridor_run: Path) -> None:
 def test_what_is_no_domain_is_refused() -> None:
     """Spec B6, G2: one line that says what a domain needs."""
     with pytest.raises(UserError, match="not a domain"):
-        load_domain("own_domain:CorridorConfig", by_user=True)
+        load_domain("own_domain:CorridorConfig")
     with pytest.raises(UserError, match="cannot be loaded"):
-        load_domain("own_domain:NOTHING", by_user=True)
+        load_domain("own_domain:NOTHING")
 
 
 @pytest.mark.parametrize("agent", ["ppo", "dqn"])
@@ -73,7 +73,7 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str,
 
 def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B6, F5: in training's numbers, the table of episodes, the evaluation; by reward it would be another."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:SWIFT")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     few = BaselineConfig(steps=2_048, max_episode_steps=20)
     numbers = train_baseline("corridor_env:SWIFT", few, tmp_path / "ppo", quiet=True)
     episodes = Episodes.read(tmp_path / "ppo" / "episodes.csv")
@@ -90,7 +90,7 @@ def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeyp
     """Spec B6: states are collected, options and agents trained, baselines, films and judgements made in one world."""
     import corridor_env
 
-    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:MIRRORED")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     data, folder = tmp_path / "run" / "data.h5", tmp_path / "run"
     small = settings("steps=60", "states=30", "mirrored=true")
     play = settings("steps=200", "environments=2", "warm_up=50")

@@ -72,10 +72,8 @@ def test_a_truth_that_is_not_planted_is_refused(factors: tuple[str, ...]) -> Non
 
 
 def test_files_of_0_23_name_them_otherwise() -> None:
-    """In data and artefacts; nobody types that name any more."""
+    """In data and artefacts."""
     assert load_domain("which-feature") is DOMAIN
-    with pytest.raises(UserError, match="unknown domain: which-feature"):
-        load_domain("which-feature", by_user=True)
 
 
 def test_an_agent_finds_the_member_that_the_reward_asks_for(tmp_path: Path) -> None:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 from command_line import run, trusting
-from ladder_run import DOMAIN, write_run
+from ladder_run import write_run
 from shared_runs import built_once
 
 
 def _evaluated(write: Callable[[Path], None], folder: Path) -> None:
     write(folder)
-    with trusting(DOMAIN.name):
+    with trusting():
         run("evaluate", folder, "-q")
         run("report", folder)
 
@@ -29,7 +29,7 @@ def ladders(built_ladders: Path) -> Iterator[Path]:
 
     Evaluated and drawn, to be read only; its domain is trusted meanwhile.
     """
-    with trusting(DOMAIN.name):
+    with trusting():
         yield built_ladders
 
 
@@ -38,5 +38,5 @@ def small_ladders(tmp_path: Path) -> Iterator[Path]:
     """What tests that change something need of it: N of 2, one seed, two methods, the oracle; not evaluated."""
     folder = tmp_path / "small"
     write_run(folder, numbers=(2,), seeds=(0,), methods=("cnn", "dbat"))
-    with trusting(DOMAIN.name):
+    with trusting():
         yield folder

@@ -79,7 +79,7 @@ class Engine:
 def trusted():
     """The data name ladder_run:DOMAIN, code that the user must allow; here it has layouts, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HYPOGOAL_TRUST", "ladder_run:DOMAIN")
+        patch.setenv("HYPOGOAL_TRUST", "1")
         patch.setattr(LadderDomain, "make_engine", lambda self, *given, **more: Engine())
         patch.setattr(LadderDomain, "rooms_of", lambda self, start: (2, 6))
         yield

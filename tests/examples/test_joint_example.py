@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load_own
+from hypogoal.core.own_code import load
 from hypogoal.domains.rooms.states import FACTORS, crossed_states, labelled_states, unlabelled_states
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
@@ -33,8 +33,8 @@ TAUGHT = EnsembleConfig(
 def joint(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The example, with few starts."""
     monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
-    monkeypatch.setenv("HYPOGOAL_TRUST", "joint:independent,joint:teach")
-    load_own("joint:teach", "teacher", "", {})
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+    load("joint:teach", "teacher", "", {})
     example = sys.modules["joint"]
     monkeypatch.setattr(example, "RESTARTS", 8)
     return example

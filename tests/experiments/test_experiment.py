@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command_line import refuses, run
+from command_line import run
 
 from hypogoal.core import own_code
 from hypogoal.core.config import describe
@@ -37,8 +37,8 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, *assignments
     (tmp_path / f"{name}.py").write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    with own_code.given(f"{name}:members"):
-        return plan(f"{name}:members", OUT, assignments=assignments)
+    own_code.allow([f"{name}:members"])
+    return plan(f"{name}:members", OUT, assignments=assignments)
 
 
 def test_a_generator_of_names_and_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,15 +100,12 @@ def test_what_its_settings_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_function_is_the_users_word_only_if_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6, G2: a name on the command line is; in a process that runs a file's command it is not."""
+    """Spec B6, G2: a name on the command line is."""
     (tmp_path / "typed.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     words = ["sweep", "typed:members", "--out", "out", "--set", "sizes=2", "--dry-run"]
     with pytest.raises(UserError, match="a file names code of its own as its experiment"):
         load_experiment("typed:members")
-    monkeypatch.setenv(own_code.OF_FILE, "1")
-    refuses("Do you trust it?", *words)
-    monkeypatch.delenv(own_code.OF_FILE)
     assert "hypogoal train-ensemble out/data.h5 --members 2 --out out/ensemble/size-2\n" in run(*words).out
     assert "--out runs/members/data.h5\n" in run("run", "typed:members", "--dry-run").out
 
@@ -149,5 +146,5 @@ def test_the_examples_are_experiments(monkeypatch: pytest.MonkeyPatch, name: str
     """The functions in examples/."""
     monkeypatch.chdir(ROOT)
     monkeypatch.syspath_prepend(str(ROOT))
-    with own_code.given(f"examples.{name}:{name}"):
-        assert len(plan(f"examples.{name}:{name}", OUT).cells) == count
+    own_code.allow([f"examples.{name}:{name}"])
+    assert len(plan(f"examples.{name}:{name}", OUT).cells) == count

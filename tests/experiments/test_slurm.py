@@ -76,8 +76,8 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     plan, out = some_plan(), tmp_path / "a run"
     asked = Options("long", "4:00:00", "2G", 1, 0, 7, 90, ("--account=x",))
-    with own_code.given("mine:net"):
-        jobs = submit(plan, out, plan.cells, asked)
+    own_code.allow(["network=mine:net"])
+    jobs = submit(plan, out, plan.cells, asked)
     assert [job["name"] for job in jobs] == [
         *("00-collect", "00-train-baseline", "01-train-ensemble", "02-evaluate", "gather")
     ]
@@ -94,7 +94,7 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         "#SBATCH --requeue",
         "#SBATCH --account=x",
         "set -- e-0 e-1 e-2",
-        "export HYPOGOAL_TRUST=mine:net",
+        "export HYPOGOAL_TRUST=1",
         f"exec {sys.executable} -P -m hypogoal sweep --out '{out}' --cell \"$1\"",
     ):
         assert f"\n{line}\n" in script, line

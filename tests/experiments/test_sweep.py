@@ -186,7 +186,7 @@ DOMAIN = CorridorDomain()
 def test_a_cell_is_done_when_its_output_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2: own code that leaves with 0 has made nothing: neither at first, nor in a job, nor made again."""
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT / 'tests'}")
-    monkeypatch.setenv("HYPOGOAL_TRUST", "leaver:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     (tmp_path / "leaver.py").write_text(LEAVER)
     toml, out = tmp_path / "own.toml", tmp_path / "out"
     toml.write_text('format = 1\nevaluate = false\ncells = [{ name = "data", command = "collect leaver:DOMAIN" }]')

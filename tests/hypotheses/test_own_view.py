@@ -27,7 +27,7 @@ AS_THEY_ARE = torch.nn.Sequential(torch.nn.Flatten())  # a network whose outputs
 
 @pytest.fixture(autouse=True)
 def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYPOGOAL_TRUST", "own_view:Moved,own_view:Wrong,own_view:OfNumbers,own_view:Settings")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
 
 
 def test_it_learns_and_comes_back_from_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

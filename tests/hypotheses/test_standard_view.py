@@ -102,7 +102,7 @@ def reader(channels: int) -> nn.Module:
 def test_numbers_may_have_an_encoder(shape: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec C5, F2: any module; stored, read, asked at once, and explained."""
     settings = {"network": "test_standard_view:reader"}
-    monkeypatch.setenv("HYPOGOAL_TRUST", settings["network"])
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     ensemble, (seen, labels) = trained(shape, learning_rate=0.01, **settings), states(200, 3, shape)
     assert ((ensemble.predictions(seen) == labels[:, None]).mean(0) > 0.8).all()
     write_ensemble(tmp_path, "up", ensemble)

@@ -245,7 +245,7 @@ def test_a_step_is_that_of_the_plain_loop(unlabelled_bn: bool) -> None:
 
 def test_thresholds_are_set_after_training(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the paper: a number, the split of unlabelled states, a function of one's own; probabilities stay."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", "own_view:lowest,own_view:too_many")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     observations, labels, unlabelled = toy()
     config = dataclasses.replace(TOY, steps=20)
     plain = fit(observations, labels, unlabelled, config, seed=0)
@@ -302,7 +302,7 @@ def test_a_split_of_states_that_are_all_alike() -> None:
 @pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
 def test_layers_that_draw_are_repeatable(schedule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec C5, G1: Dropout in a network of one's own: same seed, same bytes, whoever drew before."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", "test_broken_training:dropping")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     observations, labels, unlabelled = toy()
     config = dataclasses.replace(TOY, steps=6, network="test_broken_training:dropping", schedule=schedule)
     first = fit(observations, labels, unlabelled, config, seed=3).state()

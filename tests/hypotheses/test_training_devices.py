@@ -30,7 +30,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """Spec C, G1: images without repeated patches, which only the CPU looks for: the same bytes."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", "own_view:Moved")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     rng = np.random.default_rng(0)
     images = rng.integers(256, size=(90, *SHAPE), dtype=np.uint8)
     labels = np.arange(60) < 20

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from corridor import Corridor
 
-from hypogoal.domains.base import Step, step_of
+from hypogoal.domains.base import Step
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.options.tables import Episodes
 
@@ -40,7 +40,7 @@ def test_steps_of_before_are_steps() -> None:
 
     engine, episodes = Old(1), EpisodeRecorder(1)
     for _ in range(3):
-        episodes.see(step_of(engine, np.array([1])))
+        episodes.see(engine.step(np.array([1])))
     assert episodes == [(3, 3, 1.0, 1, 1)]
 
 

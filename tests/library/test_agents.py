@@ -47,7 +47,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("runs") / "corridor"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))
-        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+        patch.setenv("HYPOGOAL_TRUST", "1")
         layouts = settings("steps=200", "heldout_seeds=4,5")
         run("collect", "corridor_env:DOMAIN", "--out", made / "data.h5", "-q", *layouts)
         few = settings("steps=100", f"members={MEMBERS}", "workers=1", "learning_rate=1e-3")
@@ -167,7 +167,7 @@ def test_options_end_by_the_rule_they_were_trained_with(made: Path) -> None:
     out, meta = made / "patient", made / "patient-meta"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))
-        patch.setenv("HYPOGOAL_TRUST", f"corridor_env:DOMAIN,{__name__}:Falling")
+        patch.setenv("HYPOGOAL_TRUST", "1")
         sure = settings("steps=100", f"members={MEMBERS}", "workers=1", "threshold=0.9")
         ensemble = str(made / "sure")
         run("train-ensemble", made / "data.h5", "--out", ensemble, "-q", *sure)
@@ -275,7 +275,7 @@ def test_pictures_without_an_axis_of_colours(tmp_path: Path) -> None:
     """Spec B6, E1: of an environment with observations (H, W) the networks are (H, W, 1), its wrappers take (H, W)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))
-        patch.setenv("HYPOGOAL_TRUST", "corridor_env:GREY")
+        patch.setenv("HYPOGOAL_TRUST", "1")
         few = settings("steps=60", "heldout_seeds=4,5", "unlabelled_seeds=1")
         run("collect", "corridor_env:GREY", "--out", tmp_path / "data.h5", "-q", *few)
         few = settings("steps=2", f"members={MEMBERS}", "workers=1")

@@ -15,7 +15,6 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import TRUST
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.learners.baselines.settings import BaselineConfig
@@ -67,7 +66,7 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
 @pytest.fixture(autouse=True)
 def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The manifests here name this module's domain."""
-    monkeypatch.setenv(TRUST, DOMAIN.name)
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
 
 
 @pytest.fixture(scope="module")

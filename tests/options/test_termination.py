@@ -145,7 +145,7 @@ class AtLeast(Terminations):
 def test_rules_are_read_from_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec H4: one's own have a number behind the name, or none."""
     own = f"{__name__}:AtLeast"
-    monkeypatch.setenv("HYPOGOAL_TRUST", f"{own},{__name__}:Terminations")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     assert [rule_of(text) for text in ("learned", f"{own}:3")] == [(Terminations, 0), (AtLeast, 3)]
     assert rule_of(f"{__name__}:Terminations") == (Terminations, 0)
     for text in ("patience", "learned:3", "single", "", own, f"{own}:0", f"{__name__}:Terminations:3"):

@@ -20,7 +20,6 @@ from toy_data import files_of, reseal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints, State
-from hypogoal.core.own_code import OF_FILE
 from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS, lines_of
 from hypogoal.hypotheses.ensemble import read_ensemble
@@ -243,10 +242,3 @@ DOOR = "--domain doorkey --sub-goal go-to-goal"
 def test_mistakes(words: str, told: str, ensemble: Path, tmp_path: Path) -> None:
     """Spec G2: one line that says what to do."""
     refuses(told, "audit", *words.format(ensemble=ensemble).split(), "--out", tmp_path / "out" / "audit", "-q")
-
-
-def test_a_files_word_is_not_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec H8: a classifier that a sweep's file names is loaded only where the user allowed it."""
-    monkeypatch.setenv(OF_FILE, "1")
-    words = ["--domain", "doorkey", "--sub-goal", "go-to-goal", "--out", str(tmp_path / "audit"), "-q"]
-    refuses("a file names code of its own as its classifier", "audit", f"{__name__}:left_end", *words)

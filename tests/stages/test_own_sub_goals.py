@@ -72,7 +72,7 @@ def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
 ) -> None:
     """Spec A5, F6: of a domain of one's own, the place where the sub-goal's function belongs; added, it is matched."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
-    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     env, rng = CorridorEnv(), np.random.default_rng(0)
     pictures = {}
     for seed in range(8):

@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 from hypogoal.core.drafts import unfinished
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import environment_of_children
+from hypogoal.core.own_code import environment
 from hypogoal.core.workers import CORES, PYTHON, die_with_parent
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import Record, begun, last_line, log_of, open_log, read_record, write_record
@@ -74,7 +74,7 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False, check: 
             stdout=log,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
-            env={**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores), **environment_of_children()},
+            env={**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores), **environment()},
             preexec_fn=_follow(os.getpid()) if os.name == "posix" else None,
         )
     except BaseException:

@@ -25,7 +25,7 @@ from hypogoal.core import checkpoints
 from hypogoal.core.drafts import draft_folder
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text
-from hypogoal.core.own_code import TRUST, environment_of_children
+from hypogoal.core.own_code import environment
 from hypogoal.core.schemas import is_list, is_object, is_text
 from hypogoal.core.terminal import say
 from hypogoal.core.workers import PYTHON
@@ -149,7 +149,7 @@ def _script(array: Array, run: Path, options: Options) -> str:
             "trap '' USR2  # until the program listens: the warning must not end it",
             f"set -- {shlex.join(cell.name for cell in array.cells)}",
             'shift "$SLURM_ARRAY_TASK_ID"',
-            f"export {TRUST}={shlex.quote(environment_of_children()[TRUST])}",
+            *(f"export {name}={value}" for name, value in environment().items()),
             f'{last} --cell "$1"',
         ]
     else:

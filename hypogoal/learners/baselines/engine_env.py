@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from hypogoal.domains.base import Engine, step_of
+from hypogoal.domains.base import Engine, check_step
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
 
@@ -32,6 +32,7 @@ class EngineEnv(VecEnv):
         super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
         self.episodes = EpisodeRecorder(engine.count)
         self._actions = np.zeros(engine.count, dtype=np.int64)
+        self._checked = False  # the engine's first step
 
     def _observe(self, ids: NDArray[np.int64]) -> Observations:
         if self.tiles is not None:
@@ -51,7 +52,10 @@ class EngineEnv(VecEnv):
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step every environment; where an episode ended, the observation is that of the next one's start."""
-        step = step_of(self.engine, self._actions)
+        step = self.engine.step(self._actions)
+        if not self._checked:
+            check_step(self.engine, step)
+            self._checked = True
         self.episodes.see(step)
         done = step.terminated | step.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
