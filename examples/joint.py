@@ -5,8 +5,8 @@ r"""A teacher: linear classifiers of small patterns, one for each member, search
         --set teacher=joint:independent
     hypogoal evaluate runs/joint --trust
 
-``hypogoal run rooms --set methods=joint --trust`` does so for ten seeds, and trains agents that choose among the members'
-options.
+``hypogoal run rooms --set methods=joint --trust`` does so for ten seeds, and trains agents that choose among the
+members' options.
 
 Networks that a diversity objective drives apart learn mixtures of features, which fit the labels and differ as well.
 Linear classifiers of simple patterns, *proposals*, are cheap enough to search for whole sets, from many starts: the set
