@@ -18,7 +18,7 @@ from hypogoal.core import drafts
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.core.terminal import printable, say
+from hypogoal.core.terminal import say
 from hypogoal.domains.base import BUILT_IN, REGISTERED, Domain, load_domain
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
@@ -49,7 +49,7 @@ class Made:
 
     def __repr__(self) -> str:
         summary = describe_path(self.path)
-        return "\n".join(map(printable, [lines(summary)[0], *outcome(summary["kind"], self.path)]))
+        return "\n".join([lines(summary)[0], *outcome(summary["kind"], self.path)])
 
     def _repr_html_(self) -> str:
         return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'

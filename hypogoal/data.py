@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import FORMULA, NO_FILE_NAME, path_part, plain_name, plain_names, replacing
+from hypogoal.core.files import NO_FILE_NAME, path_part, plain_name, plain_names, replacing
 from hypogoal.core.terminal import amount
 from hypogoal.observations import (
     NUMBERS,
@@ -134,7 +134,7 @@ def require_names(sub_goals: Sequence[str]) -> None:
         raise UserError("there are no sub-goals", None, "Give at least one, with a name.")
     for name in sub_goals:
         if not plain_name(name):
-            do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, dot or space first or last, any of {FORMULA} first."
+            do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, dot or space first or last."
             raise UserError("a sub-goal's name must be usable as a file name", repr(name), do)
     if not plain_names(sub_goals):
         do = "Give them different names; some file systems ignore case."

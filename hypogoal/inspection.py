@@ -24,7 +24,7 @@ from hypogoal.core.artefacts import (
     open_artefact,
 )
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
+from hypogoal.core.files import json_lines, read_end, read_json, read_text, replacing, visible
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.core.own_code import command
 from hypogoal.core.tensors import load_tensors
@@ -235,7 +235,7 @@ def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:
     path = artefact.path
     yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
     for entry in artefact.manifest["inputs"]:
-        if not lies_in(folder, artefact.path / entry["relative"]):
+        if not (artefact.path / entry["relative"]).resolve().is_relative_to(folder.resolve()):
             yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not checked"
 
 
@@ -257,7 +257,7 @@ def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
                 bad.add(name)
                 yield fault
     for entry in artefact.manifest["inputs"]:
-        within = lies_in(folder, artefact.path / entry["relative"])
+        within = (artefact.path / entry["relative"]).resolve().is_relative_to(folder.resolve())
         if within and (fault := find_input(artefact.path, entry, beside=True)[1]):
             yield f"its input {entry['path']} ({entry['kind']}) is {fault}"
     if artefact.kind == "ensemble":  # last, since its files may be missing

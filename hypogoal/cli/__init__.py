@@ -4,6 +4,7 @@ Spec A1-A8. Heavy imports are inside the commands, so that ``hypogoal --help`` i
 """
 
 import functools
+import os
 import signal
 import sys
 from dataclasses import fields
@@ -16,7 +17,7 @@ from hypogoal.cli import stages, sweep, inspect, own_data  # isort: skip  # so -
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core import own_code, stopping
 from hypogoal.core.errors import Complete, printable
-from hypogoal.core.terminal import Unprinted, give, open_streams, say
+from hypogoal.core.terminal import say
 from hypogoal.settings import CONFIGS, TABLES
 
 __all__ = ["app", "inspect", "main", "own_data", "stages", "sweep"]
@@ -44,7 +45,6 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments is None:
         signal.signal(signal.SIGTERM, stopping.stop)  # a cancelled job, too, leaves nothing half-written
         sys.unraisablehook = stopping.unraised
-        open_streams()
     words = sys.argv[1:] if arguments is None else arguments
     own_code.allow(words)
     debug = "--debug" in words
@@ -53,9 +53,9 @@ def main(arguments: list[str] | None = None) -> int:
         if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in the background
             signal.signal(signal.SIGINT, stopping.stop)
         return _called(words)
-    except Unprinted as error:
-        # Not 0, since the output was not received; not 2, since the command was right.
-        return _fail(f"the output is complete, but could not be printed ({error.strerror})", 1)
+    except BrokenPipeError:  # whoever read what was printed, such as head, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its exit
+        return 1
     except (Interrupted, KeyboardInterrupt) as stop:  # KeyboardInterrupt: before a command was reached
         if arguments is None:
             for number in stopping.SIGNALS:  # all is cleaned up: a further signal may end the process at once
@@ -96,7 +96,7 @@ def _called(words: list[str]) -> int:
         code: object = _commands()(args=words, standalone_mode=False, prog_name="hypogoal")
     except Complete as complete:
         say(complete, err=True)
-        give(complete.path)
+        say(complete.path)
         return 0
     return code if isinstance(code, int) else 0
 

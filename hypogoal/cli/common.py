@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 from hypogoal.core.config import parse_assignments
 from hypogoal.core.files import MOST_INTEGER
-from hypogoal.core.terminal import give, say
+from hypogoal.core.terminal import say
 from hypogoal.settings import CONFIGS, TABLES, configuration, options_of
 from hypogoal.stages import make
 
@@ -155,7 +155,7 @@ class StageCall:
         """Print the result, the next command and the output's path."""
         print_outcome(numbers, self.how["quiet"])
         print_next(self.how["quiet"], *then)
-        give(self.out)
+        say(self.out)
 
 
 def stage(panel: str, name: str, example: str) -> Callable[[Callable[..., None]], None]:
@@ -203,7 +203,7 @@ def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
     """Print the results of training. NaN (no episode has ended) is left out: the number of episodes says it too."""
     if numbers and not quiet:
         texts = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in numbers.items()}
-        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"), wrap=True)
+        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"))
 
 
 def print_next(quiet: bool, *words: object) -> None:
@@ -216,7 +216,7 @@ def print_next(quiet: bool, *words: object) -> None:
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:
     if as_json:
-        give(json.dumps(value, indent=1))
+        say(json.dumps(value, indent=1))
     else:
         for line in text:
             say(line)

@@ -14,7 +14,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.config import DOMAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.core.terminal import draw, give, say
+from hypogoal.core.terminal import draw, say
 from hypogoal.settings import CONFIGS, OFTEN, TABLES, described, preset_text
 
 Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
@@ -41,7 +41,7 @@ def show(
     cli.echo(shown, as_json, lines({key: value for key, value in details.items() if key != "counts"}))
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
-            give(sheet, err=as_json)
+            say(sheet, err=as_json)
 
 
 @cli.command(cli.LOOK, "verify runs/mine")
@@ -102,10 +102,10 @@ def config(
         if write.exists() or write.suffix != ".toml":
             raise UserError("a preset needs a new .toml file", write, "Choose another name.")
         replace_text(write, preset_text(stage, rows))
-        give(write)
+        say(write)
         return
     if as_json:
-        give(json.dumps(rows, indent=1))
+        say(json.dumps(rows, indent=1))
         return
     width, often = min(shutil.get_terminal_size().columns, 100), OFTEN.get(stage, ())
     parts = [(part.__doc__ or "").partition(".")[0] for part in config_class.__mro__]

@@ -12,7 +12,7 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
-from hypogoal.core.terminal import give, say
+from hypogoal.core.terminal import say
 from hypogoal.settings import configuration
 
 LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
@@ -66,7 +66,7 @@ def import_(
     _print_observations(out, bool(longest), quiet)
     cli.print_counts(counts, quiet)
     cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
-    give(out)
+    say(out)
 
 
 def _print_observations(data: Path, resized: bool, quiet: bool) -> None:
@@ -103,7 +103,7 @@ def export(
     line = written(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
     if line and not quiet:
         say(line)
-    give(out)
+    say(out)
 
 
 @cli.command(cli.OWN, "check mine:DOMAIN")

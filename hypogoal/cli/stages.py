@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
-from hypogoal.core.terminal import draw, give, say
+from hypogoal.core.terminal import draw, say
 from hypogoal.settings import configuration
 from hypogoal.stages import domain_of, inherited_of
 
@@ -149,7 +149,7 @@ def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, memb
         more = data.with_name(f"{data.stem}-more.h5")
         say(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
         cli.print_next(False, "import", data, "--label", f"{goals[0]}={table}", "--out", more)
-    give(call.out / "index.html")
+    say(call.out / "index.html")
 
 
 @cli.command(cli.MAKE, "evaluate runs/mine")
@@ -172,7 +172,7 @@ def evaluate(
     if not quiet:
         draw(summary_table(metrics), 100)
     cli.print_next(quiet, *(["report", run] if out == run / "evaluation" else ["show", out]))
-    give(out)
+    say(out)
 
 
 @cli.command(cli.MAKE, "report runs/mine --videos 3")
@@ -197,7 +197,7 @@ def report(
         raise UserError(f"{option} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
         try:
-            give(drawn(run, videos=videos, force=force, resume=resume))
+            say(drawn(run, videos=videos, force=force, resume=resume))
         except Complete:
             raise Complete(run / "report" / "index.html") from None
         return
@@ -205,7 +205,7 @@ def report(
     for line in missing:
         say(line, err=True)
     for path in written:
-        give(path)
+        say(path)
 
 
 @cli.command(cli.LOOK, "compare runs/mine runs/other --out runs/both")
@@ -222,6 +222,6 @@ def compare(
         place = out or Path(folder, "comparison")
         page = compared(runs, place, force=force)
         for line in outcome("comparison", place):
-            say(line, wrap=True)
+            say(line)
     if out is not None:
-        give(page)
+        say(page)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.cli import common as cli
-from hypogoal.core.terminal import amount, draw, give, say
+from hypogoal.core.terminal import amount, draw, say
 
 KNOWN = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: "
@@ -55,10 +55,10 @@ def run(
     stage(planned, out, force=force, resume=resume, quiet=quiet, only=chosen)
     metrics = out / "evaluation" / "metrics.json"
     if chosen or not metrics.is_file():
-        give(out / "results.csv")
+        say(out / "results.csv")
         return
     draw(summary_of(numbers_of(out) or {}, metrics), 100)
-    give(out / "report" / "index.html")
+    say(out / "report" / "index.html")
 
 
 @cli.command(cli.MANY, "sweep figure3 --out runs/figure3 --seeds 0-2 --dry-run")
@@ -126,7 +126,7 @@ def sweep(
     from hypogoal.stages import sweep as stage
 
     if gather:
-        give(stage.gather(out))
+        say(stage.gather(out))
         return
     if experiment is None:
         raise UserError("which experiment?", "sweep", "Which there are: hypogoal sweep --help")
@@ -140,13 +140,13 @@ def sweep(
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
         go_on = stage.AGAIN if not planned.anew else "give it without --from and --only to go on"
-        give(stage.sweep(planned, out, quiet=quiet, go_on=go_on, only=chosen))
+        say(stage.sweep(planned, out, quiet=quiet, go_on=go_on, only=chosen))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
     jobs = stage.submit(planned, out, options, quiet=quiet, only=chosen)
     for job in jobs:
         say(f"job {job['id']}: {job['name']}, {amount(max(1, len(job['cells'])), 'cell')}", err=True)
-    give(out)
+    say(out)
 
 
 def _folder_of(experiment: str) -> Path:

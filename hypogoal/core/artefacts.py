@@ -18,12 +18,11 @@ from typing import Any, Self
 from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MAX_NAME_BYTES, inside, is_hole, open_file, read_json, visible
+from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json, visible
 from hypogoal.core.manifests import (
     AGAIN,
     FORMAT_VERSION,
     MANIFEST,
-    MAX_MANIFEST_BYTES,
     TOOK,
     check_writable,
     digest_of,
@@ -101,12 +100,8 @@ def sha256_of(path: Path) -> str:
     """The sha256 of a regular file as hexadecimal digits, read up to its size when opened; else a ``UserError``."""
     digest = hashlib.sha256()
     with open_file(path, THE_FILE, AGAIN) as file:
-        if is_hole(file):
-            raise UserError(f"{THE_FILE} nearly all hole", path, AGAIN)
-        left = os.fstat(file.fileno()).st_size
-        while piece := file.read(min(left, PIECE)):
+        while piece := file.read(PIECE):
             digest.update(piece)
-            left -= len(piece)
     return digest.hexdigest()
 
 
@@ -173,7 +168,7 @@ def begins_as(path: Path, kind: str, do: str = AWAY) -> bool:
 def _manifest_kind(folder: Path) -> str:
     """The kind in a manifest, whatever else is wrong with it; empty if it cannot be read."""
     with contextlib.suppress(UserError):
-        manifest = read_json(folder / MANIFEST, "the manifest is", "", MAX_MANIFEST_BYTES)
+        manifest = read_json(folder / MANIFEST, "the manifest is", "")
         if isinstance(manifest, dict) and "format" in manifest and isinstance(manifest.get("kind"), str):
             return str(manifest["kind"])
     return ""

@@ -21,7 +21,6 @@ from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
 from hypogoal.core.own_code import command
 
 T = TypeVar("T")
-MAX_PRESET_BYTES = 2**20
 MAX_RANGE = 10_000  # integers that one range may stand for
 DOMAIN = "doorkey"  # its presets and defaults hold if no domain is named
 
@@ -62,7 +61,7 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
     if name.endswith(".toml"):
         if not Path(name).exists():
             raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(available)}.")
-        text = read_text(Path(name), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
+        text = read_text(Path(name), "the preset is", "Give a .toml file.")
     elif name in available:
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     else:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import path_part, require_file
+from hypogoal.core.files import open_file, path_part
 
 FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # all of them built into h5py
 MOST_RATIO = 1032  # bytes from one compressed byte: deflate's limit, the highest of these filters
@@ -34,7 +34,7 @@ def open_hdf5(path: Path, subject: str, do: str) -> Iterator[Any]:
     """
     import h5py
 
-    require_file(path, f"{subject} is", do)
+    open_file(path, f"{subject} is", do).close()
     try:
         opened = h5py.File(path, "r", locking="best-effort")
     except (OSError, ValueError, RuntimeError, KeyError) as error:

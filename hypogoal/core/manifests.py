@@ -26,7 +26,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
     One that is not JSON, malformed, of another format or changed since it was written is a ``UserError``.
     """
-    data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
+    data = read_bytes(path, "the manifest is", AGAIN)
     manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
     if not isinstance(manifest, dict):
         raise UserError("the manifest is not a JSON object", path, AGAIN)
@@ -53,7 +53,7 @@ def sealed(manifest: Mapping[str, Any]) -> bytes:
 
 def digest_of(path: Path) -> str:
     """The sha256 of a manifest's text without ``took``, by which artefacts know their inputs."""
-    data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
+    data = read_bytes(path, "the manifest is", AGAIN)
     manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
     if isinstance(manifest, dict) and TOOK in manifest:
         data = sealed({key: value for key, value in manifest.items() if key != TOOK})

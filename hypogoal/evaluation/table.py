@@ -7,7 +7,6 @@ a table over runs, ``compared`` into pairs of runs, ``wide`` into the entries of
 import csv
 import io
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -18,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import FORMULA, read_text
+from hypogoal.core.files import read_text
 from hypogoal.evaluation.numbers import by_groups, grouped, method_rank, over, pairs
-from hypogoal.options.tables import AGAIN, MAX_TABLE_BYTES
+from hypogoal.options.tables import AGAIN
 
-HARMLESS = re.compile(rf"(^|[,;\"])'(?=\s*[{re.escape(FORMULA)}])")  # what ``write_table`` puts before a formula
 BEST, WORST, VALIDATED = "best_member", "worst_member", "validated_member"  # quantities: which member it is
 MEMBERS: Mapping[str, Callable[[Any], Any]] = {"best": np.max, "mean": np.mean, "worst": np.min}
 Entry = dict[str, Any]
@@ -103,7 +101,7 @@ def defined(rows: Iterable[Row]) -> Iterator[Row]:
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of ``numbers.csv``; a ``UserError`` where it is missing or damaged."""
-    text = read_text(path, "the table of numbers is", AGAIN, MAX_TABLE_BYTES)
+    text = read_text(path, "the table of numbers is", AGAIN)
     try:
         lines = list(csv.DictReader(io.StringIO(text, newline="")))
         return [Row(**{name: _field(name, line[name]) for name in Row._fields}) for line in lines]
@@ -117,7 +115,7 @@ def _field(name: str, text: str) -> Any:
     if name == "N":
         return int(text) if text else None
     whole = name in ("member", "layout", "seed", "step") and text.lstrip("-").isdecimal()
-    return int(text) if whole else HARMLESS.sub(r"\1", text)
+    return int(text) if whole else text
 
 
 def select(rows: Iterable[Row], **fields: Any) -> list[Row]:

@@ -9,7 +9,7 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import MAX_PRESET_BYTES, parse_integers, setting
+from hypogoal.core.config import parse_integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, read_text
 from hypogoal.core.own_code import names_in, require_trust
@@ -28,7 +28,7 @@ Point = Mapping[str, Value]
 
 def read_toml(path: Path) -> Experiment:
     """The experiment in a TOML file; a ``UserError`` where there is none."""
-    text = read_text(path, "the experiment is", "Give a .toml file.", MAX_PRESET_BYTES)
+    text = read_text(path, "the experiment is", "Give a .toml file.")
     table = parse_toml(text, path, "the experiment is", MEND)
     _check_keys(table, KEYS, path)
     if table.get("format") != FORMAT_VERSION:

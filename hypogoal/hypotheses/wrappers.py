@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 import os
 from pathlib import Path
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
@@ -57,7 +56,8 @@ class SubgoalReward:
 
     def __init__(self, source: str | os.PathLike[str] | Ensemble, sub_goal: str = "", by: By = "vote"):
         ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
-        rule = by if isinstance(by, str) else operator.index(by)
+        member = isinstance(by, int | np.integer) and not isinstance(by, bool)
+        rule = by if isinstance(by, str) else int(by) if member else None
         if rule not in RULES and rule not in range(len(ensemble)):
             do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
             raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)

@@ -19,7 +19,6 @@ from hypogoal.core.files import read_text, write_table
 from hypogoal.learners.episodes import LAST
 
 AGAIN = "Evaluate the run again."
-MAX_TABLE_BYTES = 2**30
 MAX_INTEGER = 2**53  # integers that a float holds exactly
 MAX_OPTIONS = 2**16
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
@@ -139,7 +138,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, ND
     ``columns`` are required, None for all that the file has. A file that is missing, too large, no table, or has other
     cells than finite numbers of at most 2^53 (or, in a ``BLANK`` column, nothing) is a ``UserError``.
     """
-    text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
+    text = read_text(path, "the table is", AGAIN)
     try:
         reader = csv.DictReader(io.StringIO(text, newline=""))
         header = list(reader.fieldnames or ())

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import open_file, require_file
+from hypogoal.core.files import open_file
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.observations import PICTURE
 from hypogoal.own_data.arrays import DAMAGED
@@ -78,7 +78,7 @@ def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
     import PIL.Image
     import PIL.ImageOps
 
-    require_file(file, "the image is", DO)
+    open_file(file, "the image is", DO).close()
     try:
         if file.suffix == ARRAY:
             values = np.load(file, mmap_mode="r", allow_pickle=False)

@@ -21,15 +21,13 @@ from hypogoal.observations import NUMBERS, digest
 # :func:`hypogoal.observations.digest`, how much members disagree.
 COLUMNS = ("name", "label", "row", "digest", "disagreement")
 REQUIRED = ("label", "row", "digest")
-MOST_BYTES = 1 << 26
 PLACE = re.compile(r"[0-9]{1,12}")
-BYTE_ORDER = "\ufeff"  # with which spreadsheets begin a table
 DO = "Give a table from 'audit', with 1 or 0 as labels."
 
 
 def read_marks(path: Path) -> list[dict[str, str]]:
     """The rows of a table; one that is missing or damaged is a ``UserError``."""
-    text = read_text(path, "the table of labels is", DO, MOST_BYTES).removeprefix(BYTE_ORDER)
+    text = read_text(path, "the table of labels is", DO)
     try:
         reader = csv.DictReader(text.splitlines())
         if not set(REQUIRED) <= set(reader.fieldnames or ()):

@@ -18,7 +18,6 @@ from hypogoal.core.files import read_text
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.observations import shrunk_picture
 from hypogoal.observations import Fields, Observations, mixed_type
-from hypogoal.own_data.marks import BYTE_ORDER
 from hypogoal.own_data.parts import Parts
 
 SPLIT = (0.4, 0.4, 0.2)  # shares of episodes that are labelled, unlabelled and held out
@@ -145,7 +144,7 @@ def _marks(recording: Recording, rule: str) -> dict[int, NDArray[np.bool_]]:
 
 def _listed(recording: Recording, table: Path) -> dict[int, NDArray[np.bool_]]:
     """Positive frames by a table: of each row those from ``from`` up to, not including, ``to``."""
-    text = read_text(table, "the table of labels is", "Give a CSV file.").removeprefix(BYTE_ORDER)
+    text = read_text(table, "the table of labels is", "Give a CSV file.")
     try:
         reader = csv.DictReader(io.StringIO(text))
         rows, names = list(reader), reader.fieldnames or ()

@@ -52,12 +52,12 @@ def collect(
     if identity["domain"] not in BUILT_IN:
         warnings = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
         for line in warnings + hard_to_judge(collected.heldout.labels, collected.sub_goals):
-            say(f"hypogoal: {line}", err=True, wrap=True)
+            say(f"hypogoal: {line}", err=True)
         if "step" in collected.labelled.origins and "option_timeout" not in domain.defaults.get("train-options", {}):
             soonest = (collected.labelled.origins["step"][held].min() for held in collected.labelled.labels.T)
             apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
             if 2 * apart > OptionConfig.option_timeout and not quiet:
                 message = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
                 do = f"train-options --option-timeout {2 * apart} gives options time for that"
-                say(f"hypogoal: {message}: {do}", err=True, wrap=True)
+                say(f"hypogoal: {message}: {do}", err=True)
     return open_dataset(out).counts()

@@ -8,7 +8,7 @@ from hypogoal.core.artefacts import DATA, begins_as, claim
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.core.seeding import torch_generator
-from hypogoal.core.terminal import printable, say
+from hypogoal.core.terminal import say
 from hypogoal.data import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays
@@ -73,7 +73,7 @@ def import_data(
     warned += _too_small(domain, collected)
     for line in warned:
         say(f"hypogoal: {line}", err=True)
-    config: dict[str, Any] = {"source": printable(source.name)}
+    config: dict[str, Any] = {"source": source.name}
     config |= ({"labels": dict(rules)} if rules else {}) | ({"resize": resize} if resize else {})
     config |= {"every": every} if every > 1 else {}
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
@@ -88,7 +88,7 @@ def _marked(source: Path, out: Path, rules: Mapping[str, str], *, seed: int, for
     [(sub_goal, table)] = rules.items()
     collected, count = with_marks(dataset, Path(table), sub_goal)
     if not len(collected.unlabelled.labels):
-        line = f"no unlabelled state is left in {printable(out.name)}: members cannot be made to differ"
+        line = f"no unlabelled state is left in {out.name}: members cannot be made to differ"
         do = "Leave some without a label, train with --unlabelled OTHER.h5, or with --set diversity=none"
         say(f"hypogoal: {line}. {do}.", err=True)
     config = dataset.config | {"marked": dataset.config.get("marked", 0) + count}

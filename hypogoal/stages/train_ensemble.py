@@ -112,7 +112,7 @@ def steps_of(config: TrainEnsembleConfig) -> int:
 
 def steps_in(logs: Sequence[Path]) -> int:
     """How many steps of all sub-goals are in the logs that their processes are writing."""
-    return sum(next((line.get("step", 0) for line in json_lines(reversed(read_end(log, 400)))), 0) for log in logs)
+    return sum(next((line.get("step", 0) for line in json_lines(reversed(read_end(log)))), 0) for log in logs)
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:

@@ -357,11 +357,13 @@ def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: py
     """Spec B6: whichever way hypogoal was started."""
     import sys
 
+    from hypogoal.core import own_code
     from hypogoal.domains.base import load_domain
 
     (tmp_path / "domain_lying_here.py").write_text("from corridor_env import DOMAIN\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    own_code.allow(["domain_lying_here:DOMAIN"])
     assert load_domain("domain_lying_here:DOMAIN") is DOMAIN
 
 

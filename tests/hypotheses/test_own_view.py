@@ -132,7 +132,7 @@ def test_pools_of_positives_take_turns(kinds: list[int], each: tuple[int, int]) 
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
-        ({"view": "own_view:Missing"}, "a file names code of its own as its view"),
+        ({"view": "own_view:Missing"}, "the view cannot be loaded: AttributeError"),
         ({"view": "window"}, "unknown view: window"),
         ({"view": "own_view:Settings"}, "this is no view: own_view:Settings"),
         ({"view_settings": ("jiter=3",)}, "the view has no such setting: view.jiter. It has jitter"),

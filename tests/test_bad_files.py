@@ -1,0 +1,116 @@
+"""Files that are missing, cut off, of another kind, newer or no text: one line, exit code 2, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from command_line import fails, refuses, run, settings
+from PIL import Image
+
+from hypogoal.core.manifests import MANIFEST
+
+PICTURE = b"\x89PNG\r\n\x1a\n" + bytes(range(200))
+# File of a run -> the command that reads it.
+READERS = {
+    "data.h5": "train-ensemble {run}/data.h5 --out {out}",
+    "ensemble/manifest.json": "train-options {run}/ensemble --out {out}",
+    "ensemble/left-end.safetensors": "train-options {run}/ensemble --out {out}",
+    "options/options.safetensors": "train-meta {run}/ensemble --options {run}/options --out {out}",
+    "meta/meta.safetensors": "report {run} --force --videos 1",
+    "meta/episodes.csv": "evaluate {run} --out {out}",
+    "meta/choices.csv": "evaluate {run} --out {out}",
+    "meta/layout.json": "evaluate {run} --out {out}",
+    "options-more/visited.h5": "train-ensemble {run}/data.h5 --unlabelled {run}/options-more --out {out}",
+    "evaluation/metrics.json": "report {run} --force",
+    "evaluation/arrays.h5": "report {run} --force",
+    "own/preset.toml": "train-ensemble {run}/data.h5 --preset {run}/own/preset.toml --out {out}",
+    "own/experiment.toml": "run {run}/own/experiment.toml --out {out} --dry-run",
+    "own/arrays.npz": "import {run}/own/arrays.npz --out {out}",
+    "own/labels.csv": "import {run}/data.h5 --label left-end={run}/own/labels.csv --out {out}",
+    "own/pictures/positive/0.png": "import {run}/own/pictures --out {out}",
+}
+TEXTS = (".json", ".csv", ".toml")
+Damage = Callable[[Path], object]
+DAMAGES: dict[str, Damage] = {
+    "missing": Path.unlink,
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "empty": lambda path: path.write_bytes(b""),
+    "of another kind": lambda path: path.write_bytes(PICTURE if path.suffix != ".png" else b"step\n1\n"),
+    "no UTF-8": lambda path: path.write_bytes(b"\xff" + path.read_bytes()),
+}
+# What a cut text may still be, and what is not looked for by its name.
+HARMLESS = {("own/preset.toml", "empty"), ("own/pictures/positive/0.png", "missing"), ("own/preset.toml", "cut off")}
+
+
+@pytest.fixture
+def there(corridor_copy: Path) -> Path:
+    """A run, and beside its stages what people bring of their own."""
+    own = corridor_copy / "own"
+    (own / "pictures" / "positive").mkdir(parents=True)
+    (own / "preset.toml").write_text("[train-ensemble]\nmembers = 2\nsteps = 2\n")
+    (own / "experiment.toml").write_text(
+        'format = 1\nevaluate = false\n[[cells]]\nname = "data"\ncommand = "collect doorkey"\n'
+    )
+    run("export", corridor_copy / "data.h5", "--out", own / "arrays.npz")
+    (own / "labels.csv").write_text("state,label\n0,1\n1,0\n")
+    Image.fromarray(np.zeros((20, 20, 3), np.uint8)).save(own / "pictures" / "positive" / "0.png")
+    return corridor_copy
+
+
+def words_for(name: str, there: Path) -> list[str]:
+    out = there.parent / "out" / "made"
+    out.parent.mkdir(exist_ok=True)
+    return [*READERS[name].format(run=there, out=out).split(), "-q"]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("name", READERS)
+def test_a_bad_file_is_one_line(there: Path, name: str, damage: str) -> None:
+    """Spec A8, G2: which file it is, for the stage that reads it, and for ``verify`` if a manifest knows it."""
+    path = there / name
+    if (name, damage) in HARMLESS or (damage == "no UTF-8" and path.suffix not in TEXTS):
+        pytest.skip("no such case")
+    DAMAGES[damage](path)
+    refuses(path.name if damage != "missing" else "", *words_for(name, there))
+    if path.parent.name != "own" and path.suffix != ".png":
+        assert path.name in fails("verify", path.parent if path.suffix != ".h5" else there).out
+
+
+@pytest.mark.parametrize("name", ["data.h5", "ensemble/manifest.json", "own/experiment.toml"])
+def test_a_newer_file_is_one_line(there: Path, name: str) -> None:
+    """Spec G2: what to do is to upgrade."""
+    path = there / name
+    if path.suffix == ".h5":
+        with h5py.File(path, "a") as file:
+            file.attrs["format"] = 99
+    elif path.name == MANIFEST:
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 99}))
+    else:
+        path.write_text(path.read_text().replace("format = 1", "format = 99"))
+    refuses("format", *words_for(name, there))
+
+
+@pytest.mark.parametrize("name", ["own/preset.toml", "own/experiment.toml", "own/labels.csv"])
+def test_a_byte_order_mark_is_read(there: Path, name: str) -> None:
+    """What some editors put first in a text."""
+    path = there / name
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    run(*words_for(name, there), *(settings("workers=1") if "preset" in name else []))
+
+
+def test_paths_that_do_not_exist_are_said_to_be_missing(tmp_path: Path) -> None:
+    """Not that they are damaged, or no recording."""
+    for words in (
+        "train-ensemble {} --out o",
+        "train-options {} --out o",
+        "import {} --out o",
+        "evaluate {}",
+        "show {}",
+    ):
+        line = refuses("nothing", *words.format(tmp_path / "nothing").split())
+        assert any(text in line for text in ("no such", "missing", "no artefact", "does not exist", "nothing to")), line
