@@ -63,10 +63,11 @@ def refuses(wanted: str, *words: object) -> str:
 
 @contextmanager
 def trusting() -> Iterator[None]:
-    """Within it the user allows the code that files name."""
+    """Within it the user allows the code that files name; behind it nothing was typed that does."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(own_code.VARIABLE, "1")
         yield
+    own_code._allowed.clear()
 
 
 def _called(words: tuple[object, ...]) -> tuple[int, Printed]:

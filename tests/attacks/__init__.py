@@ -1,1 +1,1 @@
-"""The attack kit: kills, limits, hostile and fuzzed files, own code that fails; its long runs are docs/faults.md."""
+"""The attack kit: kills and damaged files; docs/faults.md has what came of its long runs."""

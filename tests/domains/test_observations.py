@@ -5,8 +5,13 @@ from __future__ import annotations
 import random
 import re
 from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
+from math import prod
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from command_line import run, settings
@@ -16,8 +21,8 @@ from test_numbers import Says
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium_engine import reader_of
+from hypogoal.observations import PICTURE
 from hypogoal.own_data.parts import Parts, as_observations, collected_of
-from tests.attacks.observations import DTYPES, drawn_observation, outcome_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"
 TABLE = re.search(r"^\| one observation .*?(?=\n\n)", PAGE.read_text(encoding="utf-8"), re.M | re.S)
@@ -28,6 +33,61 @@ CASES = [
     for _, examples, outcome in ROWS
     for dtype, shape in re.findall(r"`(\w+) \(([\d, ]+)\)`", examples)
 ]
+
+
+DTYPES = ("uint8", "int64", "uint16", "bool", "float16", "float32", "float64")
+LENGTHS = (1, 3, 4, 7, 16, 17, 24, 64)  # of axes: of colours, frames and pictures
+MOST = 200_000  # numbers in an observation
+
+
+class Constant(gymnasium.Env[Any, Any]):
+    """Shows the same observation, of ones, all the time."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, shape: tuple[int, ...], dtype: str):
+        self.observation_space = spaces.Box(0, 1, shape, np.dtype(dtype).type)
+        self.observation = np.ones(shape, dtype)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.observation, {}
+
+
+def drawn_observation(rng: random.Random) -> tuple[tuple[int, ...], str]:
+    """A shape and a type; bytes are drawn more often."""
+    shape = tuple(rng.choice(LENGTHS) for _ in range(rng.choice((1, 2, 2, 3, 3, 3, 4, 4))))
+    return (shape if prod(shape) < MOST else shape[:2]), rng.choice(("uint8", *DTYPES))
+
+
+def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
+    """What such an observation is taken for: ``picture``, ``numbers``, ``doubtful`` numbers, or ``refused``.
+
+    An ``AssertionError`` where environment and array differ, or it was guessed.
+    """
+    env, states = Constant(shape, dtype), np.ones((2, *shape), dtype)
+    wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
+    of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: as_observations(states, "the states"))
+    assert bool(of_env) == bool(of_array), (of_env, of_array)
+    if of_env:
+        assert dtype == "uint8" or (wide and "float" not in dtype), of_env
+        return "refused"
+    look, taken = reader_of(env), as_observations(states, "the states")[0]
+    assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
+    np.testing.assert_array_equal(look.read(env.reset()[0]), taken)
+    if look.dtype == PICTURE:
+        assert dtype == "uint8" and len(shape) in (2, 3)
+        return "picture"
+    assert bool(look.doubt) == wide and ("float" in dtype or not wide)
+    return "doubtful" if look.doubt else "numbers"
+
+
+def _refusal(call: Callable[[], object]) -> str:
+    """The line with which a call refuses; empty where it does not."""
+    try:
+        call()
+    except UserError as error:
+        return str(error)
+    return ""
 
 
 @pytest.mark.parametrize(("dtype", "shape", "outcome"), CASES)
