@@ -243,7 +243,7 @@ def test_in_processes_of_a_stage(data: Path, tmp_path: Path) -> None:
             "theirs:pair_loss",
             "has no attribute 'nothing': theirs.py, line 2",
         ),
-        ("leaves:x", "the diversity objective cannot be loaded: SystemExit: 0: leaves:x (leaves.py, line 2)"),
+        ("leaves:x", "the diversity objective cannot be loaded: SystemExit: 0: leaves:x leaves.py, line 2"),
     ):
         command = [sys.executable, "-m", "hypogoal", "train-ensemble", str(data), "--diversity", objective, *few]
         ended = subprocess.run(

@@ -25,13 +25,10 @@ VARIABLE = "HYPOGOAL_TRUST"
 MOST_QUOTED = 200  # characters of an error
 PACKAGE = str(Path(__file__).parents[1]) + os.sep
 LIBRARIES = (*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), PACKAGE, "<")
-MEMORY_TEXTS = ("allocate memory", "not enough memory", "out of memory")  # of torch's errors, in any case
 NO_MEMORY = "there is not enough memory. Choose a smaller batch_size, fewer environments or --set workers=1."
 REMEDIES = {
     errno.ENOSPC: "Free some disk space and run it again.",
-    errno.EDQUOT: "Your quota is used up: remove something and run it again.",
     errno.EACCES: "Ask for permission, or choose another path.",
-    errno.EROFS: "Choose another --out.",
     errno.EMFILE: "Allow more open files (ulimit -n).",
 }
 _allowed: set[str] = set()  # what the user typed in this process
@@ -49,13 +46,8 @@ def allow(texts: Iterable[object]) -> None:
         _allowed.update(names_in(text))
 
 
-def allowed() -> frozenset[str]:
-    """What a process that this one starts must :func:`allow`."""
-    return frozenset(_allowed)
-
-
 def environment() -> dict[str, str]:
-    """For commands that this one starts: they may load what files name if this one has code of its own."""
+    """For processes that this one starts: they may load what files name if the user gave code here."""
     return {VARIABLE: "1"} if _allowed else {}
 
 
@@ -95,7 +87,7 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
         loaded = importlib.import_module(module)
         return getattr(loaded, attribute) if attribute else loaded
     except (Exception, SystemExit) as error:
-        where = f"{name} ({place_of(error) or 'no such module or object'})"
+        where = f"{name} {place_of(error)}".strip()
         raise UserError(f"the {role} cannot be loaded: {_line(error)}", where, "--debug shows more.") from error
 
 
@@ -110,7 +102,7 @@ def place_of(error: BaseException) -> str:
 def of_user(error: BaseException) -> UserError | None:
     """An error that was raised in or through user code, as a ``UserError``; None for any other."""
     place = place_of(error)
-    if not place or isinstance(error, UserError | NumericalError | MemoryError | KeyboardInterrupt):
+    if not place or isinstance(error, UserError | NumericalError):
         return None
     return UserError(f"your code raised {_line(error)}", place, "--debug shows how it was called.")
 
@@ -121,7 +113,7 @@ def message(error: BaseException) -> tuple[str, int]:
         return str(error), 2
     if isinstance(error, NumericalError):
         return f"training stopped: {error}", 1
-    if isinstance(error, MemoryError) or any(text in str(error).lower() for text in MEMORY_TEXTS):
+    if isinstance(error, MemoryError) or re.search("allocate memory|not enough memory|out of memory", str(error)):
         return NO_MEMORY, 2
     if user_error := of_user(error):
         return str(user_error), 2

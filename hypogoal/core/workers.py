@@ -50,10 +50,11 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     before = set(multiprocessing.active_children())
     # Spawned, not forked: a fork would copy the caller's threads and locks.
     spawn = multiprocessing.get_context("spawn")
-    with _environment(**SAFE_PATH):
-        pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(), own_code.allowed()))
+    environment = SAFE_PATH | own_code.environment()
+    with _environment(**environment):
+        pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
-        with _environment(**SAFE_PATH):
+        with _environment(**environment):
             futures = {pool.submit(_guarded, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
@@ -85,9 +86,8 @@ def _environment(**values: str) -> Iterator[None]:
             os.environ.update({} if value is None else {name: value})
 
 
-def _begin(parent: int, allowed: frozenset[str]) -> None:
+def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C; it sends SIGTERM
-    own_code.allow(allowed)
     die_with_parent()
     if os.getppid() != parent:
         os._exit(128 + KILLED)
