@@ -30,8 +30,8 @@ def command_line() -> str:
 def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
     from hypogoal.domains.base import BUILT_IN
+    from hypogoal.experiments.run import config_class_of
     from hypogoal.settings import TABLES, described
-    from hypogoal.stages.sweep import config_class_of
 
     lines = [
         "# Settings",

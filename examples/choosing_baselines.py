@@ -1,7 +1,7 @@
 """PPO and DQN on primitive actions, in the worlds of the preset choosing: a wrong key ends the episode, as do 1.5
 shortest paths.
 
-    hypogoal sweep examples.choosing_baselines:choosing_baselines --out runs/choosing-baselines
+    hypogoal run examples.choosing_baselines:choosing_baselines --out runs/choosing-baselines
 """
 
 from collections.abc import Iterator

@@ -4,7 +4,7 @@ D-BAT beside no diversity, one classifier a sub-goal, and the true sub-goals; PP
 tables have them on the first five layouts. ``studies.bonus`` adds PPO that is paid where D-BAT's members
 predict positive.
 
-    hypogoal sweep examples.figure6:figure6 --out runs/figure6
+    hypogoal run examples.figure6:figure6 --out runs/figure6
     python -m studies.bonus runs/figure6 docs/results/figure6-doorkey.csv
     python -m studies.figure6 runs/figure6 docs/results/figure6-doorkey.csv
 """

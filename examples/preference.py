@@ -1,7 +1,7 @@
 """Which members does reward prefer, where wrong choices only cost time? Plain DoorKey, 34 layouts, each with a seed of
 its own; options are planned (exact), so nothing here is a matter of option learning.
 
-    hypogoal sweep examples.preference:preference --out runs/preference
+    hypogoal run examples.preference:preference --out runs/preference
     python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
 """
 

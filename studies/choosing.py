@@ -4,7 +4,7 @@ hypogoal run doorkey --preset choosing --out runs/choosing
 python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run rooms --out runs/rooms
 python -m studies.choosing runs/rooms docs/results/rooms.csv
-hypogoal sweep examples.preference:preference --out runs/preference
+hypogoal run examples.preference:preference --out runs/preference
 python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
 python -m studies.choosing --tables docs/results/choosing-doorkey.csv
 """

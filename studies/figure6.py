@@ -1,6 +1,6 @@
 """Figure 6 at the paper's budget: how soon agents solve a layout, in how many steps, and whether they lose it again.
 
-hypogoal sweep examples.figure6:figure6 --out runs/figure6
+hypogoal run examples.figure6:figure6 --out runs/figure6
 python -m studies.bonus runs/figure6 docs/results/figure6-doorkey.csv
 python -m studies.figure6 runs/figure6 docs/results/figure6-doorkey.csv
 python -m studies.figure6 --tables docs/results/figure6-doorkey.csv

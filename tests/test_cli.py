@@ -15,8 +15,8 @@ from toy_data import reseal
 import hypogoal
 from hypogoal.core.config import describe
 from hypogoal.data import open_dataset
+from hypogoal.experiments.run import config_class_of
 from hypogoal.settings import CONFIGS
-from hypogoal.stages.sweep import config_class_of
 
 
 def test_steps_of_both_stages_count(tiny_run: Path) -> None:

@@ -85,8 +85,8 @@ def test_the_reference_is_that_of_the_code(site: Path) -> None:
 
     from hypogoal.cli import app
     from hypogoal.core.config import describe
+    from hypogoal.experiments.run import config_class_of
     from hypogoal.settings import STAGES
-    from hypogoal.stages.sweep import config_class_of
 
     pages = {name: (site / f"reference/{name}.html").read_text(encoding="utf-8") for name in ("cli", "settings")}
     for name in get_command(app).commands:  # type: ignore[attr-defined]

@@ -157,8 +157,8 @@ def test_help_is_light() -> None:
 
 
 def test_commands_load_what_they_need() -> None:
-    """A sweep's plan and a stage's settings need no torch; SciPy's statistics are the evaluation's alone."""
-    assert "torch" not in loaded_by("import hypogoal.stages.sweep")
+    """A run's plan and a stage's settings need no torch; SciPy's statistics are the evaluation's alone."""
+    assert "torch" not in loaded_by("import hypogoal.experiments.run")
     assert "scipy" not in loaded_by("import hypogoal.stages.train_ensemble, hypogoal.stages.train_meta")
 
 
@@ -335,7 +335,7 @@ def test_one_way_to_print_and_one_to_open() -> None:
     opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
     own = {
         "core/config.py", "core/drafts.py", "core/files.py", "core/locks.py",
-        "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/records.py",
+        "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/sweep.py",
         "hypotheses/load.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
         "own_data/videos.py", "tools/export.py", "stages/train_ensemble.py",
     }  # fmt: skip

@@ -19,7 +19,7 @@ from hypogoal.core.terminal import say
 from hypogoal.settings import CONFIGS, TABLES, configuration, options_of
 from hypogoal.stages import make
 
-GROUPS = MAKE, LOOK, OWN, MANY = "Make", "Look", "Own data and code", "Run many"  # of commands, as they are listed
+GROUPS = MAKE, LOOK, OWN = "Make", "Look", "Own data and code"  # of commands, as they are listed
 
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 

@@ -50,7 +50,7 @@ def verify(path: Made, as_json: cli.AsJson = False) -> None:
 
     Checks schema, hashes, numbers, and the inputs within PATH. What is still being made is named, not checked.
     """
-    from hypogoal.experiments.status import in_the_making
+    from hypogoal.experiments.sweep import in_the_making
     from hypogoal.inspection import faults_of, is_made, notes_of
 
     making = in_the_making(path)
@@ -65,7 +65,7 @@ def verify(path: Made, as_json: cli.AsJson = False) -> None:
 @cli.command(cli.LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: cli.AsJson = False) -> None:
     """Say which artefacts are stale, why, and which commands renew them."""
-    from hypogoal.experiments.status import in_the_making
+    from hypogoal.experiments.sweep import in_the_making
     from hypogoal.inspection import is_made
     from hypogoal.staleness import lines, states_of
 
@@ -94,7 +94,7 @@ def config(
         return
     config_class = CONFIGS.get(stage)
     if config_class is None:  # a domain's or an experiment's, slower to load
-        from hypogoal.stages.sweep import config_class_of
+        from hypogoal.experiments.run import config_class_of
 
         config_class = config_class_of(stage, domain)
     rows = described(config_class, stage, domain, preset)

@@ -51,10 +51,10 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     # Spawned, not forked: a fork would copy the caller's threads and locks.
     spawn = multiprocessing.get_context("spawn")
     environment = SAFE_PATH | own_code.environment()
-    with _environment(**environment):
+    with with_environment(**environment):
         pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
-        with _environment(**environment):
+        with with_environment(**environment):
             futures = {pool.submit(_guarded, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
@@ -74,7 +74,7 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
 
 
 @contextlib.contextmanager
-def _environment(**values: str) -> Iterator[None]:
+def with_environment(**values: str) -> Iterator[None]:
     """Set environment variables within the block."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)

@@ -1,4 +1,4 @@
-"""Experiments as Python functions: generators of (name, command) whose keyword arguments are settings (Spec A6, G4).
+"""Experiments: generators of (name, command) whose keyword arguments are settings, or TOML files (Spec A6, G4).
 
 ::
 
@@ -13,18 +13,20 @@ A command is what one would type, without ``--out``; ``@data`` stands for the ou
 
 import inspect
 import shlex
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass
-from itertools import islice, product
-from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
+from dataclasses import dataclass, make_dataclass
+from itertools import chain, product
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias, get_args, get_origin, get_type_hints
 
-from hypogoal.core.config import setting
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hypogoal.core.config import parse_integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load
+from hypogoal.core.own_code import load, names_in, require_trust
 
-MAX_CELLS = 20_000
 MEND = "Mend the experiment or its settings, see docs/formats.md."
-KINDS = (bool, int, float, str, tuple[int, ...], tuple[float, ...], tuple[str, ...])
 COMMON = ("workers", "evaluate")  # settings of every experiment
 
 Value = str | int | float
@@ -32,21 +34,12 @@ Names: TypeAlias = tuple[str, ...]
 Integers: TypeAlias = tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """One command of an experiment."""
 
     name: str  # its place in the run's folder: ensemble/seed-0
-    command: str | Sequence[str]  # as one would type it, or its words
-    columns: Mapping[str, Value] = field(default_factory=dict)  # of results.csv: seed, method, ...
-
-    @property
-    def words(self) -> list[str]:
-        """The command, split as a shell does."""
-        try:
-            return shlex.split(self.command) if isinstance(self.command, str) else [*self.command]
-        except (ValueError, TypeError) as error:
-            raise UserError(f"the command cannot be read ({error})", f"cell {self.name!r}", MEND) from None
+    command: str  # as one would type it
+    columns: Mapping[str, Value] = {}  # of results.csv: seed, method, ...
 
 
 @dataclass(frozen=True)
@@ -64,18 +57,22 @@ class Experiment:
         """The names of the function's settings."""
         return tuple(name for name in inspect.get_annotations(self.config_class) if name not in COMMON)
 
-    def commands(self, settings: Mapping[str, Any], stage: Callable[[str], Any]) -> Iterator[Command]:
+    def commands(self, settings: Mapping[str, Any], stage: Callable[[str], Any]) -> list[Command]:
         """What the function yields; ``stage`` gives a stage's settings. What is no command is a ``UserError``."""
         takes_stage = "stage" in inspect.signature(self.function).parameters
-        rows = list(islice(self.function(*[stage][:takes_stage], **settings), MAX_CELLS + 1))
-        if len(rows) > MAX_CELLS:
-            raise UserError(f"more than {MAX_CELLS} cells", self.name, "Take fewer values.")
+        rows = self.function(stage, **settings) if takes_stage else self.function(**settings)
+        commands = []
         for row in rows:
-            command = Command(*row) if isinstance(row, tuple) and 2 <= len(row) <= 3 else row
-            parts = (command.name, *command.words) if isinstance(command, Command) else (None,)
-            if not all(isinstance(part, str) for part in parts):
+            if (
+                not isinstance(row, tuple)
+                or not 2 <= len(row) <= 3
+                or not all(isinstance(part, str) for part in row[:2])
+            ):
                 raise UserError("an experiment yields (name, command) or (name, command, columns)", self.name, MEND)
-            yield command
+            commands.append(Command(*row))
+        if not commands:
+            raise UserError("no cells in this experiment", self.name, "Give its axes values.")
+        return commands
 
 
 def explained(meaning: str, **limits: Any) -> Mapping[str, Any]:
@@ -90,7 +87,7 @@ Paired = Annotated[bool, explained("each layout with the seed at its place in th
 
 
 def experiment(domain: str, *, stages: Sequence[str]) -> Callable[[Callable[..., Iterable[Any]]], Experiment]:
-    """Makes a function an experiment on ``domain``; the arguments are those of :class:`Experiment`.
+    """Makes a function an experiment on ``domain``.
 
     Presets, ``--device`` and settings of ``stages`` then apply to all its commands, and it may ask for the settings of
     a stage: ``def mine(stage, *, ...)`` has ``stage("train-meta").steps``.
@@ -122,16 +119,6 @@ def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> 
     return list(zip(layouts, seeds, strict=True))
 
 
-def run_config(fields: Sequence[tuple[str, Any, Any]], workers: int = 0, evaluate: bool = True) -> type:
-    """The settings of ``hypogoal run``: an experiment's own, then those of all experiments."""
-    common: list[tuple[str, Any, Any]] = [
-        ("workers", int, setting(workers, "cells at once; 0 for one per core", low=0, high=1024)),
-        ("evaluate", bool, setting(evaluate, "evaluation and report at the end")),
-    ]
-    namespace = {"__doc__": "Which cells there are."}
-    return make_dataclass("RunConfig", [*fields, *common], namespace=namespace, frozen=True)
-
-
 def _experiment_of(
     function: Callable[..., Iterable[Any]], domain: str | None = None, stages: Sequence[str] = ()
 ) -> Experiment:
@@ -141,12 +128,92 @@ def _experiment_of(
     for name, parameter in inspect.signature(function).parameters.items():
         if name == "stage" and domain:
             continue
-        kind, metadata = hints.get(name), explained("")
-        if get_origin(kind) is Annotated:
-            kind, metadata = get_args(kind)
-        is_setting = parameter.kind is parameter.KEYWORD_ONLY and parameter.default is not parameter.empty
-        if kind not in KINDS or not is_setting or name in COMMON:
+        if parameter.kind is not parameter.KEYWORD_ONLY or parameter.default is parameter.empty or name in COMMON:
             do = "Make it keyword-only, a bool, int, float, str or a tuple of one of them, with a default."
             raise UserError("this argument of an experiment cannot be a setting", f"{function.__name__}: {name}", do)
+        kind, metadata = hints[name], explained("")
+        if get_origin(kind) is Annotated:
+            kind, metadata = get_args(kind)
         fields.append((name, kind, setting(parameter.default, **metadata)))
-    return Experiment(function.__name__.replace("_", "-"), function, run_config(fields), domain, (*stages,))
+    return Experiment(function.__name__.replace("_", "-"), function, _run_config(fields), domain, (*stages,))
+
+
+def _run_config(fields: Sequence[tuple[str, Any, Any]], workers: int = 0, evaluate: bool = True) -> type:
+    """The settings of ``hypogoal run``: an experiment's own, then those of all experiments."""
+    common: list[tuple[str, Any, Any]] = [
+        ("workers", int, setting(workers, "cells at once; 0 for one per core", low=0, high=1024)),
+        ("evaluate", bool, setting(evaluate, "evaluation and report at the end")),
+    ]
+    namespace = {"__doc__": "Which cells there are."}
+    return make_dataclass("RunConfig", [*fields, *common], namespace=namespace, frozen=True)
+
+
+class _Cells(BaseModel):
+    """Of a TOML file: a command for each point of its axes."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    command: str
+    axes: list[str] = []
+
+    def at(self, point: Mapping[str, Value]) -> str:
+        """The cell's name: NAME, or NAME/AXIS-VALUE-AXIS-VALUE."""
+        values = "-".join(f"{axis}-{point[axis]}" for axis in self.axes)
+        return f"{self.name}/{values}" if values else self.name
+
+
+class _File(BaseModel):
+    """A user's experiment in TOML."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    format: Literal[1]
+    axes: dict[str, list[Value] | str] = {}
+    cells: list[_Cells]
+    workers: int = 0
+    evaluate: bool = True
+
+    def commands(self, **axes: Sequence[Value]) -> Iterator[Command]:
+        """In a command ``{AXIS}`` is its value, ``{NAME}`` the output of the cells of that name for the same values."""
+        for row in self.cells:
+            for values in product(*(axes[axis] for axis in row.axes)):
+                point = dict(zip(row.axes, values, strict=True))
+                others = [other for other in self.cells if point.keys() >= {*other.axes}]
+                known = {**{other.name: f"@{other.at(point)}" for other in others}, **point}
+                words = [word.format_map(known) for word in shlex.split(row.command)]
+                for own in chain.from_iterable(map(names_in, [*words, *point.values()])):
+                    require_trust(own, "setting")
+                yield Command(row.at(point), shlex.join(words), {"group": row.name, **point})
+
+
+def read_toml(path: Path) -> Experiment:
+    """The experiment in a TOML file; a ``UserError`` where there is none."""
+    try:
+        file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
+    except (OSError, ValueError) as error:
+        fault = error.errors()[0] if isinstance(error, ValidationError) else None
+        reason = f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" if fault else str(error)
+        raise UserError(f"the experiment cannot be read ({reason})", path, MEND) from None
+
+    def commands(**axes: Any) -> list[Command]:
+        try:
+            return [*file.commands(**axes)]
+        except (LookupError, ValueError, AttributeError) as error:
+            problem = f"a command cannot be read, or names neither an axis of its cells nor cells over those ({error})"
+            raise UserError(problem, path, MEND) from None
+
+    axes = {
+        name: tuple(parse_integers(values)) if isinstance(values, str) else tuple(values)
+        for name, values in file.axes.items()
+    }
+    settings = [(name, _kind(values), setting(values, "an axis")) for name, values in axes.items()]
+    return Experiment(path.stem, commands, _run_config(settings, file.workers, file.evaluate))
+
+
+def _kind(values: Sequence[Value]) -> Any:
+    """What a setting of these values must be."""
+    kinds = {type(value) for value in values}
+    if kinds == {int}:
+        return tuple[int, ...]
+    return tuple[float, ...] if kinds == {float} else tuple[str, ...]

@@ -19,9 +19,7 @@ from hypogoal.evaluation.provenance import provenance
 from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings
 from hypogoal.evaluation.run import FORMAT, find, most_used
 from hypogoal.evaluation.table import Row, compared, defined
-from hypogoal.experiments.cells import DERIVED
-from hypogoal.experiments.records import PLAN, read_plan
-from hypogoal.experiments.status import stamp_of
+from hypogoal.experiments.sweep import unmade
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.config import layout_seeds
 
@@ -106,9 +104,7 @@ def missing(work: Work) -> list[str]:
 
 
 def _unfinished_cells(run: Path) -> list[str]:
-    """Of a sweep, the cells that it was to have and has not: failed, or not run yet."""
-    if not (run / PLAN).is_file():
-        return []
-    left = [cell.name for cell in read_plan(run).cells if cell.stage not in DERIVED and stamp_of(cell) is None]
+    """The cells that the run was to have and has not: failed, or not run yet."""
+    left = unmade(run)
     names = ", ".join([*left[:5], *(["..."] if len(left) > 5 else [])])
-    return [f"{len(left)} of the sweep's cells are not done: {names}"] if left else []
+    return [f"{len(left)} of the run's cells are not done: {names}"] if left else []

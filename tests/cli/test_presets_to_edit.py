@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from command_line import refuses, run
+from command_line import run
 
 from hypogoal.cli import main
 from hypogoal.settings import CONFIGS, configuration
@@ -25,8 +25,7 @@ def test_an_existing_file_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert file.read_text() == "mine" and "a new .toml file" in capsys.readouterr().err
 
 
-def test_a_dry_run_of_a_sweep_needs_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dry_run_needs_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert "--out runs/figure3/" in run("sweep", "figure3", "--seeds", "0", "--dry-run").out
+    assert "--out runs/figure3/" in run("run", "figure3", "--seed", "0", "--dry-run").out
     assert not [*tmp_path.iterdir()]
-    refuses("which experiment?", "sweep")

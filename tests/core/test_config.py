@@ -12,8 +12,8 @@ import hypogoal
 from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import defaults_of
+from hypogoal.experiments.run import config_class_of
 from hypogoal.settings import TABLES, configuration, described
-from hypogoal.stages.sweep import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 

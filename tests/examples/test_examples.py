@@ -137,7 +137,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     """Spec B6: observations that are a dictionary of numbers; what is of pictures only is left out, or refused."""
     example = EXAMPLES / "vector_goals.py"
     text = example.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= (110 if "hypogoal sweep" in text else 40)
+    assert len(text.splitlines()) <= (110 if "hypogoal run examples" in text else 40)
     run = tmp_path / "run"
     data, ensemble, options, meta = (str(run / name) for name in ("data.h5", "ensemble", "options", "meta"))
     play = settings("steps=2500", "environments=4", "warm_up=200", "layout_seed=0")
@@ -263,7 +263,7 @@ def test_examples_are_short(example: Path) -> None:
     """Spec B6: what one reads before one writes one's own; sweeps, figures, a robot and own parts may be longer."""
     text = example.read_text(encoding="utf-8")
     longer = {
-        "hypogoal sweep": 110,
+        "hypogoal run examples": 110,
         "robot_bin.py": 150,
         "robot_bin": 60,
         "def policy(": 80,

@@ -1,19 +1,21 @@
-"""Experiments as Python functions (Spec G4): named ones, and those of a user."""
+"""Experiments (Spec A6, G4): their cells, as Python functions, TOML files, and those that come with hypogoal."""
+
+from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import refuses, run
 
 from hypogoal.core import own_code
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
-from hypogoal.experiments.cells import Plan
-from hypogoal.experiments.experiment import Command, Seeds, experiment, load_experiment
-from hypogoal.experiments.planning import make_plan
-from hypogoal.stages.sweep import config_class_of, plan
+from hypogoal.experiments.experiment import read_toml
+from hypogoal.experiments.named import EXPERIMENTS
+from hypogoal.experiments.run import config_class_of, plan
+from hypogoal.experiments.sweep import Cell
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("somewhere")
@@ -27,34 +29,66 @@ def members(*, sizes: Annotated[tuple[int, ...], explained("members", low=1)] = 
     yield "data", "collect doorkey"
     for size in sizes:
         yield f"ensemble/size-{size}", f"train-ensemble @data --members {size}", {"size": size}
-        yield f"agent/size-{size}", f"train-meta --ensemble=@ensemble/size-{size}"
+        yield f"agent/size-{size}", f"train-baseline doorkey --data=@data --seed {size}"
+"""
+TOML = """
+format = 1
+axes = { seed = [0, 1], layout = "210-212" }
+cells = [
+  { name = "data", command = "collect doorkey --seed 3" },
+  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}" },
+  { name = "agent", axes = ["seed", "layout"], command = "train-meta {ensemble} --layout-seed {layout} --seed {seed}" },
+]
 """
 
 
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, *assignments: str) -> Plan:
-    """The plan of ``members`` in a module of this text."""
+def cells_of(name: str, *assignments: str, **given: str) -> list[Cell]:
+    return plan(name, assignments=assignments, **given)[0]  # type: ignore[arg-type]
+
+
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, *assignments: str) -> list[Cell]:
+    """The cells of ``members`` in a module of this text."""
     name = re.sub(r"\W", "_", tmp_path.name)
     (tmp_path / f"{name}.py").write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     own_code.allow([f"{name}:members"])
-    return plan(f"{name}:members", OUT, assignments=assignments)
+    return cells_of(f"{name}:members", *assignments)
+
+
+def of_toml(tmp_path: Path, text: str, *assignments: str) -> list[Cell]:
+    (tmp_path / "own.toml").write_text(text)
+    return cells_of(str(tmp_path / "own.toml"), *assignments)
 
 
 def test_a_generator_of_names_and_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G4: @NAME is the output of the command of that name; its arguments are settings."""
-    made = own(tmp_path, monkeypatch, MODULE, "sizes=2-4", "workers=2")
-    assert made.experiment == "members" and made.workers == 2
-    cells = {cell.name: cell for cell in made.cells}
-    assert [*cells] == ["data", *(f"{kind}-size-{size}" for size in (2, 3, 4) for kind in ("ensemble", "agent")),
-                        "evaluate", "report"]  # fmt: skip
-    ensemble = cells["ensemble-size-3"]
-    assert ensemble.text == ("hypogoal train-ensemble somewhere/data.h5 --members 3 --out somewhere/ensemble/size-3")
-    assert ensemble.needs == (OUT / "data.h5",) and ensemble.axes == (("size", 3),)
-    assert ensemble.cores == 5
-    assert cells["agent-size-3"].arguments[1:3] == ("--ensemble", "somewhere/ensemble/size-3")
-    assert cells["agent-size-3"].needs == (OUT / "ensemble/size-3",)
-    assert {*cells["evaluate"].needs} == {cell.out for cell in made.cells[:-2]}
+    made = own(tmp_path, monkeypatch, MODULE, "sizes=2-4")
+    cells = {cell.name: cell for cell in made}
+    kinds = [f"{kind}/size-{size}" for size in (2, 3, 4) for kind in ("ensemble", "agent")]
+    assert [*cells] == ["data", *kinds, "evaluation", "report"]
+    ensemble = cells["ensemble/size-3"]
+    words = "train-ensemble somewhere/data.h5 --members 3 --out somewhere/ensemble/size-3"
+    assert ensemble.command(OUT) == words.split()
+    assert ensemble.needs == ["data"] and ensemble.columns == {"size": 3}
+    assert "--data=somewhere/data.h5" in cells["agent/size-3"].command(OUT)
+    assert cells["evaluation"].command(OUT) == ["evaluate", "somewhere", "--out", "somewhere/evaluation"]
+    assert cells["evaluation"].needs == ["data", *kinds] and cells["report"].command(OUT) == ["report", "somewhere"]
+
+
+def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
+    """Spec G4: cells are the product of axes; what they read is what cells of the same point made."""
+    cells = of_toml(tmp_path, TOML)
+    agents = [cell for cell in cells if cell.stage == "train-meta"]
+    assert len(agents) == 6 and [cell.stage for cell in cells].count("collect") == 1
+    words = "train-meta somewhere/ensemble/seed-1 --layout-seed 212 --seed 1 --out somewhere/agent/seed-1-layout-212"
+    assert agents[-1].command(OUT) == words.split() and agents[-1].needs == ["ensemble/seed-1"]
+    assert agents[-1].columns == {"group": "agent", "seed": 1, "layout": 212}
+    ten = of_toml(tmp_path, TOML, "seed=0-4", "layout=1,5", "evaluate=false")
+    assert sum(cell.stage == "train-meta" for cell in ten) == 10 and ten[-1].stage == "train-meta"
+    dotted = of_toml(tmp_path, TOML.replace("--layout-seed {layout} ", "").replace('"210-212"', "[0.1, 1.5]"))
+    assert dotted[3].name == "agent/seed-0-layout-0.1"
+    assert len(cells_of(str(ROOT / "examples" / "sweep-doorkey.toml"))) == 1 + 4 + 8 + 4 + 2
 
 
 @pytest.mark.parametrize(
@@ -62,73 +96,159 @@ def test_a_generator_of_names_and_commands(tmp_path: Path, monkeypatch: pytest.M
     [
         ('"collect doorkey"', '"rm -rf x"', "the command must be a stage"),
         ('"collect doorkey"', '"collect \'doorkey"', "cannot be read"),
-        ('"collect doorkey"', '"collect doorkey --out /tmp"', "given by the sweep"),
+        ('"collect doorkey"', '"collect doorkey --out /tmp"', "given by the run"),
         ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "would read what no cell before it makes"),
         ('"collect doorkey"', "[3]", r"yields \(name, command\)"),
-        ('yield "data"', 'yield "../data"', "name of their own"),
+        ('yield "data"', 'yield "../data"', "fit for a file"),
         ('yield "data"', 'yield "logs"', "name of their own"),
-        ("ensemble/size-{size}", "ensemble/../{size}", "outside the run"),
-        ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "two cells would be the same"),
-        ('f"agent/size-{size}"', 'f"ensemble-size-{size}"', "two cells would be the same"),
-        ('{"size": size}', '{"value": size}', "columns must be names"),
-        ('{"size": size}', '{"size": []}', "columns must be names"),
+        ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "name of their own"),
+        ('{"size": size}', '{"size": []}', "columns texts or numbers"),
+        ("--members {size}", "--members {size} --set stepps=3", "ensemble/size-1: train-ensemble has no setting"),
+        ("--members {size}", "--members {size} --steps 0", "ensemble/size-1: "),
         ("small: bool = False", "small: bool", "cannot be a setting"),
         ("small: bool = False", "workers: int = 3", "cannot be a setting"),
-        ("small: bool = False", "small: dict = {}", "cannot be a setting"),
         ("members(*,", "members(stage, *,", "Make it keyword-only"),
         ("def members", "members = 3\ndef other", "not an experiment"),
-        ('yield "data", "collect', 'yield from [("data", "collect doorkey")] * 30_000; "collect', "more than 20000"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_experiment_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str, words: str
 ) -> None:
-    """Spec G2: as the user's to mend."""
+    """Spec G2: as the user's to mend, before the first cell starts."""
     assert before in MODULE
     with pytest.raises(UserError, match=words) as caught:
         own(tmp_path, monkeypatch, MODULE.replace(before, after))
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("given", ["sizes=0", "sizes=x", "size=1", "small=perhaps", "train-ensemble.steps=3"])
-def test_what_its_settings_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str) -> None:
-    """Spec G2: types, bounds and names are those of the signature."""
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("format = 1", "format = 2", "format: "),
+        ("format = 1", "format = 1\nsubmit = 'rm'", "submit: "),
+        ('axes = ["seed"],', "axis = ['seed'],", "axis: "),
+        ("{ensemble}", "{ensembles}", "names neither an axis"),
+        ('axes = ["seed"], command', "command", "names neither an axis"),
+        ('axes = ["seed"]', 'axes = ["sed"]', "names neither an axis"),
+        ("[0, 1]", "[0, 0]", "name of their own"),
+        ("[0, 1]", "['x y', 'y']", "fit for a file"),
+        ("collect doorkey", "collect 'doorkey", "cannot be read"),
+        ("cells = [", "cells = [ [", "cannot be read"),
+        ("train-meta {", "train-meta --force {", "given by the run"),
+        ("collect doorkey", "collect evil:DOMAIN", "a file names code of its own"),
+    ],
+)
+def test_what_is_no_toml_experiment_is_told_in_one_line(tmp_path: Path, before: str, after: str, words: str) -> None:
+    """Spec G2: stages only, into the run's folder only."""
+    assert before in TOML
+    with pytest.raises(UserError, match=words):
+        of_toml(tmp_path, TOML.replace(before, after))
+
+
+@pytest.mark.parametrize("given", ["seeds=1", "seed=x", "workers=many", "evaluate=perhaps", "train-ensemble.steps=3"])
+def test_what_its_settings_cannot_be(tmp_path: Path, given: str) -> None:
+    """Spec G2: types, bounds and names are those of the axes or of the signature."""
     with pytest.raises(UserError):
-        own(tmp_path, monkeypatch, MODULE, given)
+        of_toml(tmp_path, TOML, given)
 
 
 def test_a_function_is_the_users_word_only_if_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6, G2: a name on the command line is."""
+    """Spec B6: a name on the command line is; the folder is called after the function."""
     (tmp_path / "typed.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
-    words = ["sweep", "typed:members", "--out", "out", "--set", "sizes=2", "--dry-run"]
-    with pytest.raises(UserError, match="a file names code of its own as its experiment"):
-        load_experiment("typed:members")
-    assert "hypogoal train-ensemble out/data.h5 --members 2 --out out/ensemble/size-2\n" in run(*words).out
-    assert "--out runs/members/data.h5\n" in run("run", "typed:members", "--dry-run").out
+    words = "hypogoal train-ensemble runs/members/data.h5 --members 2 --out runs/members/ensemble/size-2\n"
+    assert words in run("run", "typed:members", "--set", "sizes=2", "--dry-run").out
+    assert not (tmp_path / "runs").exists()
+    refuses("takes no preset", "run", "typed:members", "--preset", "demo", "--dry-run")
 
 
-def test_settings_and_presets_of_a_domain() -> None:
-    """Spec G4: with a domain, presets, the device and settings of stages apply to all commands of a stage."""
+@pytest.mark.parametrize(
+    ("experiment", "changes"),
+    [
+        ("doorkey", ["layout_seeds=100,101", "seeds=0,1"]),
+        ("doorkey", ["pretrain=false"]),
+        ("choosing", []),
+        ("rooms", []),
+        ("montezuma-ladders", ["ladders=1L,2-6", "seeds=0,1", "variants=batch_size=16"]),
+    ],
+)
+def test_cells_need_only_what_cells_before_them_make(experiment: str, changes: list[str]) -> None:
+    """Spec A6: an order in which they can run; evaluate waits for all; columns tell all cells of a stage apart."""
+    *others, evaluation, _ = cells_of(experiment, *changes)
+    made: set[str] = set()
+    for cell in others:
+        assert {*cell.needs} <= made
+        made.add(cell.name)
+    assert {*evaluation.needs} == made and len(made) == len(others)
+    assert {cell.stage for cell in others} <= {*EXPERIMENTS[experiment].stages}
+    trained = [(cell.stage, *cell.columns.items()) for cell in others if cell.stage.startswith("train")]
+    assert len({*trained}) == len(trained) or experiment == "choosing"
 
-    @experiment("doorkey", stages=("collect", "train-ensemble"))
-    def two(*, seeds: Seeds = (0, 1)) -> Iterator[Command]:
-        yield Command("data", "collect doorkey")
-        for seed in seeds:
-            yield Command(f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}")
 
-    given = {"preset": "choosing", "device": "cpu"}
-    cells = make_plan(two, OUT, ["seeds=3", "train-ensemble.steps=7"], **given).cells  # type: ignore[arg-type]
-    assert cells[1].text == (
-        "hypogoal train-ensemble somewhere/data.h5 --preset choosing --set steps=7 --device cpu --seed 3 "
-        "--out somewhere/ensemble/seed-3"
-    )
-    for given_setting, words in (
-        ("train-ensemble.seed=3", "Set seeds instead"),
-        ("train-meta.steps=3", "no such stage"),
-    ):
-        with pytest.raises(UserError, match=words):
-            make_plan(two, OUT, [given_setting])
+def test_a_single_agent_has_short_names() -> None:
+    """Contract: runs/demo/ensemble, runs/demo/options, runs/demo/meta."""
+    cells = [cell.place for cell in cells_of("doorkey", preset="demo")]
+    assert cells == ["data.h5", "ensemble", "options", "meta", "ppo-tuned", "evaluation", "report"]
+    more = cells_of("doorkey", preset="demo", seeds="0-1")
+    assert {cell.name for cell in more} >= {"ensemble/seed-0", "meta/layout-101-seed-1"}
+
+
+def settings(cell: Cell) -> dict[str, str]:
+    """What a cell's ``--set`` say: of two for one setting the last."""
+    return dict(word.split("=", 1) for before, word in pairwise(cell.words) if before == "--set")
+
+
+def test_what_all_cells_are_given_undoes_no_variant_and_no_method() -> None:
+    """Spec F1: the single CNN has one member and a variant its own setting, whatever --set train-ensemble.KEY says."""
+    common = [f"train-ensemble.{pair}" for pair in ("members=3", "diversity=none", "batch_size=8")]
+    changes = ["groups=1", "variants=batch_size=16", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
+    cells = cells_of("montezuma-ladders", *changes, *common, "train-options.termination=learned")
+    for cell in cells:
+        has = settings(cell)
+        if cell.stage == "train-ensemble":
+            assert has["diversity"] == ("dbat" if cell.columns["method"] == "dbat" else "none")
+            assert has["members"] == ("1" if cell.columns["method"] == "cnn" else "3")
+            assert has["batch_size"] == ("16" if cell.columns["variant"] else "8")
+    options = [settings(cell) for cell in cells if cell.stage == "train-options"]
+    assert {has["start"] for has in options} == {"1L"}
+    assert [has["termination"] for has in options].count("oracle") == 1
+
+
+def test_controls_and_baselines_keep_the_agents_budget() -> None:
+    """Spec E6, E7: as many steps as options and agent together, also where those were changed for all cells."""
+    changes = ["train-meta.steps=5000", "train-options.steps=3000", "train-meta.chooser=ppo", "controls=random,oracle"]
+    changes += ["train-baseline.steps=7", "train-baseline.setting=tuned"]
+    for cell in cells_of("doorkey", *changes, preset="demo"):
+        agent, has = cell.columns.get("agent"), settings(cell)
+        if cell.stage in ("train-meta", "train-baseline"):
+            assert has["steps"] == ("5000" if agent == "meta" else "8000")
+        if cell.stage == "train-meta":
+            assert has["chooser"] == ("random" if agent == "meta-random" else "ppo")
+    for given, instead in (("train-meta.layout_seed=3", "layout_seeds"), ("train-baseline.agent=dqn", "baselines")):
+        with pytest.raises(UserError, match=f"Set .*{instead}.* instead"):
+            cells_of("doorkey", given)
+    with pytest.raises(UserError, match="no such stage"):
+        cells_of("montezuma-ladders", "train-meta.steps=3")
+    with pytest.raises(UserError, match="no cell before it makes"):
+        cells_of("montezuma-ladders", "option_methods=none", "methods=dbat", "ladders=1L")
+
+
+def test_the_papers_figures_are_experiments() -> None:
+    """Spec E4, F1, F3, F5: each with its preset; layouts and seeds as ranges, all with all or in pairs."""
+    assert cells_of("figure6") == cells_of("doorkey", preset="figure6")
+    assert cells_of("figure4") == cells_of("montezuma-ladders", preset="figure4")
+    assert cells_of("figure3") == cells_of("montezuma-ladders", preset="figure3")
+    assert cells_of("doorkey", preset="choosing") == cells_of("choosing")
+    assert cells_of("figure6", preset="paper") == cells_of("doorkey", preset="paper")
+    assert not any(cell.stage == "train-options" for cell in cells_of("figure3", preset="paper"))
+    ten = cells_of("figure6", "paired=false", "layout_seeds=210-219", seeds="0")
+    agents = [cell.columns for cell in ten if cell.stage == "train-meta" and cell.columns["agent"] == "meta"]
+    assert [columns["layout_seed"] for columns in agents] == [*range(210, 220)]
+    pairs = cells_of("doorkey", "paired=true", "layout_seeds=7,8", "baselines=ppo-tuned", seeds="3,5")
+    places = {(cell.columns["layout_seed"], cell.columns["seed"]) for cell in pairs if "layout_seed" in cell.columns}
+    assert places == {(7, 3), (8, 5)}
+    with pytest.raises(UserError, match="10 layouts cannot be paired with 1 seeds"):
+        cells_of("figure6", seeds="0")
 
 
 def test_settings_of_run_are_the_signatures() -> None:
@@ -137,6 +257,7 @@ def test_settings_of_run_are_the_signatures() -> None:
     assert (rows["groups"]["default"], rows["groups"]["allowed"]) == ((1, 2, 3, 7), "1 .. 7")
     assert rows["methods"]["allowed"] == "dbat|none|cnn" and rows["methods"]["source"] == "Figure 3"
     assert rows["oracle"]["type"] == "bool" and "workers" in rows and "evaluate" in rows
+    assert read_toml(ROOT / "examples" / "sweep-doorkey.toml").settings == ("seed", "layout", "members")
 
 
 @pytest.mark.parametrize(("name", "count"), [("figure6", 133), ("preference", 139), ("choosing_baselines", 23)])
@@ -145,4 +266,4 @@ def test_the_examples_are_experiments(monkeypatch: pytest.MonkeyPatch, name: str
     monkeypatch.chdir(ROOT)
     monkeypatch.syspath_prepend(str(ROOT))
     own_code.allow([f"examples.{name}:{name}"])
-    assert len(plan(f"examples.{name}:{name}", OUT).cells) == count
+    assert len(cells_of(f"examples.{name}:{name}")) == count

@@ -1,17 +1,18 @@
-"""A sweep of cells that take seconds, in a file of its own."""
+"""An experiment of cells that take seconds, in a file of its own."""
 
 from pathlib import Path
 
-DATA = "collect doorkey --set heldout_layouts=1 --set unlabelled_seeds=1"
-SMALL = "--set steps=6 --set members=2 --set sub_goals=open-red-door"
+DATA = "collect rooms"
+SMALL = "--set steps=20 --set members=2"
+PLAY = "--layout-seed 990 --set steps=200 --set random_episodes=2"
 
 
-def write_toy(path: Path, seeds: str = "0-1", more: str = "") -> Path:
-    """States, an ensemble for each seed, and whatever ``more`` says; ``path``."""
+def write_toy(path: Path, seeds: str = "0-1", more: str = "", *, evaluate: bool = False) -> Path:
+    """States, an ensemble and an agent for each seed, and whatever ``more`` says; ``path``."""
     path.write_text(
         f"""
 format = 1
-evaluate = false
+evaluate = {str(evaluate).lower()}
 axes = {{ seed = "{seeds}" }}
 
 [[cells]]
@@ -22,6 +23,11 @@ command = "{DATA}"
 name = "ensemble"
 axes = ["seed"]
 command = "train-ensemble {{data}} --seed {{seed}} {SMALL}"
+
+[[cells]]
+name = "agent"
+axes = ["seed"]
+command = "train-meta {{ensemble}} --seed {{seed}} {PLAY}"
 {more}"""
     )
     return path

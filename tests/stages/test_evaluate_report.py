@@ -24,8 +24,7 @@ from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.questions import summary_table
 from hypogoal.evaluation.run import find, read_evaluation
-from hypogoal.experiments.cells import Cell, Plan
-from hypogoal.experiments.records import write_plan
+from hypogoal.experiments.sweep import Cell, begin
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.inspection import summary_of
 from hypogoal.meta.config import TrainMetaConfig
@@ -94,10 +93,9 @@ def test_what_was_made_since_is_said(tiny_copy):
 def test_cells_of_a_sweep_that_are_not_done_are_said(tiny_run, tmp_path):
     """Spec A5, G4: a mean over nine of ten seeds says that it is one."""
     shutil.copytree(tiny_run / "ensemble", tmp_path / "ensemble")
-    cells = [Cell(name, ("train-ensemble", "d"), tmp_path / name) for name in ("ensemble", "other")]
-    write_plan(tmp_path, Plan("own", cells, 1))
+    begin([Cell(name=name, words=["train-ensemble", "d"]) for name in ("ensemble", "other")], tmp_path)
     nothing = {"agents": [], "rooms": [], "selection": [], "distance": {"options": []}}
-    assert "1 of the sweep's cells are not done: other" in missing(Work(find(tmp_path), None, None, metrics=nothing))
+    assert "1 of the run's cells are not done: other" in missing(Work(find(tmp_path), None, None, metrics=nothing))
 
 
 def test_members_are_judged_on_heldout_states(tiny_run, metrics):
