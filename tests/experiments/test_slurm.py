@@ -80,7 +80,7 @@ command = "train-meta {{worse}}"
 
 [[cells]]
 name = "long"
-command = "train-ensemble {{data}} --set members=2 --set steps=1000000"
+command = "train-baseline rooms --set steps=100000000 --set max_episode_steps=20"
 """
 
 
