@@ -7,14 +7,13 @@ a command is a ``UserError``.
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from hypogoal import stages
-from hypogoal.core import drafts
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.tensors import load_tensors
@@ -89,7 +88,7 @@ def evaluate(run: Place, out: Place | None = None, **arguments: Any) -> Made:
     """Compute every number of a run into ``run/evaluation`` or ``out``; takes ``layouts``, and no settings."""
     path, place = Path(run), Path(out or Path(run) / "evaluation")
     call = partial(stages.named("evaluate"), path, place, **arguments)
-    return _called("evaluate", place, call, {"run": path, **arguments})
+    return _called(place, call)
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
@@ -98,26 +97,20 @@ def compare(*runs: Place, out: Place, force: bool = False) -> Made:
     from hypogoal.tools.compare import compare as written
 
     call = partial(written, paths, Path(out), force=force)
-    return _called("compare", Path(out), call, {"runs": paths})
+    return _called(Path(out), call)
 
 
 def _made(stage: str, source: str | Path, out: Place, arguments: dict[str, Any], **sources: Any) -> Made:
     settings = {name: value for name, value in arguments.items() if name not in OPTIONS}
     options = {name: value for name, value in arguments.items() if name in OPTIONS}
     run = partial(stages.make, stage, source, Path(out), settings, **sources, **options)
-    return _called(stage, Path(out), run, {"source": source, **sources, **arguments})
+    return _called(Path(out), run)
 
 
-def _called(stage: str, out: Path, run: Callable[[], object], words: Mapping[str, Any]) -> Made:
-    """Call a stage; the manifest's command is the call. With ``resume`` the result may be complete already."""
-    texts = {name: ",".join(map(str, word)) if isinstance(word, list | tuple) else word for name, word in words.items()}
-    shown = (f"{name}={text}" for name, text in texts.items() if text not in (None, "") and name != "resume")
-    token = drafts.COMMAND.set((f"hypogoal.{stage.replace('-', '_')}", f"out={out}", *shown))
-    try:
-        with contextlib.suppress(Complete):
-            run()
-    finally:
-        drafts.COMMAND.reset(token)
+def _called(out: Path, run: Callable[[], object]) -> Made:
+    """Call a stage; with ``resume`` the result may be complete already."""
+    with contextlib.suppress(Complete):
+        run()
     return Made(out)
 
 
@@ -161,10 +154,10 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     >>> options.count, options.members, options.sub_goals[3], options.name(11)
     (15, 3, 'open-red-door', 'open-red-door/2')
     """
-    artefact = open_artefact(Path(path), ("options", "meta")).whole()
+    artefact = open_artefact(Path(path), "options", "meta")
     config = artefact.config
     folder = Path(ensemble) if ensemble else artefact.input("ensemble")
-    source = open_artefact(folder, "ensemble").whole()
+    source = open_artefact(folder, "ensemble")
     ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
     weights = load_tensors(artefact.path / "options.safetensors")
     policies = make_policies(config, weights, source.config)

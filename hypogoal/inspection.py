@@ -15,17 +15,13 @@ from rich.console import Group
 from rich.table import Table
 
 from hypogoal.core.artefacts import (
+    AGAIN,
+    LOG,
     MANIFEST,
     Artefact,
-    check_parent,
-    extra_files,
-    file_faults,
-    find_input,
-    open_artefact,
 )
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_end, read_json, read_text, replacing, visible
-from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.core.own_code import command
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
@@ -51,9 +47,9 @@ def _describe_part(path: Path) -> dict[str, Any]:
         details: dict[str, Any] = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
         details |= {"observation_dtype": type_text(dataset.observation_dtype)}
         return {"kind": "data", "path": str(path), "counts": dataset.counts(), **details, "config": dataset.config}
-    artefact = open_artefact(path)
+    artefact = Artefact(path)
     keys = ("kind", "result", "inputs", "seed", "config", "command", "took", "versions", "format", "files")
-    details = {"path": str(path), **artefact.manifest, "result": result_of(path)}
+    details = {"path": str(path), **artefact.manifest.model_dump(), "result": result_of(path)}
     return {key: details.get(key) for key in ("path", *keys)}
 
 
@@ -112,7 +108,7 @@ def numbers_of(path: Path) -> Mapping[str, Any] | None:
 
     for folder in (path, path / EVALUATION):
         if (folder / MANIFEST).is_file():
-            artefact = open_artefact(folder)
+            artefact = Artefact(folder)
             return read_numbers(artefact) if artefact.kind == EVALUATION else None
     return None
 
@@ -170,7 +166,6 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
         actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
         do = f"Read them as arrays: {command('export', path, '--out', path.stem + '.npz')}"
         raise UserError("the states are not pictures", actual, do)
-    check_parent(folder / "labelled")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []
@@ -205,7 +200,7 @@ def faults_of(path: Path) -> list[str]:
     faults: list[str] = []
     for part in parts:
         try:
-            for fault in _artefact_faults(open_artefact(part), path) if part.is_dir() else _data_faults(part):
+            for fault in _artefact_faults(Artefact(part), path) if part.is_dir() else _data_faults(part):
                 faults.append(f"{part}: {fault}")
         except UserError as error:  # for example a manifest that is a folder
             faults.append(str(error))
@@ -218,7 +213,7 @@ def notes_of(path: Path) -> list[str]:
     with contextlib.suppress(UserError):
         for part in filter(Path.is_dir, _parts(path)):
             with contextlib.suppress(UserError):
-                notes += _notes_of(open_artefact(part), path)
+                notes += _notes_of(Artefact(part), path)
     return notes
 
 
@@ -233,10 +228,9 @@ def _parts(path: Path) -> list[Path]:
 
 def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:
     path = artefact.path
-    yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
-    for entry in artefact.manifest["inputs"]:
-        if not (artefact.path / entry["relative"]).resolve().is_relative_to(folder.resolve()):
-            yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not checked"
+    for entry in artefact.manifest.inputs:
+        if not (artefact.path / entry.relative).resolve().is_relative_to(folder.resolve()):
+            yield f"{path}: its input {entry.path} ({entry.kind}) lies outside, not checked"
 
 
 def _data_faults(path: Path) -> Iterator[str]:
@@ -248,18 +242,18 @@ def _data_faults(path: Path) -> Iterator[str]:
 
 
 def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
-    faults = file_faults(artefact)
+    faults = artefact.file_faults()
     yield from (f"{name}: {fault}" for name, fault in faults.items())
     bad = {*faults}
-    for name in artefact.manifest["files"]:
+    for name in artefact.manifest.files:
         if name not in bad and (check := CONTENTS.get(Path(name).suffix)) is not None:
             for fault in _fault(partial(check, artefact.path / name)):
                 bad.add(name)
                 yield fault
-    for entry in artefact.manifest["inputs"]:
-        within = (artefact.path / entry["relative"]).resolve().is_relative_to(folder.resolve())
-        if within and (fault := find_input(artefact.path, entry, beside=True)[1]):
-            yield f"its input {entry['path']} ({entry['kind']}) is {fault}"
+    for entry in artefact.manifest.inputs:
+        within = (artefact.path / entry.relative).resolve().is_relative_to(folder.resolve())
+        if within and (fault := artefact.input_fault(entry)):
+            yield f"its input {entry.path} ({entry.kind}) is {fault}"
     if artefact.kind == "ensemble":  # last, since its files may be missing
         for sub_goal in artefact.config["sub_goals"]:
             if f"{sub_goal}.safetensors" not in bad:
@@ -285,7 +279,7 @@ def _fault(read: Callable[[], object]) -> Iterator[str]:
 def _read_table(path: Path) -> None:
     from hypogoal.options.tables import read_table
 
-    read_table(path, ("value",) if path.name == NUMBERS_CSV else None)  # its other columns are texts
+    read_table(path, ("value",) if path.name == "numbers.csv" else None)  # its other columns are texts
 
 
 def _read_lines(path: Path) -> None:

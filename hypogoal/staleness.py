@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hypogoal.core.artefacts import Artefact, check_files, find_input, open_artefact
+from hypogoal.core.artefacts import Artefact
 from hypogoal.inspection import EVALUATION, parts_of
 
 READS_ALL = (EVALUATION, "comparison", "report")  # kinds that other artefacts are not made from
@@ -31,7 +31,7 @@ class State:
 def states_of(run: Path) -> list[State]:
     """The data files and artefacts of a run in the order in which they are made; a ``UserError`` if there are none."""
     parts = parts_of(run)
-    artefacts = {path.resolve(): open_artefact(path) for path in parts if path.is_dir()}
+    artefacts = {path.resolve(): Artefact(path) for path in parts if path.is_dir()}
     states = {path.resolve(): State(path) for path in parts if not path.is_dir()}
     for artefact in _in_order(artefacts):
         reasons = (
@@ -67,20 +67,19 @@ def _in_order(artefacts: Mapping[Path, Artefact]) -> Iterator[Artefact]:
 
 def _places(artefact: Artefact) -> list[Path]:
     """Where an artefact's inputs lie."""
-    return [(artefact.path / entry["relative"]).resolve() for entry in artefact.manifest["inputs"]]
+    return [artefact.place_of(entry) for entry in artefact.manifest.inputs]
 
 
 def _faults(artefact: Artefact) -> Iterator[str]:
-    faults = check_files(artefact)
+    faults = [f"{name}: {fault}" for name, fault in artefact.file_faults().items()]
     if faults:
         more = f" and {len(faults) - 1} more" if len(faults) > 1 else ""
         yield f"{faults[0]}{more}"
 
 
 def _of_inputs(artefact: Artefact, states: Mapping[Path, State]) -> Iterator[str]:
-    for entry, place in zip(artefact.manifest["inputs"], _places(artefact), strict=True):
-        _, fault = find_input(artefact.path, entry, beside=place in states)
-        if fault:
+    for entry, place in zip(artefact.manifest.inputs, _places(artefact), strict=True):
+        if fault := artefact.input_fault(entry):
             yield f"its input {_shown(place)} is {fault}"
         elif place in states and states[place].reasons:
             yield f"its input {_shown(place)} is stale"
@@ -99,10 +98,10 @@ def _since(artefact: Artefact, artefacts: Mapping[Path, Artefact]) -> Iterator[s
 
 def _command(artefact: Artefact) -> str:
     """The recorded command with today's places of inputs and output, as one would type it; empty from Python."""
-    words = list(artefact.manifest.get("command", []))
+    words = list(artefact.manifest.command)
     if words[:1] != ["hypogoal"]:
         return ""
-    moved = {entry["path"]: place for entry, place in zip(artefact.manifest["inputs"], _places(artefact), strict=True)}
+    moved = {entry.path: place for entry, place in zip(artefact.manifest.inputs, _places(artefact), strict=True)}
     typed = [_shown(moved[word]) if word in moved else word for word in words]
     if "--out" in typed:
         typed[typed.index("--out") + 1] = _shown(artefact.path.resolve())

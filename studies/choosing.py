@@ -92,7 +92,7 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
 
 
 def _played(artefact: Artefact) -> list[dict[str, str]]:
-    config, seed = artefact.config, artefact.manifest["seed"]
+    config, seed = artefact.config, artefact.seed
     policy = PLANNED if config["network"] == PLANNED else "learned"
     agent = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
     played, rows = play_agent(artefact, seed), []

@@ -12,7 +12,7 @@ import pytest
 from command_line import fails, refuses, run, settings
 from PIL import Image
 
-from hypogoal.core.manifests import MANIFEST
+from hypogoal.core.artefacts import MANIFEST
 
 PICTURE = b"\x89PNG\r\n\x1a\n" + bytes(range(200))
 # File of a run -> the command that reads it.

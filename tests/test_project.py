@@ -334,7 +334,7 @@ def test_one_way_to_print_and_one_to_open() -> None:
     printing = re.compile(r"typer\.echo\(|(?<![\w.])print\(|Console\(|sys\.std(out|err)\.write")
     opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
     own = {
-        "core/config.py", "core/drafts.py", "core/files.py", "core/locks.py",
+        "core/artefacts.py", "core/config.py", "core/files.py",
         "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/sweep.py",
         "hypotheses/load.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
         "own_data/videos.py", "tools/export.py", "stages/train_ensemble.py",

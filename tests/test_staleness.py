@@ -7,20 +7,17 @@ from pathlib import Path
 import pytest
 
 from hypogoal.cli import main
-from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.drafts import BEGUN, COMMAND, draft_folder, sole_writer
+from hypogoal.core.artefacts import Draft, create
 from hypogoal.staleness import lines, states_of
 
 
 def make(run: Path, name: str, kind: str, *inputs: str, text: str = "", command: str = "", force: bool = False) -> None:
     """An artefact of one file; ``command`` is what made it."""
-    token = COMMAND.set(tuple(shlex.split(command)))
     paths = [run / each for each in inputs]
-    try:
-        with create_artefact(run / name, kind=kind, config={}, seed=0, inputs=paths, force=force) as folder:
-            (folder / "file.txt").write_text(text)
-    finally:
-        COMMAND.reset(token)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", shlex.split(command) or ["mine.py"])
+        with create(run / name, kind=kind, config={}, seed=0, inputs=paths, force=force) as draft:
+            (draft.files / "file.txt").write_text(text)
 
 
 @pytest.fixture
@@ -30,7 +27,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     made = tmp_path / "before"
     make(made, "ensemble", "ensemble", command="hypogoal train-ensemble data.h5 --out before/ensemble")
     make(made, "options", "options", "ensemble", command=f"hypogoal train-options {made}/ensemble --out before/options")
-    make(made, "meta", "meta", "ensemble", "options", command="hypogoal.train_meta()")
+    make(made, "meta", "meta", "ensemble", "options", command="program.py")
     make(made, "evaluation", "evaluation", "ensemble", "meta", command="hypogoal evaluate before")
     return made.rename(tmp_path / "run")
 
@@ -47,9 +44,9 @@ def test_a_new_run_is_up_to_date(run: Path) -> None:
 def test_a_changed_input_makes_all_that_follow_stale(run: Path) -> None:
     make(run, "ensemble", "ensemble", text="other", force=True)
     assert stale(run) == {
-        "options": "its input run/ensemble is changed since",
-        "meta": "its input run/ensemble is changed since; its input run/options is stale",
-        "evaluation": "its input run/ensemble is changed since; its input run/meta is stale",
+        "options": "its input run/ensemble is changed since it was written",
+        "meta": "its input run/ensemble is changed since it was written; its input run/options is stale",
+        "evaluation": "its input run/ensemble is changed since it was written; its input run/meta is stale",
     }
     names = [state.path.name for state in states_of(run)]
     assert names.index("ensemble") < names.index("options") < names.index("meta") < names.index("evaluation")
@@ -67,7 +64,7 @@ def test_a_damaged_file_and_a_lost_input(run: Path) -> None:
     (run / "meta" / "file.txt").write_text("mine")
     assert stale(run)["meta"] == "file.txt: changed since it was written"
     (run / "options").rename(run.parent / "elsewhere")
-    assert "its input run/options is gone" in stale(run)["meta"]
+    assert "its input run/options is missing" in stale(run)["meta"]
 
 
 def test_an_evaluation_lacks_what_was_made_since(run: Path) -> None:
@@ -92,8 +89,10 @@ def test_what_is_in_progress_is_said(
     monkeypatch.chdir(tmp_path)
     run = Path("run")
     make(run, "dqn", "baseline")
-    with sole_writer(run / "ppo"):
-        (draft_folder(run / "ppo") / BEGUN).write_text("{}")
+    draft = Draft(run / "ppo")
+    with draft.locked():
+        draft.begun.write_text("{}")
+        draft.checkpoints().save({"step": 1})
         assert main(["verify", "run"]) == 0
         assert capsys.readouterr().out.splitlines()[:2] == ["run: whole so far", "run/ppo: in progress"]
         assert main(["status", "run"]) == 0

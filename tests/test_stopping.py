@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from hypogoal.cli import main
+from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.drafts import draft_folder, unfinished
 from tests.attacks.kills import STAGES, needed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +57,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.Captu
     out = tmp_path / "ppo"
     arguments = ["train-baseline", "doorkey", "--out", str(out), "--set", "random_episodes=5", "-q"]
     for number, resume in ((signal.SIGINT, []), (signal.SIGTERM, ["--resume"])):
-        log = draft_folder(out) / "files" / "metrics.jsonl"
+        log = Draft(out).folder / "files" / "metrics.jsonl"
         before = log.stat().st_size if log.exists() else 0
         command = [sys.executable, "-m", "hypogoal", *arguments, *resume]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
@@ -71,7 +71,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.Captu
         assert words == (
             "hypogoal: stopped; the last checkpoint is kept: give the same command with --resume to continue\n"
         )
-        assert unfinished(out) and not out.exists()
+        assert Draft(out).is_resumable and not out.exists()
     for given, line in (([], "an unfinished output exists"), (["--resume", "--seed", "1"], "begun with seed=0, not 1")):
         assert main([*arguments, *given]) == 2
         err = capsys.readouterr().err
@@ -88,7 +88,7 @@ def test_workers_save_when_their_stage_is_stopped(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hypogoal", "train-ensemble", str(data), "--out", str(out), *long]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         until = time.monotonic() + WAIT_SECONDS
-        logs = [draft_folder(out) / "checkpoint" / f"{name}.jsonl" for name in ("open-red-door", "go-to-goal")]
+        logs = [Draft(out).folder / "checkpoint" / f"{name}.jsonl" for name in ("open-red-door", "go-to-goal")]
         while not all(log.exists() and log.stat().st_size for log in logs):
             assert process.poll() is None and time.monotonic() < until
             time.sleep(0.05)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hypogoal.core.manifests import LOG, MANIFEST, NUMBERS_CSV, sealed
+from hypogoal.core.artefacts import LOG, MANIFEST
 from hypogoal.core.tensors import save_tensors
 from hypogoal.data import Collected, States, create_hdf5, write_dataset
 
@@ -42,7 +42,7 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
     return {
         "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
         "baseline": {LOG, "episodes.csv", "layout.json", "policy.safetensors"},
-        "evaluation": {"metrics.json", NUMBERS_CSV, "arrays.h5"},
+        "evaluation": {"metrics.json", "numbers.csv", "arrays.h5"},
         "report": {"index.html"},
         "comparison": {"index.html", "metrics.json"},
     }[kind]
@@ -64,7 +64,7 @@ def fill(artefact: Path, kind: str, config: Mapping[str, Any]) -> None:
 
 
 def reseal(artefact: Path, **changes: Any) -> dict[str, Any]:
-    """Change keys of an artefact's manifest, and its checksum with them; returns the manifest."""
+    """Change keys of an artefact's manifest; returns the manifest."""
     manifest = json.loads((artefact / MANIFEST).read_bytes()) | changes
-    (artefact / MANIFEST).write_bytes(sealed(manifest))
+    (artefact / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     return manifest

@@ -131,7 +131,7 @@ def audit(
 
 
 def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, member: int | None) -> None:
-    from hypogoal.core.artefacts import DATA, TO_FILL_IN, open_artefact
+    from hypogoal.core.artefacts import DATA, TO_FILL_IN, Artefact
     from hypogoal.data import open_dataset
     from hypogoal.tools.audit_recorded import audit_recorded, lines_of
 
@@ -142,7 +142,7 @@ def _audit_recorded(call: cli.StageCall, source: str, sub_goal: str | None, memb
     parts = audit_recorded(Path(source), call.out, sub_goal=sub_goal, **how)
     for line in () if call.how["quiet"] else lines_of(parts):
         say(line)
-    data = open_artefact(call.out).input(DATA)
+    data = Artefact(call.out).input(DATA)
     goals = open_dataset(data).sub_goals
     if len(goals) == 1 and not call.how["quiet"]:  # 'import' takes labels of a data file's only sub-goal
         table = call.out / "next" / goals[0] / TO_FILL_IN

@@ -38,13 +38,12 @@ def run(
 ) -> None:
     """Run all cells of an experiment: from nothing to a report. (--set also takes STAGE.KEY=VALUE.)"""
     from hypogoal.core.compute import prepare
-    from hypogoal.core.drafts import place_of
     from hypogoal.core.errors import UserError
     from hypogoal.experiments.run import in_part, plan
     from hypogoal.experiments.run import run as run_cells
     from hypogoal.inspection import numbers_of, summary_of
 
-    out = place_of(out or Path("runs", Path(experiment.rpartition(":")[2]).stem))
+    out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
     cells, workers = plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)

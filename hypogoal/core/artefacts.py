@@ -1,108 +1,208 @@
-"""Artefacts: folders with a ``manifest.json``, written beside their final name and renamed at the end.
+"""The store: folders with a ``manifest.json``, and data files, each made in a hidden draft and renamed when whole.
 
-A folder with a manifest is complete (Spec A8). The manifest records kind, format version, the full resolved
-configuration, the seed, the sha256 of every file and of every input's manifest, package versions, time and memory.
+``.NAME.partial/``, the draft of ``NAME``, has ``files/`` (the future output), ``checkpoint/`` (see
+``core.checkpoints``), ``begun.json`` (what was asked for) and ``lock``, which the working process holds.
 """
 
 import contextlib
 import hashlib
+import json
 import os
 import platform
+import shutil
+import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from hypogoal.core import drafts
-from hypogoal.core.config import as_dict
-from hypogoal.core.errors import UserError
-from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json, visible
-from hypogoal.core.manifests import (
-    AGAIN,
-    FORMAT_VERSION,
-    MANIFEST,
-    TOOK,
-    check_writable,
-    digest_of,
-    read_manifest,
-    sealed,
-)
+from filelock import FileLock, Timeout
+from pydantic import BaseModel, ValidationError
 
-DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
-# How a file of a kind begins, and what is in its first bytes, even if the rest is cut off.
-SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations.npy")}
+from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.files import read_json, replace_text, sync, visible
+
+FORMAT = 3
+READ = (2, FORMAT)  # 2, of 0.23 and 0.24, ended with a digest of itself
+MANIFEST = "manifest.json"
+LOG = "metrics.jsonl"
 TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
-DEPTH = 3  # levels of folders below a run that are searched for artefacts
-THE_FILE = "the file is"
-PIECE = 1 << 20  # bytes hashed at once
+DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
+# How a file of a kind begins, and what its first bytes have, even if the rest is cut off.
+SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations.npy")}
 FRONT = 1 << 16  # bytes of a file that are looked at for its kind
+DEPTH = 3  # levels of folders below a run that are searched for artefacts
+PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
+NO_RESULT = ("workers", "quiet")  # settings that change no result
+AGAIN = "Make the artefact again."
+ANEW = "Give --force and no --resume to begin anew."
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
     "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
     "safetensors", "stable-baselines3",
 )  # fmt: skip
+# Settings of 0.23 without which what was made would be taken for something else, and the values that changed nothing.
+GONE = {
+    "actions": "all",
+    "encoder": "separate",
+    "initiation": "anywhere",
+    "keyring": True,
+    "policy_pixels": "all",
+    "policy_view": "full",
+}
 
 
-@dataclass(frozen=True)
+class Input(BaseModel):
+    """What an artefact was made from: an artefact or a file, and its :func:`sha256_of`."""
+
+    kind: str
+    path: str  # as it was given
+    relative: str  # from the artefact's folder
+    sha256: str
+
+
+class Manifest(BaseModel):
+    """What made an artefact, and what it holds."""
+
+    kind: str
+    format: int = FORMAT
+    config: dict[str, Any]
+    seed: int
+    inputs: list[Input] = []
+    files: dict[str, str] = {}  # path within the folder -> sha256
+    versions: dict[str, str] = {}
+    command: list[str] = []
+    took: dict[str, Any] = {}  # seconds and bytes of memory, in which alone two runs of a command differ
+
+
+class Settings(dict[str, Any]):
+    """A manifest's configuration; a missing key is a ``UserError``."""
+
+    def __missing__(self, key: str) -> Any:
+        raise UserError("the manifest's configuration lacks a setting", key, AGAIN)
+
+
 class Artefact:
-    """A complete artefact: its folder and its manifest."""
+    """A complete artefact: its folder and its manifest, which is read and checked; its files are not."""
 
-    path: Path
-    manifest: dict[str, Any]
+    def __init__(self, path: Path):
+        self.path = path
+        if not (path / MANIFEST).is_file():
+            raise UserError(f"no artefact here (no {MANIFEST})", path, "Give the folder that a stage wrote.")
+        self.manifest = _read_manifest(path / MANIFEST, AGAIN)
 
     @property
     def kind(self) -> str:
-        """ensemble, options, meta, baseline, evaluation, report, comparison, audit or recorded-audit."""
-        return str(self.manifest["kind"])
+        """ensemble, options, meta, baseline, evaluation, report, comparison, audit, recorded-audit, hub, episodes."""
+        return self.manifest.kind
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved configuration that made it; a missing key is a ``UserError``."""
-        return Settings(self.manifest["config"], self.path)
+        """The resolved configuration that made it."""
+        return Settings(self.manifest.config)
 
     @property
     def seed(self) -> int:
         """The seed that made it."""
-        return int(self.manifest["seed"])
-
-    def whole(self) -> Self:
-        """This artefact; a ``UserError`` if a file is not as in the manifest. Takes some ms per MB."""
-        if faults := check_files(self):
-            raise UserError(f"the artefact is damaged ({faults[0]})", self.path, AGAIN)
-        return self
+        return self.manifest.seed
 
     def input(self, kind: str) -> Path:
-        """The input of ``kind``, at its relative or its recorded path; a ``UserError`` if gone or changed."""
-        for entry in self.manifest["inputs"]:
-            if entry["kind"] == kind:
-                path, fault = find_input(self.path, entry)
-                if path is None:
-                    source = f"the {kind} that {self.path} was made from"
-                    raise UserError(f"{source} is {fault}", entry["path"], "Restore it.")
-                return path
+        """The input of a kind; a ``UserError`` if there is none, or it is missing or was changed."""
+        for entry in self.manifest.inputs:
+            if entry.kind == kind:
+                if fault := self.input_fault(entry):
+                    raise UserError(f"the {kind} that {self.path} was made from is {fault}", entry.path, "Restore it.")
+                return self.place_of(entry)
         raise UserError(f"{self.path} was not made from any {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
+    def place_of(self, entry: Input) -> Path:
+        """Where an input lies: at its relative path or, if nothing is there, at its recorded one."""
+        relative, recorded = self.path / entry.relative, Path(entry.path)
+        moved_alone = recorded.exists() and not relative.exists()
+        return (recorded if moved_alone else relative).resolve()
 
-class Settings(dict[str, Any]):
-    """A manifest's configuration: a missing key is a ``UserError``."""
+    def input_fault(self, entry: Input) -> str:
+        """What is wrong with an input; empty if nothing is."""
+        return _fault(self.place_of(entry), entry.sha256)
 
-    def __init__(self, values: dict[str, Any], path: Path):
-        super().__init__(values)
-        self._path = path
+    def file_faults(self) -> dict[str, str]:
+        """What is wrong with each file that is missing or was changed, by name."""
+        faults = {name: _fault(self.path / name, digest) for name, digest in self.manifest.files.items()}
+        return {name: fault for name, fault in faults.items() if fault}
 
-    def __missing__(self, key: str) -> Any:
-        raise UserError(f"the manifest's configuration has no {key!r}", self._path / MANIFEST, AGAIN)
+    def faults(self) -> list[str]:
+        """A line for each file and each input that is missing or was changed."""
+        files = [f"{name}: {fault}" for name, fault in self.file_faults().items()]
+        inputs = [(entry, self.input_fault(entry)) for entry in self.manifest.inputs]
+        return files + [f"its input {entry.path} ({entry.kind}) is {fault}" for entry, fault in inputs if fault]
+
+
+def _fault(path: Path, digest: str) -> str:
+    try:
+        return "" if sha256_of(path) == digest else "changed since it was written"
+    except (OSError, UserError):
+        return "missing"
+
+
+def _read_manifest(path: Path, do: str) -> Manifest:
+    content = read_json(path, "the manifest is", do)
+    version = content.get("format") if isinstance(content, dict) else None
+    if version not in READ:
+        fault = f"this hypogoal reads formats 2 and 3, this is {version}"
+        raise UserError(fault, path, "Use the hypogoal that wrote it, or make it again.")
+    try:
+        manifest = Manifest.model_validate(content)
+    except ValidationError as error:
+        place = ".".join(map(str, error.errors()[0]["loc"]))
+        raise UserError(f"the manifest's {place!r} is missing or malformed", path, do) from None
+    settings = manifest.config | manifest.config.get("domain_config", {})
+    for key, without in GONE.items():
+        if settings.get(key, without) != without:
+            raise UserError(f"it was made with {key}={settings[key]}, which is gone since 0.24", path, do)
+    return manifest
+
+
+def open_artefact(path: Path, *kinds: str) -> Artefact:
+    """A complete artefact of one of these kinds, or of any, whose files are as they were written; else a ``UserError``.
+
+    Takes some ms per MB.
+    """
+    artefact = Artefact(path)
+    if kinds and artefact.kind not in kinds:
+        fault = f"this is a {artefact.kind!r} artefact, but {' or '.join(kinds)} is needed"
+        raise UserError(fault, path, "Give the right folder.")
+    for name, fault in artefact.file_faults().items():
+        raise UserError(f"the artefact is damaged ({name}: {fault})", path, AGAIN)
+    return artefact
+
+
+def find_artefacts(run: Path, kind: str) -> list[Artefact]:
+    """All artefacts of a kind below ``run`` and ``run`` itself, sorted by path."""
+    if not run.is_dir():
+        raise UserError("no such run", run, "Give the folder of a run.")
+    folders = [path.parent for path in visible(run, MANIFEST)]
+    near = [folder for folder in folders if len(folder.relative_to(run).parts) <= DEPTH]
+    return [artefact for artefact in map(Artefact, near) if artefact.kind == kind]
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a regular file as hexadecimal digits, read up to its size when opened; else a ``UserError``."""
-    digest = hashlib.sha256()
-    with open_file(path, THE_FILE, AGAIN) as file:
-        while piece := file.read(PIECE):
-            digest.update(piece)
-    return digest.hexdigest()
+    """The sha256 of a file; of an artefact that of what its manifest says, without white space and ``took``."""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    content = read_json(path / MANIFEST, "the manifest is", AGAIN)
+    kept = {key: value for key, value in content.items() if key not in ("took", "sha256")}
+    digest = hashlib.sha256(_text_of(kept).encode()).hexdigest()
+    if kept["format"] == FORMAT:
+        return digest
+    sealed = _text_of({**kept, "sha256": digest})  # what was made of it recorded its sha256 with that at its end
+    return hashlib.sha256(sealed.encode()).hexdigest()
+
+
+def _text_of(manifest: Mapping[str, Any]) -> str:
+    return json.dumps(manifest, indent=1, allow_nan=False) + "\n"
 
 
 def versions() -> dict[str, str]:
@@ -112,118 +212,6 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(metadata.PackageNotFoundError):
             installed[name] = metadata.version(name)
     return installed
-
-
-def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
-    """Check, before any work, that ``out`` may be written as a ``kind``: an artefact's, ``data`` or ``arrays``.
-
-    A ``UserError`` if its name is too long; it is or contains an input; it exists without ``force`` or is of another
-    kind; another process writes it; or it is unfinished and neither ``force`` nor ``resume`` is given. With ``resume``
-    a complete output passes: ``create_artefact`` compares it.
-    """
-    place = out.resolve()
-    if len(os.fsencode(place.name)) > MAX_NAME_BYTES:  # the draft's name is longer
-        raise UserError(f"the output's name is longer than {MAX_NAME_BYTES} bytes", out, "Choose a shorter one.")
-    for path in inputs:
-        if path.resolve().is_relative_to(place):
-            raise UserError("the output would replace an input", path, "Choose another --out.")
-    if out.exists():
-        if not resume:  # only the stage knows whether a complete output was made with the requested settings
-            drafts.check_replaceable(out, force=force)
-        check_kind(out, kind)
-    out = drafts.place_of(out)
-    check_parent(out)
-    drafts.check_free(out, force=force, resume=resume)
-    drafts.sweep_up(out.parent)
-    return out
-
-
-def check_kind(out: Path, kind: str) -> None:
-    """Refuse (``UserError``) to replace anything but an empty folder or an output, whole or damaged, of the same kind.
-
-    A mistyped ``--out`` with ``--force`` may hit months of work, or files that are not hypogoal's.
-    """
-    if out.is_dir():
-        if not any(out.iterdir()):
-            return
-        if not (out / MANIFEST).is_file():
-            raise UserError(f"the existing output is not of kind {kind!r}: a folder without a manifest", out, AWAY)
-        existing = _manifest_kind(out)
-        if existing != kind:
-            reason = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
-            raise UserError(f"the existing output is not of kind {kind!r}: {reason}", out, AWAY)
-        return
-    if not begins_as(out, kind):
-        raise UserError(f"the existing output is not of kind {kind!r}: another file", out, AWAY)
-
-
-def begins_as(path: Path, kind: str, do: str = AWAY) -> bool:
-    """Whether a file begins as those of a kind, data or arrays; ``do`` is the advice where it cannot be read."""
-    with open_file(path, THE_FILE, do) as file:
-        begin = file.read(FRONT)
-    signature, content = SIGNATURES.get(kind, (b"", b""))
-    return bool(signature) and begin.startswith(signature) and content in begin
-
-
-def _manifest_kind(folder: Path) -> str:
-    """The kind in a manifest, whatever else is wrong with it; empty if it cannot be read."""
-    with contextlib.suppress(UserError):
-        manifest = read_json(folder / MANIFEST, "the manifest is", "")
-        if isinstance(manifest, dict) and "format" in manifest and isinstance(manifest.get("kind"), str):
-            return str(manifest["kind"])
-    return ""
-
-
-def check_parent(out: Path) -> None:
-    """Refuse (``UserError``) an output whose folder cannot be made or written to."""
-    parent = next(folder for folder in out.absolute().parents if folder.exists())
-    if not parent.is_dir():
-        raise UserError("the output's folder cannot be made, a file is in the way", parent, "Choose another --out.")
-    if not os.access(parent, os.W_OK):
-        raise UserError("no permission to write", parent, "Choose another --out.")
-
-
-@contextlib.contextmanager
-def create_artefact(
-    out: Path,
-    *,
-    kind: str,
-    config: Any,
-    seed: int,
-    inputs: Sequence[Path] = (),
-    force: bool = False,
-    resume: bool = False,
-) -> Iterator[Path]:
-    """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
-
-    ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are the artefact folders or data files
-    that were read. ``checkpoints_of`` finds the checkpoints beside the folder. If the block raises, ``out`` stays as it
-    was, and the folder is removed unless it has a checkpoint.
-
-    Raises:
-        UserError: see :func:`claim`, or the unfinished output has another configuration, seed or inputs.
-        Complete: with ``resume``, the output is complete and was made with the same ones.
-    """
-    started = time.monotonic()
-    inputs = [Path(path) for path in inputs]
-    requested, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
-    config = config if isinstance(config, dict) else as_dict(config)
-    header = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
-    entries = [_input_entry(path, out) for path in inputs]
-    check_writable({**header, "inputs": entries, "files": {}}, out)
-    identity = {**header, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
-    if resume and out.exists() and not drafts.unfinished(out):
-        manifest = open_artefact(out, kind).manifest
-        hashes = [entry["sha256"] for entry in manifest["inputs"]]
-        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, requested)
-    with drafts.draft(out, identity, force=force, resume=resume) as work:
-        yield work.files
-        written = sorted(file for file in work.files.rglob("*") if file.is_file() and file.name != TO_FILL_IN)
-        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
-        manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
-        manifest[TOOK] = {"seconds": round(time.monotonic() - started, 1), "memory": peak_memory()}
-        (work.files / MANIFEST).write_bytes(sealed(manifest))
-        drafts.put_in_place(work.files, out)
 
 
 def peak_memory() -> int:
@@ -236,102 +224,234 @@ def peak_memory() -> int:
     return 1024 * max(kilobytes)
 
 
-def _input_entry(path: Path, out: Path) -> dict[str, str]:
-    kind = open_artefact(path).kind if path.is_dir() else DATA
-    digest = digest_of(path / MANIFEST) if path.is_dir() else sha256_of(path)
-    try:
-        relative = os.path.relpath(path.absolute(), out.absolute())
-    except ValueError:  # Windows: on another drive
-        relative = str(path.absolute())
-    return {"path": str(path), "relative": relative, "kind": kind, "sha256": digest}
+class Draft:
+    """An output in the making; :func:`create` gives one to fill.
 
-
-def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefact:
-    """A complete artefact of ``kind`` (one, several, or None for any).
-
-    A path that is missing or no artefact, a damaged manifest, another kind or a newer format is a ``UserError``.
+    Attributes:
+        files: the folder to fill; of a data file the folder in which to write it under the output's name.
     """
-    manifest_path = path / MANIFEST
-    if not path.exists():
-        raise UserError("no such artefact", path, "Check the path, or run the stage that makes it.")
-    if not path.is_dir() or not manifest_path.is_file():
-        raise UserError(f"not an artefact (no {MANIFEST})", path, "Give the folder that a stage wrote.")
-    manifest = read_manifest(manifest_path)
-    kinds = (kind,) if isinstance(kind, str) else kind
-    if kinds is not None and manifest["kind"] not in kinds:
-        fault = f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed"
-        raise UserError(fault, path, "Give the right folder.")
-    return Artefact(path, manifest)
 
+    def __init__(self, out: Path):
+        self.out = out.resolve()
+        self.folder = self.out.with_name(f".{self.out.name}.partial")
+        self.files = self.folder / "files"
+        self.begun = self.folder / "begun.json"
+        self.checkpoint = self.folder / "checkpoint"
+        self.lock = self.folder / "lock"
 
-def find_artefacts(run: Path, kind: str) -> list[Artefact]:
-    """All complete artefacts of ``kind`` below ``run`` (and ``run`` itself), sorted by path."""
-    if not run.is_dir():
-        raise UserError("no such run", run, "Give the folder of a run.")
-    near = [path.parent for path in visible(run, MANIFEST) if len(path.relative_to(run).parts) <= DEPTH + 1]
-    return [artefact for artefact in map(open_artefact, near) if artefact.kind == kind]
+    def checkpoints(self, name: str = "stage") -> Checkpoints:
+        """The checkpoints of this name."""
+        return Checkpoints(self.checkpoint / f"{name}.safetensors")
 
+    @property
+    def is_resumable(self) -> bool:
+        """Whether there is a checkpoint to continue from."""
+        return self.begun.is_file() and any(self.checkpoint.glob("*.safetensors"))
 
-def check_files(artefact: Artefact) -> list[str]:
-    """One line for each file of the artefact that is missing or changed."""
-    return [f"{name}: {fault}" for name, fault in file_faults(artefact).items()]
-
-
-def file_faults(artefact: Artefact) -> dict[str, str]:
-    """What is wrong with the files that an artefact's manifest lists, by name."""
-    listed = artefact.manifest["files"].items()
-    return {name: fault for name, digest in listed if (fault := file_fault(artefact.path, name, digest))}
-
-
-def extra_files(artefact: Artefact) -> list[str]:
-    """Files in the artefact's folder that its manifest should list; artefacts and drafts within are ignored."""
-    listed, present = {MANIFEST, *artefact.manifest["files"]}, []
-    for place, folders, names in os.walk(artefact.path):
-        inner = [Path(place, name) for name in folders if not name.endswith(drafts.PARTIAL)]
-        inner = [path for path in inner if not (path / MANIFEST).exists()]
-        folders[:] = sorted(path.name for path in inner if not path.is_symlink())
-        files = [*(Path(place, name) for name in names), *(path for path in inner if path.is_symlink())]
-        present += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
-    return [name for name in present if name not in listed and Path(name).name != TO_FILL_IN]
-
-
-def file_fault(folder: Path, name: str, digest: str) -> str:
-    """What is wrong with a file of an artefact; empty if it is whole."""
-    path = inside(folder, name)
-    if path is None:
-        return "outside the artefact"
-    if not path.is_file():
-        return "missing"
-    try:
-        return "" if sha256_of(path) == digest else "changed since it was written"
-    except UserError as error:
-        return _of_file(error)
-
-
-def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> tuple[Path | None, str]:
-    """The path of an input recorded in ``folder``'s manifest, and ""; or None and what is wrong.
-
-    It is looked for at its relative path, then, unless ``beside``, at its recorded path. A stranger may have written
-    these paths: they are only read from, and only a file with the recorded sha256 is accepted.
-    """
-    fault = "gone"
-    for candidate in (folder / entry["relative"], *(() if beside else (Path(entry["path"]),))):
-        is_data = entry["kind"] == DATA
-        target = candidate if is_data else candidate / MANIFEST
+    @property
+    def is_locked(self) -> bool:
+        """Whether a process works on it."""
+        if not self.lock.is_file():
+            return False
         try:
-            if not target.is_file():
-                continue
-            digest = sha256_of(target) if is_data else digest_of(target)
-            if digest == entry["sha256"]:
-                return candidate.resolve(), ""
-            fault = "changed since"
-        except UserError as error:
-            fault = _of_file(error)
-        except OSError:
-            continue
-    return None, fault
+            with FileLock(self.lock, timeout=0):
+                return False
+        except Timeout:
+            return True
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the lock; a ``UserError`` if another process does.
+
+        At the end a draft is removed that has neither a checkpoint nor a finished output.
+        """
+        lock = FileLock(self.lock, timeout=PATIENCE_SECONDS)
+        made = [folder for folder in self.folder.parents if not folder.exists()]
+        while not lock.is_locked:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire()
+            except FileNotFoundError:
+                continue  # its owner has just removed the folder
+            except Timeout:
+                do = "Wait until it is done, or choose another --out."
+                raise UserError("another process is writing this", self.out, do) from None
+        try:
+            yield
+        finally:
+            if not self.is_resumable and not (self.files / MANIFEST).is_file():
+                for folder in (self.checkpoint, self.files, self.folder):  # the lock last
+                    shutil.rmtree(folder, ignore_errors=True)
+                with contextlib.suppress(OSError):
+                    for folder in made:
+                        folder.rmdir()
+            lock.release()
+
+    def begin(self, wanted: Manifest) -> None:
+        """Remove what an earlier process left, and begin anew."""
+        self.begun.unlink(missing_ok=True)  # first: what is left then is not resumed
+        for folder in (self.checkpoint, self.files):
+            shutil.rmtree(folder, ignore_errors=True)
+        self.files.mkdir()
+        replace_text(self.begun, _text_of(wanted.model_dump()))
 
 
-def _of_file(error: UserError) -> str:
-    """What is wrong with a file that :func:`sha256_of` refuses."""
-    return error.what.removeprefix(f"{THE_FILE} ")
+@contextlib.contextmanager
+def create(
+    out: Path,
+    *,
+    kind: str,
+    config: Mapping[str, Any],
+    seed: int,
+    inputs: Sequence[Path] = (),
+    force: bool = False,
+    resume: bool = False,
+) -> Iterator[Draft]:
+    """A draft to fill; when the block ends, its manifest is written and it takes its place at ``out``.
+
+    ``config`` determines the output, beside ``seed``, ``inputs`` (artefacts and files) and versions; keys added in the
+    block are in the manifest. Of the kinds ``DATA`` and ``ARRAYS`` the output is the one file in ``draft.files``,
+    without a manifest. If the block raises, ``out`` stays as it was, and the draft stays if it has a checkpoint.
+
+    Raises:
+        UserError: ``out`` exists and ``force`` is not given, is of another kind or none of hypogoal's, would replace an
+            input, or is being written by another process; or its draft has a checkpoint and neither ``force`` nor
+            ``resume`` is given, or was begun with other settings, seed, inputs or versions.
+        Complete: with ``resume``, the output is complete and was made with these.
+    """
+    started = time.monotonic()
+    draft = Draft(out)
+    for path in inputs:
+        if path.resolve().is_relative_to(draft.out):
+            raise UserError("the output would replace an input", path, "Choose another --out.")
+    entries = [_input(path, draft.out) for path in inputs]
+    wanted = Manifest(kind=kind, config=dict(config), seed=seed, inputs=entries, versions=versions())
+    wanted.command = _command()
+    with draft.locked():
+        _put_in_place(draft)  # a process was killed while it did
+        begun = _begun(draft, wanted, out, force=force, resume=resume)
+        if begun is None:
+            draft.begin(wanted)
+        else:
+            draft.files.mkdir(exist_ok=True)
+            wanted.command = begun.command
+        try:
+            yield draft
+            wanted.config = dict(config)
+            wanted.took = {"seconds": round(time.monotonic() - started, 1), "memory": peak_memory()}
+            _finish(draft, wanted)
+        except BaseException as error:
+            if draft.is_resumable:
+                error.add_note("the last checkpoint is kept: give the same command with --resume to continue")
+            raise
+
+
+def _command() -> list[str]:
+    """The command of this process, without ``--resume``, which changes no result."""
+    program = Path(sys.argv[0]).name
+    words = ["hypogoal" if program == "__main__.py" else program, *sys.argv[1:]]
+    return [word for word in words if word != "--resume"]
+
+
+def _input(path: Path, out: Path) -> Input:
+    kind = Artefact(path).kind if path.is_dir() else DATA
+    relative = os.path.relpath(path.resolve(), out)
+    return Input(kind=kind, path=str(path), relative=relative, sha256=sha256_of(path))
+
+
+def _begun(draft: Draft, wanted: Manifest, out: Path, *, force: bool, resume: bool) -> Manifest | None:
+    """How the draft to continue was begun; None: begin anew. May I write here? If not, a ``UserError``."""
+    is_free = not out.exists() or (out.is_dir() and not any(out.iterdir()))
+    if not is_free and kind_of(out) != wanted.kind:
+        what = f"of kind {kind_of(out)!r}" if kind_of(out) else "not made by hypogoal"
+        raise UserError(f"what is there is {what}, and would be replaced by one of kind {wanted.kind!r}", out, AWAY)
+    if draft.is_resumable and resume:
+        begun = _read_manifest(draft.begun, ANEW)
+        _refuse_other(begun, wanted, "the unfinished output was begun", out)
+        return begun
+    if draft.is_resumable and not force:
+        raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
+    if is_free:
+        return None
+    if resume:
+        made = _made(out).model_copy(update={"versions": {}})  # nothing is continued
+        _refuse_other(made, wanted, "the complete output was made", out)
+        raise Complete(out)
+    if not force:
+        raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
+    return None
+
+
+def _refuse_other(before: Manifest, now: Manifest, subject: str, out: Path) -> None:
+    """Refuse (``UserError``) what differs in a setting that both have, in seed, inputs or versions."""
+    old, new = _identity(before), _identity(now)
+    for key, value in old.items():
+        if key in new and json.dumps(value) != json.dumps(new[key]):
+            other = "other inputs" if key == "inputs" else f"{key}={value}, not {new[key]}"
+            raise UserError(f"{subject} with {other}", out, ANEW)
+
+
+def _identity(manifest: Manifest) -> dict[str, Any]:
+    """All that determines an output, by name."""
+    inputs = [entry.sha256 for entry in manifest.inputs]
+    identity = {"kind": manifest.kind, "seed": manifest.seed, "inputs": inputs, **manifest.versions, **manifest.config}
+    return {key: value for key, value in identity.items() if key not in NO_RESULT}
+
+
+def _made(out: Path) -> Manifest:
+    """What made a complete output, a folder or an HDF5 file."""
+    if out.is_dir():
+        return open_artefact(out).manifest
+    import h5py
+
+    try:
+        with h5py.File(out) as file:
+            domain = file.attrs["domain"]
+            name = domain if isinstance(domain, str) else domain.decode()
+            config = {**json.loads(file.attrs["config"]), "domain": name}
+            return Manifest(kind=DATA, config=config, seed=int(file.attrs["seed"]))
+    except (OSError, KeyError, ValueError) as error:
+        raise UserError(f"the data file is damaged ({error})", out, ANEW) from None
+
+
+def kind_of(out: Path) -> str:
+    """The kind of an existing output, whole or damaged; empty if it is none of hypogoal's."""
+    if out.is_file():
+        with out.open("rb") as file:
+            front = file.read(FRONT)
+        fitting = [kind for kind, (begin, part) in SIGNATURES.items() if front.startswith(begin) and part in front]
+        return fitting[0] if fitting else ""
+    with contextlib.suppress(UserError):
+        content = read_json(out / MANIFEST, "the manifest is", AGAIN)
+        if isinstance(content, dict) and "format" in content:
+            return str(content.get("kind", ""))
+    return ""
+
+
+def _finish(draft: Draft, manifest: Manifest) -> None:
+    """Write the manifest of what is in the draft, and put it in place."""
+    files = [path for path in sorted(draft.files.rglob("*")) if path.is_file()]
+    listed = [path for path in files if path.name != TO_FILL_IN]
+    manifest.files = {path.relative_to(draft.files).as_posix(): sha256_of(path) for path in listed}
+    for path in files:
+        sync(path)
+    if manifest.kind in SIGNATURES:
+        [data] = files
+        data.replace(draft.out)
+        sync(draft.out.parent)
+        shutil.rmtree(draft.checkpoint, ignore_errors=True)
+    else:
+        replace_text(draft.files / MANIFEST, _text_of(manifest.model_dump()))
+        _put_in_place(draft)
+
+
+def _put_in_place(draft: Draft) -> None:
+    """Rename a finished folder to the output; what was there is moved aside first and removed last."""
+    old = draft.folder / "old"
+    if (draft.files / MANIFEST).is_file():
+        shutil.rmtree(draft.checkpoint, ignore_errors=True)
+        if draft.out.exists():
+            draft.out.rename(old)
+        draft.files.rename(draft.out)
+        sync(draft.out.parent)
+    shutil.rmtree(old, ignore_errors=True)

@@ -36,15 +36,9 @@ State = dict[str, Any]
 FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least 30 times as long as saving took: at most 3 % of a run
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
-FOLDER = "checkpoint"  # beside the folder that a stage fills
 JSON_PART, SUM_PART = "json-7", "crc32"  # raise the number when the contents of states change
 ARRAY, TENSOR = "$array", "$tensor"
 ANEW = "Give --force and no --resume to begin anew."
-
-
-def checkpoints_of(folder: Path, name: str = "stage") -> Checkpoints:
-    """The checkpoints called ``name`` of the stage that fills ``folder`` (see ``create_artefact``)."""
-    return Checkpoints(folder.parent / FOLDER / f"{name}.safetensors")
 
 
 class Checkpoints:

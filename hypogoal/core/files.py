@@ -8,7 +8,6 @@ import csv
 import io
 import json
 import os
-import re
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from io import BufferedReader
@@ -19,7 +18,6 @@ from hypogoal.core.errors import UserError
 
 MAX_NAME_BYTES = 200  # of a file's name
 MOST_INTEGER = (1 << 53) - 1  # many readers of JSON treat numbers as 64-bit floats
-FRESH = re.compile(r"\..+\.\d+\.new", re.DOTALL)  # the name of a file while :func:`replacing` writes it
 NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
 
 
@@ -94,8 +92,11 @@ def replace_text(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write, renamed to ``path`` when the block ends; removed if it raises, left over if it is killed."""
-    fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
+    """A file to write, renamed to ``path`` when the block ends; removed if it raises.
+
+    If the process is killed it is left over; the next writer of ``path`` overwrites it.
+    """
+    fresh = path.with_name(f".{path.name}.new")
     try:
         yield fresh
         replace_file(fresh, path)

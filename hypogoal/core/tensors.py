@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from hypogoal.core.artefacts import AGAIN as AGAIN
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.files import open_file
-from hypogoal.core.manifests import AGAIN as AGAIN
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

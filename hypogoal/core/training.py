@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
-from hypogoal.core.manifests import LOG
+from hypogoal.core.artefacts import LOG, Draft, create
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.progress import MetricsLog, Progress
 
 
 @dataclass(frozen=True)
 class Training:
-    """An artefact in training: the folder to fill, its log, its progress bar, its checkpoints."""
+    """An artefact in training: its draft, the folder to fill, its log, its progress bar, its checkpoints."""
 
+    draft: Draft
     folder: Path
     log: MetricsLog
     progress: Progress
@@ -36,11 +36,11 @@ def training(
     """Open the artefact; train and fill it in the block.
 
     ``tensorboard``: see :class:`hypogoal.core.progress.MetricsLog`; ``artefact``: see
-    :func:`hypogoal.core.artefacts.create_artefact`.
+    :func:`hypogoal.core.artefacts.create`.
     """
     with (
-        create_artefact(out, resume=resume, **artefact) as folder,
-        contextlib.closing(MetricsLog(folder / LOG, tensorboard)) as log,
+        create(out, resume=resume, **artefact) as draft,
+        contextlib.closing(MetricsLog(draft.files / LOG, tensorboard)) as log,
         Progress(stage, steps, quiet=quiet) as progress,
     ):
-        yield Training(folder, log, progress, checkpoints_of(folder))
+        yield Training(draft, draft.files, log, progress, draft.checkpoints())

@@ -137,7 +137,7 @@ def rows(work: Work) -> Iterator[Row]:
         artefact = work.artefact(run.path)
         config = artefact.config
         learned = artefact.kind == "meta" and takes(artefact) and config["chooser"] != "random"
-        playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
+        playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest.files
         # Of many layouts the states are too many to say what follows in each.
         if not learned or not playable or config.get("layouts") or (played := play_agent(artefact, run.seed)) is None:
             continue

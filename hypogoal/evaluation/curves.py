@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table as Printed
 
-from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.artefacts import Artefact
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.numbers import (
@@ -109,7 +109,7 @@ def read_run(artefact: Artefact, path: str) -> Run:
     """The episodes and the layout of one trained agent, whose path in the run is ``path``."""
     config = artefact.config
     if artefact.kind != "baseline":
-        config["ensemble"] = ensemble_name(open_artefact(artefact.input("ensemble"), "ensemble").config)
+        config["ensemble"] = ensemble_name(Artefact(artefact.input("ensemble")).config)
     episodes, layout = Episodes.read(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
     return Run(artefact.kind, path, artefact.seed, config, episodes, layout)
 

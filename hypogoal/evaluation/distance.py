@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from rich.table import Table as Printed
 
-from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.artefacts import Artefact
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Work
@@ -211,7 +211,7 @@ def rows(work: Work) -> Iterator[Row]:
         choices = picked.get((source,), []) if takes(artefact) else []
         validated = {row.sub_goal: int(row.value) for row in choices if not math.isnan(row.value)}
         executions = Executions.read(artefact.path / "executions.csv")
-        if "terminations.h5" in artefact.manifest["files"]:
+        if "terminations.h5" in artefact.manifest.files:
             ends = read_terminations(artefact.path / "terminations.h5")
             for option, states in ends.items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
@@ -230,7 +230,7 @@ def view(work: Work) -> dict[str, Any]:
     options = options_of(work.rows)
     for entry in options:
         artefact = artefacts[entry["path"]]
-        source = open_artefact(artefact.input("ensemble"), "ensemble") if takes(artefact) else None
+        source = Artefact(artefact.input("ensemble")) if takes(artefact) else None
         entry["ensemble"] = source and within(contents, source)
     names = {artefact.config["domain"] for artefact in contents.ladders}
     domain = installed_domain(names.pop()) if len(names) == 1 else None
@@ -247,7 +247,7 @@ def _named(work: Work) -> Iterator[tuple[Artefact, str, dict[str, Any]]]:
     known = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
     paths, methods, groups = [], [], []
     for artefact in work.contents.ladders:
-        source = open_artefact(artefact.input("ensemble"), "ensemble")
+        source = Artefact(artefact.input("ensemble"))
         paths.append(within(work.contents, source) or "")
         methods.append(known.get(paths[-1], ensemble_name(source.config)) if takes(artefact) else ORACLE)
         groups.append(groups_of(source.config) if takes(artefact) else None)

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
+from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.files import parse_json
-from hypogoal.core.manifests import AGAIN
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import STATES, image_png, reduced

@@ -24,9 +24,9 @@ def provenance(contents: Contents, data: list[Path]) -> dict[str, Any]:
             "kind": artefact.kind,
             "seed": artefact.seed,
             "config": artefact.config,
-            "inputs": artefact.manifest["inputs"],
-            "command": artefact.manifest.get("command", []),
-            "versions": artefact.manifest.get("versions", {}),
+            "inputs": [entry.model_dump() for entry in artefact.manifest.inputs],
+            "command": artefact.manifest.command,
+            "versions": artefact.manifest.versions,
         }
         for artefact in (*contents.everything(), *contents.continued)
     ]

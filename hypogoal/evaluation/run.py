@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts
+from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json
-from hypogoal.core.manifests import digest_of
 from hypogoal.core.own_code import command
 from hypogoal.data import reading
 from hypogoal.options.tables import AGAIN, MAX_INTEGER
@@ -49,16 +48,14 @@ def find(run: Path) -> Contents:
     None, or a damaged one, is a ``UserError``.
     """
     metas, learned = find_artefacts(run, "meta"), find_artefacts(run, "options")
-    inputs = [
-        (artefact.path / entry["relative"]).resolve() for artefact in metas for entry in artefact.manifest["inputs"]
-    ]
+    inputs = [artefact.place_of(entry) for artefact in metas for entry in artefact.manifest.inputs]
     continued = [artefact for artefact in learned if artefact.path.resolve() in inputs]
     ladders: list[Artefact] = []
     silent: list[Artefact] = []
     others: list[Artefact] = []
     for artefact in learned:
         if artefact not in continued:
-            has_table = "executions.csv" in artefact.manifest["files"]
+            has_table = "executions.csv" in artefact.manifest.files
             (ladders if has_table else silent if artefact.config.get("start") else others).append(artefact)
     agents = [*metas, *others, *find_artefacts(run, "baseline")]
     contents = Contents(run, find_artefacts(run, "ensemble"), agents, ladders, silent, continued)
@@ -136,16 +133,21 @@ def fitting(where: object) -> Iterator[None]:
         raise UserError("the evaluation does not fit this hypogoal, or is damaged", where, AGAIN) from error
 
 
+def evaluation_of(run: Path) -> Artefact:
+    """The evaluation of a run: that in ``run/evaluation`` where there are several; a ``UserError`` if there is none."""
+    evaluations = find_artefacts(run, "evaluation")
+    if not evaluations:
+        raise UserError("this run was not evaluated", run, f"First run: {command('evaluate', run)}")
+    return next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
+
+
 def read_evaluation(run: Path, start: str = "") -> Evaluated:
-    """The evaluation of a run: that in ``run/evaluation`` where there are several.
+    """The evaluation of a run, see :func:`evaluation_of`.
 
     Of the arrays only those whose names begin with ``start``. What was made since is among ``missing``. A run that was
     not evaluated, or a damaged evaluation, is a ``UserError``.
     """
-    evaluations = find_artefacts(run, "evaluation")
-    if not evaluations:
-        raise UserError("this run was not evaluated", run, f"First run: {command('evaluate', run)}")
-    source = next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
+    source = evaluation_of(run)
     metrics = read_numbers(source)
     metrics["missing"] = [*metrics["missing"], *_since(run, source)]
     with reading(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
@@ -158,7 +160,7 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
 
 def read_numbers(source: Artefact) -> dict[str, Any]:
     """``metrics.json`` of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
-    path = source.whole().path / "metrics.json"
+    path = open_artefact(source.path).path / "metrics.json"
     metrics = read_json(path, "the evaluation is", AGAIN)
     if not isinstance(metrics, dict) or not isinstance(metrics.get("missing"), list):
         raise UserError("the evaluation is damaged", path, AGAIN)
@@ -180,16 +182,12 @@ def _sub_goals(part: Any) -> Iterator[Any]:
 
 def _since(run: Path, source: Artefact) -> list[str]:
     """A line for each artefact of the run that the evaluation does not know: it was made, or made again, since."""
-    evaluated = {entry["sha256"] for entry in source.manifest["inputs"]}
+    evaluated = {entry.sha256 for entry in source.manifest.inputs}
     try:
         contents = find(run)
     except UserError:  # evaluations may lie where nothing else does
         return []
-    names = [
-        contents.name(artefact)
-        for artefact in contents.everything()
-        if digest_of(artefact.path / MANIFEST) not in evaluated
-    ]
+    names = [contents.name(artefact) for artefact in contents.everything() if sha256_of(artefact.path) not in evaluated]
     elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
     do = f"evaluate it again: {command('evaluate', run, *elsewhere, '--force')}" if names else ""
     return [f"{name}: made since this evaluation ({do})" for name in names]

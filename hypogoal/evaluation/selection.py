@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain
 from hypogoal.evaluation import choosing, page
@@ -89,7 +89,7 @@ def view(work: Work) -> dict[str, Any]:
     """Of each run its sub-goals' members, see :func:`selection_of`, and which ensemble they are of."""
     selection = selection_of(work.rows)
     for run in (run for agent in selection for run in agent["runs"]):
-        source = open_artefact(work.artefact(run["path"]).input("ensemble"), "ensemble")
+        source = Artefact(work.artefact(run["path"]).input("ensemble"))
         run["ensemble"] = within(work.contents, source)
     return {"selection": selection}
 
@@ -126,7 +126,7 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
     """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met."""
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
-    source = open_artefact(path, "ensemble")
+    source = Artefact(path)
     domain, members = load_domain(source.config["domain"]), source.config["members"]
     arguments = domain.world(source.config["domain_config"])
     arguments |= {"layouts": Layouts(layouts)} if len(layouts) > 1 else {}

@@ -104,7 +104,7 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> list[tuple[dict[str,
 def rows(work: Work) -> Iterator[Row]:
     """Every agent, uniform-random choice among its options, and each option on every layout; none without layouts."""
     for artefact in work.contents.agents if work.layouts else ():
-        if "options.safetensors" not in artefact.manifest["files"]:
+        if "options.safetensors" not in artefact.manifest.files:
             work.progress.advance(len(work.layouts))
             continue
         path = work.contents.name(artefact)

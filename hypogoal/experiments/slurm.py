@@ -14,8 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hypogoal.core.checkpoints import FOLDER as CHECKPOINTS
-from hypogoal.core.drafts import draft_folder
+from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.own_code import environment
@@ -105,7 +104,7 @@ def _arrays(cells: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
 def _line(cell: Cell, run: Path) -> list[str]:
     """What the batch script needs of a cell."""
     log = cell.log(run).with_suffix("")
-    return [str(log), str(draft_folder(cell.out(run)) / CHECKPOINTS), *cell.command(run), "--resume"]
+    return [str(log), str(Draft(cell.out(run)).checkpoint), *cell.command(run), "--resume"]
 
 
 def _sbatch(script: Path, text: str, needs: set[str], options: Sequence[str], jobs: list[str]) -> str:

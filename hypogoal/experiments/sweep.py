@@ -22,10 +22,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from hypogoal.core.drafts import LOCK, draft_folder, drafts_in
+from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.core.locks import try_lock
 from hypogoal.core.own_code import environment
 from hypogoal.core.terminal import amount
 from hypogoal.core.workers import CORES, SAFE_PATH, with_environment
@@ -191,7 +190,7 @@ def _check_same(before: Sequence[Cell], cells: Sequence[Cell], run: Path) -> Non
     do = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
     now = {cell.name: cell for cell in cells}
     for old in before:
-        if old.stage in DERIVED or not (old.out(run).exists() or draft_folder(old.out(run)).exists()):
+        if old.stage in DERIVED or not (old.out(run).exists() or Draft(old.out(run)).folder.exists()):
             continue
         if old.name not in now:
             raise UserError(f"the run here has a cell that this one lacks: {old.name}", run, do)
@@ -203,11 +202,11 @@ def _check_same(before: Sequence[Cell], cells: Sequence[Cell], run: Path) -> Non
 def discard(cells: Sequence[Cell], run: Path) -> None:
     """Remove what cells made or began; one that is being made is a ``UserError``."""
     for cell in cells:
-        if is_locked(cell.out(run)):
+        if Draft(cell.out(run)).is_locked:
             do = "Wait until it is done, or end it."
             raise UserError(f"{cell.name} is being made by another process", run, do)
     for cell in cells:
-        for place in (cell.out(run), draft_folder(cell.out(run))):
+        for place in (cell.out(run), Draft(cell.out(run)).folder):
             if place.is_dir():
                 shutil.rmtree(place)
             else:
@@ -252,7 +251,7 @@ def run_local(
     try:
         while True:
             makeable = [cell for cell in todo if all(needed[need].out(run).exists() for need in cell.needs)]
-            ready = [cell for cell in makeable if not is_locked(cell.out(run))]
+            ready = [cell for cell in makeable if not Draft(cell.out(run)).is_locked]
             while ready and (free := workers - sum(each.cores for each in running)) > 0:
                 cores = max(1, free // len(ready))
                 cell = ready.pop(0)
@@ -328,15 +327,6 @@ def _run_cell(words: list[str], log: str, own: dict[str, str]) -> None:
     sys.exit(import_module("hypogoal.cli").main())
 
 
-def is_locked(out: Path) -> bool:
-    """Whether a process is making this output."""
-    try:
-        with (draft_folder(out) / LOCK).open("rb") as lock:
-            return try_lock(lock, shared=True) is False
-    except OSError:
-        return False
-
-
 def last_line(log: Path) -> str:
     """The last line of a log, of an error without the program's name."""
     if not log.exists():
@@ -349,7 +339,7 @@ def state_of(cell: Cell, run: Path) -> str:
     """Whether a cell is done, runs, failed or waits."""
     if cell.out(run).exists():
         return DONE
-    if is_locked(cell.out(run)):
+    if Draft(cell.out(run)).is_locked:
         return RUNNING
     code = cell.log(run, "code")
     return FAILED if code.exists() and int(code.read_text() or 0) not in STOPPED else WAITING
@@ -378,4 +368,7 @@ def in_the_making(path: Path) -> list[str]:
     """A line for each output at or below a path that is not complete; of a run how far it is."""
     if (path / PLAN).exists():
         return status_lines(path)
-    return [f"{place}: {'in progress' if active else INTERRUPTED}" for place, active in drafts_in(path).items()]
+    hidden = [Draft(path).folder, *sorted(path.rglob(".*.partial"))]
+    outs = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in hidden]
+    begun = [out for out in outs if Draft(out).begun.is_file()]
+    return [f"{out}: {'in progress' if Draft(out).is_locked else INTERRUPTED}" for out in begun]

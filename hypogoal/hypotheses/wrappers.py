@@ -33,7 +33,7 @@ def require_observations(env: Env, ensemble: Ensemble) -> Reader:
 
 def ensemble_at(path: Path, sub_goal: str) -> Ensemble:
     """One sub-goal's ensemble in an artefact; without a name its only one."""
-    artefact = open_artefact(path, "ensemble").whole()
+    artefact = open_artefact(path, "ensemble")
     goals = artefact.config["sub_goals"]
     return read_ensemble(artefact.path, artefact.config, sub_goal or (goals[0] if len(goals) == 1 else ""))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
@@ -51,7 +51,7 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
 
     A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
     """
-    source, files = open_artefact(artefact.input("ensemble"), "ensemble"), artefact.manifest["files"]
+    source, files = Artefact(artefact.input("ensemble")), artefact.manifest.files
     settings = {
         field.name: artefact.config[field.name] for field in fields(TrainMetaConfig) if field.name in artefact.config
     }

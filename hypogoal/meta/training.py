@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import MANIFEST, Artefact
+from hypogoal.core.artefacts import Artefact, sha256_of
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
-from hypogoal.core.manifests import digest_of
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
@@ -261,8 +260,8 @@ def check_fit(
     trained: Artefact, source: Artefact, config: TrainOptionsConfig | TrainMetaConfig, fixed: Sequence[str]
 ) -> None:
     """Refuse (``UserError``) to train options further that are of another ensemble or differ in ``fixed`` settings."""
-    made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
-    if digest_of(source.path / MANIFEST) not in made_from:
+    made_from = [entry.sha256 for entry in trained.manifest.inputs if entry.kind == "ensemble"]
+    if sha256_of(source.path) not in made_from:
         fault = "these options were trained with another ensemble"
         raise UserError(fault, trained.path, f"Train them from {source.path}.")
     before = trained.config

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim, create_artefact
+from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.files import write_table
 from hypogoal.core.progress import Progress
@@ -39,18 +39,19 @@ def evaluate(
     prepare()
     seeds = tuple(layout_seeds(layouts)) if layouts else ()
     settings = SETTINGS | ({"layouts": layouts} if layouts else {})
-    out = claim(out, kind="evaluation", force=force, resume=resume)
     contents = find(run)
-    inputs = [artefact.whole().path for artefact in contents.everything()]
+    inputs = [artefact.path for artefact in contents.everything()]
     data = sorted({artefact.input("data") for artefact in contents.ensembles})
     cases = cases_of(contents.ensembles)
     workers = processes_for([case for _, case in cases], cores())
-    with create_artefact(
+    with create(
         out, kind="evaluation", config=settings, seed=0, inputs=[*data, *inputs], force=force, resume=resume
-    ) as folder:
+    ) as draft:
+        for path in inputs:
+            open_artefact(path)  # refuses changed files
         parts = 2 * len(cases) + len(contents.ladders) + len(contents.agents) * (1 + len(seeds))
         steps = Progress("evaluate", total=parts, quiet=quiet)
-        with create_hdf5(folder / "arrays.h5") as arrays, steps as progress:
+        with create_hdf5(draft.files / "arrays.h5") as arrays, steps as progress:
             agents = group_runs([read_run(artefact, contents.name(artefact)) for artefact in contents.agents])
             work = Work(contents, arrays, progress, seeds, agents=agents)
             judge_ensembles(work, cases, workers)
@@ -70,9 +71,9 @@ def evaluate(
                     "quantities": meanings(),
                 }
             )
-        write_table(folder / "numbers.csv", Row._fields, defined(work.rows))
+        write_table(draft.files / "numbers.csv", Row._fields, defined(work.rows))
         text = json.dumps(metrics, indent=1, allow_nan=False)
-        (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
+        (draft.files / "metrics.json").write_text(text + "\n", encoding="utf-8")
     return metrics
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import DATA, begins_as, claim
+from hypogoal.core.artefacts import DATA, create, kind_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.core.seeding import torch_generator
@@ -51,36 +51,39 @@ def import_data(
     axes of frames and colours become channels. ``domain`` is for later stages. Errors: see ``hypogoal.own_data``.
     """
     rules = labels or {}
-    claim(out, kind=DATA, inputs=[source], force=force)
-    if source.is_file() and begins_as(source, DATA, "Give a file that can be read."):
-        if sub_goals or keys or resize or every > 1 or stack or domain != IMPORTED:
-            raise UserError("a data file is taken as it is", source, "Give --label NAME=TABLE.csv and --out alone.")
-        return _marked(source, out, rules, seed=seed, force=force)
-    if (source / MINARI).exists():
-        functions = [load(name, "label function", LABELS, {}) for name in rules.values()]
-        parts, sub_goals = read_minari(source, functions, keys=keys, seed=seed), tuple(rules)
-    elif (recording := recording_of(source, keys, resize)) is not None:
-        parts, sub_goals = recorded_parts(recording, rules, every=every, seed=seed), ()
-    elif rules or keys or every > 1:
-        do = "--label, --key and --every are for Minari, LeRobot and robomimic datasets, and folders of mp4 files."
-        raise UserError("this is no recording", source, do)
-    elif (source / "positive").is_dir() or (source / "negative").is_dir():
-        parts = read_images(source, resize=resize_of(resize, "", picture=True), stack=stack)
-        sub_goals = sub_goals or (source.resolve().name,)
-    else:
-        parts = read_arrays(source)
-    collected, warned = collected_of(parts, sub_goals, share=share, seed=seed, resize=resize, stack=stack)
-    warned += _too_small(domain, collected)
-    for line in warned:
-        say(f"hypogoal: {line}", err=True)
-    config: dict[str, Any] = {"source": source.name}
-    config |= ({"labels": dict(rules)} if rules else {}) | ({"resize": resize} if resize else {})
-    config |= {"every": every} if every > 1 else {}
-    write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
-    return open_dataset(out).counts()
+    inputs = [source] if source.is_file() else []
+    with create(out, kind=DATA, config={"domain": domain}, seed=seed, inputs=inputs, force=force) as draft:
+        file = draft.files / out.name
+        if source.is_file() and kind_of(source) == DATA:
+            if sub_goals or keys or resize or every > 1 or stack or domain != IMPORTED:
+                raise UserError("a data file is taken as it is", source, "Give --label NAME=TABLE.csv and --out alone.")
+            _write_marked(source, file, rules, seed=seed)
+            return open_dataset(file).counts()
+        if (source / MINARI).exists():
+            functions = [load(name, "label function", LABELS, {}) for name in rules.values()]
+            parts, sub_goals = read_minari(source, functions, keys=keys, seed=seed), tuple(rules)
+        elif (recording := recording_of(source, keys, resize)) is not None:
+            parts, sub_goals = recorded_parts(recording, rules, every=every, seed=seed), ()
+        elif rules or keys or every > 1:
+            do = "--label, --key and --every are for Minari, LeRobot and robomimic datasets, and folders of mp4 files."
+            raise UserError("this is no recording", source, do)
+        elif (source / "positive").is_dir() or (source / "negative").is_dir():
+            parts = read_images(source, resize=resize_of(resize, "", picture=True), stack=stack)
+            sub_goals = sub_goals or (source.resolve().name,)
+        else:
+            parts = read_arrays(source)
+        collected, warned = collected_of(parts, sub_goals, share=share, seed=seed, resize=resize, stack=stack)
+        warned += _too_small(domain, collected)
+        for line in warned:
+            say(f"hypogoal: {line}", err=True)
+        config: dict[str, Any] = {"source": source.name}
+        config |= ({"labels": dict(rules)} if rules else {}) | ({"resize": resize} if resize else {})
+        config |= {"every": every} if every > 1 else {}
+        write_dataset(file, collected, domain=domain, config=config, seed=seed)
+        return open_dataset(file).counts()
 
 
-def _marked(source: Path, out: Path, rules: Mapping[str, str], *, seed: int, force: bool) -> dict[str, Any]:
+def _write_marked(source: Path, file: Path, rules: Mapping[str, str], *, seed: int) -> None:
     """Write a data file's states again, with those labelled that a table labels."""
     dataset = open_dataset(source)
     if len(rules) != 1:
@@ -88,12 +91,11 @@ def _marked(source: Path, out: Path, rules: Mapping[str, str], *, seed: int, for
     [(sub_goal, table)] = rules.items()
     collected, count = with_marks(dataset, Path(table), sub_goal)
     if not len(collected.unlabelled.labels):
-        line = f"no unlabelled state is left in {out.name}: members cannot be made to differ"
+        line = f"no unlabelled state is left in {file.name}: members cannot be made to differ"
         do = "Leave some without a label, train with --unlabelled OTHER.h5, or with --set diversity=none"
         say(f"hypogoal: {line}. {do}.", err=True)
     config = dataset.config | {"marked": dataset.config.get("marked", 0) + count}
-    write_dataset(out, collected, domain=dataset.domain, config=config, seed=seed, force=force)
-    return open_dataset(out).counts()
+    write_dataset(file, collected, domain=dataset.domain, config=config, seed=seed)
 
 
 def recording_of(source: Path, keys: Sequence[str], resize: Resize) -> Recording | None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
+from hypogoal.core.artefacts import Artefact, create, find_artefacts, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text, replacing
-from hypogoal.evaluation.run import fitting, read_evaluation
+from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
 from hypogoal.observations import PICTURE
 
 if TYPE_CHECKING:
@@ -33,25 +33,27 @@ def report(run: Path, *, videos: int | None = None, force: bool = False, resume:
     from hypogoal.evaluation.questions import render
 
     out = run / "report"
-    evaluation = read_evaluation(run)
-    claim(out, kind="report", force=force, resume=resume)
-    films, missing = _films(run, videos)
-    inputs = [evaluation.source.path, *dict.fromkeys(episode.agent.path for episode in films)]
-    about: dict[str, Any] = {"kind": "report", "config": {"videos": len(films)}, "seed": 0, "inputs": inputs}
-    with create_artefact(out, **about, force=force, resume=resume) as folder:
+    source = evaluation_of(run)
+    agents = _agents(run, videos)
+    inputs = [source.path, *(agent.path for agent in agents)]
+    config = {"videos": len(agents) if videos is None else videos}
+    with create(out, kind="report", config=config, seed=0, inputs=inputs, force=force, resume=resume) as draft:
+        evaluation = read_evaluation(run)
+        films, missing = _films(agents, run, videos)
         metrics = {**evaluation.metrics, "missing": [*evaluation.metrics["missing"], *missing]}
         shown = [film(episode.gif, episode.caption) for episode in films[:1] if len(episode.gif) <= MOST_BYTES]
         material = Material(metrics, evaluation.arrays, films=shown)
-        with fitting(evaluation.source.path):
+        with fitting(source.path):
             page = render(material, versions().get("hypogoal", "unknown"))
-        (folder / "index.html").write_text(page, encoding="utf-8")
-        (folder / "figures").mkdir()
+        (draft.files / "index.html").write_text(page, encoding="utf-8")
+        figures = draft.files / "figures"
+        figures.mkdir()
         for name, figure in material.figures.items():
-            (folder / "figures" / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
-            (folder / "figures" / f"{name}.png").write_bytes(to_png(figure))
+            (figures / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
+            (figures / f"{name}.png").write_bytes(to_png(figure))
         for episode in films:
-            (folder / "videos").mkdir(exist_ok=True)
-            (folder / "videos" / episode.name).write_bytes(episode.gif)
+            (draft.files / "videos").mkdir(exist_ok=True)
+            (draft.files / "videos" / episode.name).write_bytes(episode.gif)
     return out / "index.html"
 
 
@@ -64,12 +66,24 @@ class Film(NamedTuple):
     gif: bytes
 
 
-def _films(run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
-    """Those that were asked for; where nobody asked, one where there can be one, and a line where it cannot be."""
+def _agents(run: Path, videos: int | None) -> list[Artefact]:
+    """Those that films are made of: as many as ``videos``; where nobody asked, the first where there is one."""
     if videos == 0:
+        return []
+    try:
+        return agents_of(run)[: videos or 1]
+    except NoAgent:
+        if videos:
+            raise
+        return []
+
+
+def _films(agents: Sequence[Artefact], run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
+    """Those that were asked for; where nobody asked, one where there can be one, and a line where it cannot be."""
+    if not agents:
         return [], []
     try:
-        return play_films(agents_of(run), run, videos), []
+        return play_films(agents, run, videos), []
     except UserError as error:
         if videos:
             raise

@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
@@ -43,7 +42,6 @@ def train_baseline(
 
     device = prepare(device)
     inputs = [data] if data else []
-    out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain)
     lived: dict[str, Any] = {}
     if data:

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import claim, open_artefact
-from hypogoal.core.checkpoints import FOLDER, checkpoints_of
+from hypogoal.core.artefacts import LOG, Draft, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_end
-from hypogoal.core.manifests import LOG
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.training import training
@@ -76,7 +74,6 @@ def train_ensemble(
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
     inputs = [data, *others]
-    out = claim(out, kind="ensemble", inputs=inputs, force=force, resume=resume)
     settings = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
     settings |= {"observation_dtype": type_text(dataset.observation_dtype)}
     settings |= {"domain": dataset.domain, "domain_config": dataset.config}
@@ -84,11 +81,11 @@ def train_ensemble(
     steps = len(sub_goals) * steps_of(config)
     artefact: dict[str, Any] = {"kind": "ensemble", "config": settings, "seed": seed, "inputs": inputs, "force": force}
     with training("train-ensemble", out, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
-        folder, parts = work.folder, work.folder.parent / FOLDER
+        parts = work.draft.checkpoint
         jobs = []
         for sub_goal in sub_goals:
             board = Path(tensorboard, sub_goal) if tensorboard else None
-            jobs.append(partial(_train_one, data, others, sub_goal, config, seed, folder, device, board))
+            jobs.append(partial(_train_one, data, others, sub_goal, config, seed, work.draft, device, board))
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
         parts.mkdir(exist_ok=True)
         logs = [log_of(parts, sub_goal) for sub_goal in sub_goals]
@@ -96,7 +93,7 @@ def train_ensemble(
         with work.progress.following(partial(steps_in, logs)):
             in_processes(jobs, workers, summaries.__setitem__)
         texts = [log.read_text(encoding="utf-8") for log in logs]
-        (folder / LOG).write_text("".join(texts), encoding="utf-8")
+        (work.folder / LOG).write_text("".join(texts), encoding="utf-8")
     return summaries
 
 
@@ -121,7 +118,7 @@ def unlabelled_file(path: Path, dataset: Dataset) -> Path:
     No such file, or one of another domain or shape than ``dataset``, is a ``UserError``.
     """
     file = path / VISITED if path.is_dir() else path
-    if path.is_dir() and VISITED not in open_artefact(path, ("options", "meta")).whole().manifest["files"]:
+    if path.is_dir() and VISITED not in open_artefact(path, "options", "meta").manifest.files:
         raise UserError("no visited states", path, "Make it with --set save_visited=N.")
     source = open_dataset(file)
     for name, value, expected in (
@@ -170,17 +167,17 @@ def _train_one(
     sub_goal: str,
     config: TrainEnsembleConfig,
     seed: int,
-    folder: Path,
+    draft: Draft,
     device: str,
     tensorboard: Path | None,
 ) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
-    checkpoints = checkpoints_of(folder, sub_goal)
+    checkpoints = draft.checkpoints(sub_goal)
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
-    log = MetricsLog(log_of(folder.parent / FOLDER, sub_goal), tensorboard)
+    log = MetricsLog(log_of(draft.checkpoint, sub_goal), tensorboard)
     if not checkpoints.saved:
         log.restore(0)
     report = _Report(sub_goal, log)
@@ -196,7 +193,7 @@ def _train_one(
             device=device,
             checkpoints=checkpoints,
         )
-    write_ensemble(folder, sub_goal, ensemble)
+    write_ensemble(draft.files, sub_goal, ensemble)
     return {"sub_goal": sub_goal, **report.numbers, HELDOUT: heldout_accuracy(ensemble, dataset, sub_goal)}
 
 

@@ -7,7 +7,7 @@ count in every curve.
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import Artefact, claim, open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.training import training
 from hypogoal.domains.base import load_domain
@@ -49,12 +49,11 @@ def train_meta(
     Returns steps, episodes, and success and length over the last 100 episodes.
     """
     device = prepare(device)
-    source = open_artefact(ensemble, "ensemble").whole()
-    practice = open_artefact(options, "options").whole() if options else None
+    source = open_artefact(ensemble, "ensemble")
+    practice = open_artefact(options, "options") if options else None
     if practice:
         check_fit(practice, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
-    out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # refuse an impossible start before any work
     settings = description(domain, source.config, config, **steps_spent(practice))

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.training import training
 from hypogoal.domains.base import load_domain
@@ -44,12 +44,11 @@ def train_options(
     begins an episode, instead of these two the shares of ``recorder.recent``. With ``until`` also ``ended``: by what.
     """
     device = prepare(device)
-    source = open_artefact(ensemble, "ensemble").whole()
-    practice = open_artefact(options, "options").whole() if options else None
+    source = open_artefact(ensemble, "ensemble")
+    practice = open_artefact(options, "options") if options else None
     if practice:
         check_fit(practice, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
-    out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # refuse an impossible start before any work
     steps = config.steps * (options_of(source.config, config) if config.steps_for == "each" else 1)

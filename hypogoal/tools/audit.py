@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import claim, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
@@ -63,7 +63,6 @@ def audit(
         "domain": domain,
         "domain_config": target.domain_config,
     }
-    out = claim(out, kind="audit", inputs=target.inputs, force=force, resume=resume)
     start_arguments(world, config, 1, seed)  # refuse an impossible start before any work
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
     settings = description(world, ensemble_config, config, classifier=classifier, member=member, steps=steps)
@@ -106,7 +105,7 @@ def classifier_of(name: str, sub_goal: str, member: int, domain: str, device: st
     """A member of an ensemble artefact, or ``module:function``; anything else is a ``UserError``."""
     if ":" in name and not Path(name).is_dir():
         return Target(own_classifier(name), THRESHOLD)
-    source = open_artefact(Path(name), "ensemble").whole()
+    source = open_artefact(Path(name), "ensemble")
     ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
     classify, threshold = member_of(ensemble, member), float(ensemble.thresholds[member])
     world = source.config["domain_config"] if source.config["domain"] == domain else {}

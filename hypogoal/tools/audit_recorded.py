@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import TO_FILL_IN, Artefact, claim, create_artefact, open_artefact, versions
+from hypogoal.core.artefacts import TO_FILL_IN, Artefact, create, open_artefact, versions
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
@@ -62,32 +62,33 @@ def audit_recorded(
     sub-goal's part of ``audit.json``. An unknown sub-goal, data that are gone or have no unlabelled states, and an
     ``out`` that exists are a ``UserError``.
     """
-    device, artefact = prepare(device), open_artefact(source, "ensemble").whole()
+    device, artefact = prepare(device), open_artefact(source, "ensemble")
     goals = artefact.config["sub_goals"]
     if sub_goal is not None and sub_goal not in goals:
         raise UserError("unknown sub-goal", sub_goal, f"{source} has {', '.join(goals)}.")
     goals = [sub_goal] if sub_goal is not None else goals
     data = artefact.input("data")
-    out = claim(out, kind="recorded-audit", inputs=[source, data], force=force)
     about: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": list(goals)}, "seed": 0}
     with (
-        create_artefact(out, **about, inputs=[source, data], force=force) as folder,
+        create(out, **about, inputs=[source, data], force=force) as draft,
         Progress("audit", len(goals), quiet=quiet) as progress,
     ):
         parts, sections = [], []
         for goal in goals:
             look = look_at(artefact, data, goal, device)
-            part, section = findings(look, folder / "next" / goal)
+            part, section = findings(look, draft.files / "next" / goal)
             parts.append(part)
             sections.append(section)
             progress.advance()
-        (folder / "audit.json").write_text(json.dumps(plain({"sub_goals": parts}), indent=1) + "\n", encoding="utf-8")
+        (draft.files / "audit.json").write_text(
+            json.dumps(plain({"sub_goals": parts}), indent=1) + "\n", encoding="utf-8"
+        )
         lead = {"task": "", "verdict": lines_of(parts), "baselines": "", "films": [], "question": ""}
         version = versions().get("hypogoal", "unknown")
         text = page.draw_page(
             f"hypogoal: audit of {source.name}", f"recorded data; hypogoal {version}", sections, version, lead
         )
-        (folder / "index.html").write_text(text, encoding="utf-8")
+        (draft.files / "index.html").write_text(text, encoding="utf-8")
     return parts
 
 

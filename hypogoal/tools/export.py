@@ -12,10 +12,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import DTypeLike
 
-from hypogoal.core.artefacts import ARRAYS, claim, open_artefact
-from hypogoal.core.drafts import draft, put_in_place
+from hypogoal.core.artefacts import ARRAYS, create, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import replacing
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import amount
 from hypogoal.data import open_dataset
@@ -53,7 +51,7 @@ def export(source: Path, out: Path, *, episodes: int, seed: int, force: bool, qu
     if not source.is_dir():
         export_arrays(source, out, force=force)
         return ""
-    if open_artefact(source, ("meta", "ensemble")).kind == "ensemble":
+    if open_artefact(source, "meta", "ensemble").kind == "ensemble":
         export_ensemble(source, out, force=force)
         return ""
     steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
@@ -64,11 +62,8 @@ def export_arrays(data: Path, out: Path, *, force: bool = False) -> None:
     """Write the states of a data file as ``.npz``, which ``import`` reads."""
     if out.suffix != ".npz":
         raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
-    out = claim(out, kind=ARRAYS, inputs=[data], force=force)
-    dataset = open_dataset(data)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as fresh:
-        write_arrays(fresh, dataset)
+    with create(out, kind=ARRAYS, config={}, seed=0, inputs=[data], force=force) as draft:
+        write_arrays(draft.files / out.name, open_dataset(data))
 
 
 def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
@@ -83,11 +78,10 @@ def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
     from hypogoal.hypotheses.ensemble import read_ensemble
     from hypogoal.hypotheses.views import FullView
 
-    artefact = open_artefact(source, "ensemble").whole()
-    out = claim(out, kind="hub", inputs=[source], force=force)
+    artefact = open_artefact(source, "ensemble")
     config = artefact.config
     thresholds: dict[str, list[float]] = {}
-    with draft(out, {"kind": "hub"}, force=force) as work:
+    with create(out, kind="hub", config={}, seed=artefact.seed, inputs=[source], force=force) as draft:
         for goal in config["sub_goals"]:
             ensemble = read_ensemble(artefact.path, config, goal)
             if not isinstance(ensemble.view, FullView):
@@ -95,7 +89,7 @@ def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
                 raise UserError("these members have a view of your own, which only hypogoal can load", source, do)
             members = nn.ModuleList(ensemble.members)
             state = {**members.state_dict(), **dict(ensemble.view.named_buffers())}
-            save_tensors(work.files / f"{goal}.safetensors", {name: part.clone() for name, part in state.items()})
+            save_tensors(draft.files / f"{goal}.safetensors", {name: part.clone() for name, part in state.items()})
             thresholds[goal] = [round(float(threshold), 6) for threshold in ensemble.thresholds]
         fields = fields_of(ensemble.observation_shape, ensemble.view.dtype)
         observations = {key: [str(kind), list(shape)] for key, (kind, shape) in fields.items()}
@@ -111,13 +105,12 @@ def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
             first=next(iter(thresholds)),
             observations=observations,
             diversity=config["diversity"],
-            version=artefact.manifest["versions"]["hypogoal"],
+            version=artefact.manifest.versions["hypogoal"],
         )
         loader = Path(load.__file__).read_text(encoding="utf-8")
-        (work.files / "config.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        (work.files / "README.md").write_text(card, encoding="utf-8")
-        (work.files / "load.py").write_text(loader, encoding="utf-8")
-        put_in_place(work.files, out)
+        (draft.files / "config.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        (draft.files / "README.md").write_text(card, encoding="utf-8")
+        (draft.files / "load.py").write_text(loader, encoding="utf-8")
 
 
 def _layers(layers: Iterable[Any], source: Path) -> list[Any]:
@@ -152,7 +145,7 @@ def export_episodes(
 
     ``out`` is the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
     ``seed`` determines the draws of options; ``infos/option`` is the option that led to each state, -1 at the start.
-    ``force`` replaces an empty folder only. A missing agent, another name, or an existing ``out`` is a ``UserError``.
+    A missing agent, another name, or an existing ``out`` is a ``UserError``.
     """
     from hypogoal.core.compute import prepare
     from hypogoal.meta.episodes import agent_of, play_episodes
@@ -166,8 +159,7 @@ def export_episodes(
     if not NAME.fullmatch(out.name):
         raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
     prepare()
-    source = open_artefact(meta, "meta").whole()
-    out = claim(out, kind="episodes", inputs=[meta], force=force)
+    source = open_artefact(meta, "meta")
     where = source.config["layouts"] or source.config["layout_seed"]
     options = len(source.config["sub_goals"]) * source.config["members"]
     about = {
@@ -177,10 +169,11 @@ def export_episodes(
         "description": f"Episodes of an agent that chooses among {options} options "
         f"({source.config['domain']}, layout seed {where}, seed {seed}).",
     }
-    loop = agent_of(source, seed)
-    with draft(out, {"kind": "episodes"}, force=force) as work:
+    config = {"episodes": episodes}
+    with create(out, kind="episodes", config=config, seed=seed, inputs=[meta], force=force) as draft:
+        loop = agent_of(source, seed)
         storage = MinariStorage.new(
-            (work.files / "data").resolve(),
+            (draft.files / "data").resolve(),
             observation_space=_observation_space(loop.engine),
             action_space=spaces.Discrete(loop.engine.n_actions),
             jpeg_encoding=False,
@@ -188,9 +181,7 @@ def export_episodes(
         storage.update_metadata(about)
         with Progress("export", total=episodes, quiet=quiet) as progress:
             storage.update_episodes(_buffers(play_episodes(loop, episodes), progress))
-        steps = int(storage.total_steps)
-        put_in_place(work.files, out)
-    return steps
+        return int(storage.total_steps)
 
 
 def _observation_space(engine: Engine) -> spaces.Space[Any]:

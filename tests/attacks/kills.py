@@ -25,8 +25,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
-from hypogoal.core.drafts import draft_folder
+from hypogoal.core.artefacts import Draft
+from hypogoal.core.checkpoints import PACE, Checkpoints
 
 PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
 GOALS = "sub_goals=open-red-door,go-to-goal"
@@ -184,14 +184,14 @@ def broken(stage: Stage, folder: Path, kills: int, seconds: float, rng: random.R
             elif code:
                 tally.losses += 1
                 print(log.read_text(encoding="utf-8")[-2000:], file=sys.stderr)
-                shutil.rmtree(draft_folder(out), ignore_errors=True)
+                shutil.rmtree(Draft(out).folder, ignore_errors=True)
                 break
         else:
             tally.ended += 1
             differ = differences(whole, out)
             print("".join(f"{stage.name}: {name} differs\n" for name in differ), end="", file=sys.stderr)
             tally.differences += len(differ)
-            tally.losses += draft_folder(out).exists() and not left_over(out)
+            tally.losses += Draft(out).folder.exists() and not left_over(out)
             _remove(out)
     return tally
 
@@ -219,14 +219,14 @@ def paired(stage: Stage, folder: Path, pairs: int, seconds: float, rng: random.R
         tally.writing += len(refused)
         tally.ended += codes.count(0)
         tally.differences += len(differ)
-        tally.losses += not fine or draft_folder(out).exists()
+        tally.losses += not fine or Draft(out).folder.exists()
         _remove(out)
     return tally
 
 
 def half_written(out: Path) -> bool:
     """Whether a checkpoint is being written, or was when its process was killed."""
-    return any(draft_folder(out).glob(f"{FOLDER}/*.new"))
+    return any(Draft(out).checkpoint.glob("*.new"))
 
 
 def unreadable(out: Path) -> int:
@@ -234,7 +234,7 @@ def unreadable(out: Path) -> int:
     from hypogoal.core.errors import UserError
 
     count = 0
-    for path in draft_folder(out).glob(f"{FOLDER}/*.safetensors"):
+    for path in Draft(out).checkpoint.glob("*.safetensors"):
         try:
             Checkpoints(path).load()
         except UserError:
@@ -244,7 +244,7 @@ def unreadable(out: Path) -> int:
 
 def left_over(out: Path) -> bool:
     """Whether a draft is what a process leaves that dies after its output is whole."""
-    return not (draft_folder(out) / "files" / "manifest.json").exists()
+    return not (Draft(out).folder / "files" / "manifest.json").exists()
 
 
 def differences(one: Path, other: Path) -> list[str]:

@@ -1,210 +1,390 @@
-"""Artefacts: complete or absent, and refused when they are not what is needed (Spec A8, G2)."""
+"""The store: an output is whole or absent, has one writer, and is continued only by what began it (Spec A8, G1, G2)."""
 
+import errno
+import json
 import os
-import time
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import torch
-from toy_data import files_of, reseal
+from command_line import refuses, run
 
-from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
-from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import rng_for, seed_for, torch_generator
-from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, Draft, create, find_artefacts, open_artefact
+from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.data import create_hdf5
 
-
-def make(out: Path, kind: str = "meta", inputs: tuple[Path, ...] = (), force: bool = False) -> Path:
-    with create_artefact(out, kind=kind, config={"steps": 3}, seed=7, inputs=inputs, force=force) as folder:
-        for name in files_of(kind, {}):
-            (folder / name).write_text("step\n1\n")
-    return out
+ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "world": {"rooms": 2}}, "seed": 7}
 
 
-def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
-    """Spec A8: kind, format, configuration, seed, hashes of files and of inputs, versions."""
-    first = make(tmp_path / "ensemble", "ensemble")
-    artefact = open_artefact(make(tmp_path / "meta", inputs=(first,)), "meta")
-    assert artefact.config == {"steps": 3} and artefact.seed == 7
-    assert artefact.input("ensemble") == first.resolve()
-    assert set(artefact.manifest["files"]) == files_of("meta", {})
-    assert {"python", "torch", "numpy"} <= set(artefact.manifest["versions"])
-    assert check_files(artefact) == []
+def stop(out: Path, error: BaseException, *, checkpoint: bool = True, **about: Any) -> None:
+    """A stage that stops with ``error``, after its first checkpoint if it has one."""
+    with create(out, **{**ABOUT, **about}) as draft:
+        (draft.files / "half.csv").write_text("x")
+        if checkpoint:
+            draft.checkpoints().save({"step": 1})
+        raise error
 
 
-def break_off(out: Path) -> None:
-    """A stage that fails half-way."""
-    with create_artefact(out, kind="meta", config={}, seed=0, force=True) as folder:
-        (folder / "half").write_text("x")
-        raise RuntimeError("broke")
-
-
-def test_a_failed_stage_leaves_nothing(tmp_path: Path) -> None:
-    """Spec G2: no half-written output, and what stood there before stands there still."""
-    out = make(tmp_path / "meta")
-    with pytest.raises(RuntimeError, match="broke"):
-        break_off(out)
-    assert [path.name for path in tmp_path.iterdir()] == ["meta"]
-    assert open_artefact(out).config == {"steps": 3}
-
-
-def test_moved_runs_find_their_inputs(tmp_path: Path) -> None:
-    """Spec A8: inputs are found beside the artefact when the run was moved as a whole."""
-    (tmp_path / "run").mkdir()
-    first = make(tmp_path / "run" / "ensemble", "ensemble")
-    make(tmp_path / "run" / "meta", inputs=(first,))
-    (tmp_path / "run").rename(tmp_path / "moved")
-    assert open_artefact(tmp_path / "moved" / "meta").input("ensemble") == (tmp_path / "moved" / "ensemble").resolve()
-
-
-def test_refusals(tmp_path: Path) -> None:
-    """Spec G2: each says what, where and what to do, in one line."""
-    out = make(tmp_path / "meta")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "mine.txt").write_text("precious")
-    cases = [
-        (lambda: claim(out, kind="meta"), "exists already"),
-        (lambda: claim(tmp_path / "other", kind="meta", force=True), "without a manifest"),
-        (lambda: open_artefact(tmp_path / "none"), "no such artefact"),
-        (lambda: open_artefact(tmp_path / "other"), "not an artefact"),
-        (lambda: open_artefact(out, "ensemble"), "'ensemble' is needed|but ensemble is needed"),
-        (lambda: find_artefacts(tmp_path / "none", "meta"), "no such run"),
-    ]
-    for case, words in cases:
-        with pytest.raises(UserError, match=words) as caught:
-            case()
-        assert "\n" not in str(caught.value)
-    assert (tmp_path / "other" / "mine.txt").read_text() == "precious"
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"seed": 1 << 53}, "'seed'"),
-        ({"seed": -1}, "'seed'"),
-        ({"config": {"sub_goals": ["a", "a"]}}, "'sub_goals'"),
-        ({"config": {"layout_seed": (1 << 53) + 1}}, "'layout_seed'"),
-        ({"config": {"threshold": float("nan")}}, "not valid JSON"),
-        ({"inputs": [b"\xff.h5"]}, "not valid JSON"),
-    ],
-)
-def test_what_could_not_be_read_again_is_not_begun(tmp_path: Path, change: dict[str, Any], words: str) -> None:
-    """Spec A8, G2: a manifest is refused before the work for it, not by the next stage."""
-    out = tmp_path / "meta"
-    about: dict[str, Any] = {"kind": "meta", "config": {"steps": 3}, "seed": 0, **change}
-    about["inputs"] = [tmp_path / os.fsdecode(name) for name in about.get("inputs", ())]
-    for path in about["inputs"]:
-        path.write_text("states")
-    with pytest.raises(UserError, match=words) as caught, create_artefact(out, **about):
-        raise AssertionError("it worked")
-    assert "could not be read again" in str(caught.value) and not out.exists()
+def finish(out: Path, **about: Any) -> int:
+    """A stage that continues and ends; returns the step at which it continued."""
+    with create(out, **{**ABOUT, **about}) as draft:
+        step = (draft.checkpoints().load() or {"step": 0})["step"]
+        (draft.files / "whole.csv").write_text("y")
+    return int(step)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_force_replaces_only_what_a_stage_makes_there(tmp_path: Path) -> None:
-    """Spec A6, G2: nothing of another kind and no file of others', however wrong the --out."""
-    ensemble, meta = make(tmp_path / "ensemble", "ensemble"), make(tmp_path / "meta")
-    unreadable = make(tmp_path / "unreadable")
-    (unreadable / "manifest.json").write_text("{")
-    (tmp_path / "empty").mkdir()
-    texts = {"thesis.txt": b"precious", "foreign.h5": b"precious", "foreign.npz": b"precious"}
-    for name, text in texts.items():
-        (tmp_path / name).write_bytes(text)
+def rewrite(artefact: Path, **changes: Any) -> None:
+    """Change keys of a manifest."""
+    path = artefact / MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8-sig")) | changes))
+
+
+def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
+    source, out = tmp_path / "ensemble", tmp_path / "meta"
+    finish(source, kind="ensemble")
+    finish(out, inputs=[source])
+    artefact = open_artefact(out, "options", "meta")
+    assert (artefact.kind, artefact.config, artefact.seed) == ("meta", ABOUT["config"], 7)
+    assert artefact.input("ensemble") == source and artefact.manifest.files.keys() == {"whole.csv"}
+    assert {"python", "torch", "numpy"} <= artefact.manifest.versions.keys()
+    assert 0 <= artefact.manifest.took["seconds"] < 60 and 1e7 < artefact.manifest.took["memory"] < 1e12
+    assert artefact.faults() == [] and find_artefacts(tmp_path, "meta")[0].path == out
+
+
+def test_white_space_and_took_are_no_change(tmp_path: Path) -> None:
+    """An editor and git's line ends may change a manifest; another seed in it is another input."""
+    source, out = tmp_path / "ensemble", tmp_path / "meta"
+    finish(source, kind="ensemble")
+    finish(out, inputs=[source])
+    manifest = json.loads((source / MANIFEST).read_text())
+    for text in (json.dumps(manifest), json.dumps(manifest, indent=4).replace("\n", "\r\n")):
+        (source / MANIFEST).write_bytes(b"\xef\xbb\xbf" + text.encode())
+        assert Artefact(out).faults() == []
+    rewrite(source, took={"seconds": 9.9})
+    assert Artefact(out).faults() == []
+    rewrite(source, seed=8)
+    assert Artefact(out).faults() == [f"its input {source} (ensemble) is changed since it was written"]
+
+
+def test_an_artefact_of_format_2_is_read(tmp_path: Path) -> None:
+    """Of 0.24: it ends with a digest of itself; what was made from it knows the digest of all that but ``took``."""
+    old = {"kind": "ensemble", "format": 2, "config": {}, "seed": 0, "inputs": [], "files": {}}
+    source, out = tmp_path / "ensemble", tmp_path / "meta"
+    source.mkdir()
+    (source / MANIFEST).write_text(json.dumps({**old, "took": {"seconds": 1.0}, "sha256": "1" * 64}, indent=1) + "\n")
+    finish(out, inputs=[source])
+    assert open_artefact(source).seed == 0 and Artefact(out).faults() == []
+    # computed by 0.24's core/manifests.digest_of
+    digest = "7e82e3791a5dac9f5de1edfbc063d3e148dd086eba7c23b4ef3afa2394d1a217"
+    assert Artefact(out).manifest.inputs[0].sha256 == digest
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": 4}, "this hypogoal reads formats 2 and 3, this is 4"),
+        ({"seed": "x"}, "'seed' is missing or malformed"),
+        ({"inputs": [{"kind": "data"}]}, "'inputs.0.path' is missing or malformed"),
+        ({"config": {"initiation": "learned"}}, "made with initiation=learned, which is gone since 0.24"),
+        ({"config": {"domain_config": {"keyring": False}}}, "made with keyring=False"),
+    ],
+)
+def test_manifests_that_are_refused(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    finish(tmp_path / "meta")
+    rewrite(tmp_path / "meta", **change)
+    with pytest.raises(UserError, match=words):
+        Artefact(tmp_path / "meta")
+
+
+def test_faults_are_named(tmp_path: Path) -> None:
+    """Missing and changed files and inputs; to open an artefact its own files must be whole."""
+    data, out = tmp_path / "data.h5", tmp_path / "meta"
+    data.write_text("states")
+    finish(out, inputs=[data])
+    data.unlink()
+    assert Artefact(out).faults() == [f"its input {data} (data) is missing"] and open_artefact(out)
+    with pytest.raises(UserError, match=r"the data that .* was made from is missing"):
+        Artefact(out).input(DATA)
+    (out / "whole.csv").write_text("changed")
+    assert Artefact(out).faults()[0] == "whole.csv: changed since it was written"
+    (out / "whole.csv").unlink()
+    with pytest.raises(UserError, match=r"the artefact is damaged \(whole.csv: missing\)"):
+        open_artefact(out)
+
+
+def test_what_is_not_what_is_needed(tmp_path: Path) -> None:
+    finish(tmp_path / "meta")
+    (tmp_path / "other").mkdir()
+    cases: list[tuple[Callable[[], object], str]] = [
+        (lambda: open_artefact(tmp_path / "none"), "no artefact here"),
+        (lambda: open_artefact(tmp_path / "other"), "no artefact here"),
+        (lambda: open_artefact(tmp_path / "meta", "ensemble", "options"), "but ensemble or options is needed"),
+        (lambda: find_artefacts(tmp_path / "none", "meta"), "no such run"),
+        (lambda: Artefact(tmp_path / "meta").input("ensemble"), "was not made from any ensemble"),
+        (lambda: Artefact(tmp_path / "meta").config["stepz"], "lacks a setting: stepz"),
+    ]
+    for case, words in cases:
+        with pytest.raises(UserError, match=words):
+            case()
+
+
+def test_a_moved_run_finds_its_inputs(tmp_path: Path) -> None:
+    """Beside the artefact; if nothing is there, where they were. What is beside it and was changed is changed."""
+    run, data = tmp_path / "Läufe 1", tmp_path / "data.h5"
+    data.write_text("states")
+    finish(run / "ensemble", kind="ensemble", inputs=[data])
+    finish(run / "meta", inputs=[run / "ensemble"])
+    shutil.copytree(run, tmp_path / "far" / "kopiert ü")
+    moved = Artefact(tmp_path / "far" / "kopiert ü" / "meta")
+    assert moved.input("ensemble") == moved.path.parent / "ensemble"
+    assert Artefact(moved.input("ensemble")).input(DATA) == data
+    rewrite(moved.path.parent / "ensemble", seed=8)
+    with pytest.raises(UserError, match="changed since"):
+        moved.input("ensemble")
+
+
+def test_resume_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The manifest has the command that began it; what is complete is complete, with another torch, too."""
+    out = tmp_path / "meta"
+    monkeypatch.setattr("sys.argv", ["/usr/bin/hypogoal", "train-meta", "--resume"])
+    with pytest.raises(KeyError):
+        stop(out, KeyError())
+    assert Draft(out).is_resumable and not Draft(out).is_locked and not out.exists()
+    monkeypatch.setattr("sys.argv", ["/usr/bin/hypogoal", "train-meta", "--quiet", "--resume"])
+    assert finish(out, resume=True) == 1 and os.listdir(tmp_path) == ["meta"]
+    manifest = open_artefact(out).manifest
+    assert manifest.files.keys() == {"half.csv", "whole.csv"} and manifest.command == ["hypogoal", "train-meta"]
+    rewrite(out, versions={"torch": "0.1"}, config=ABOUT["config"] | {"gone": 1, "workers": 4})
+    with pytest.raises(Complete):
+        finish(out, resume=True)
+    assert finish(tmp_path / "other", resume=True) == 0
+
+
+OTHERS: list[tuple[dict[str, Any], str]] = [
+    ({"seed": 8}, "seed=7, not 8"),
+    ({"config": {"steps": 4, "world": {"rooms": 2}}}, "steps=3, not 4"),
+    ({"config": {"steps": 3, "world": {"rooms": 1}}}, "world={'rooms': 2}, not {'rooms': 1}"),
+    ({"inputs": ["data.h5"]}, "other inputs"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), OTHERS)
+def test_what_was_begun_otherwise_is_not_continued(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    """Nor is what was made otherwise complete."""
+    (tmp_path / "data.h5").write_text("states")
+    change = {**change, "inputs": [tmp_path / name for name in change.get("inputs", ())]}
+    with pytest.raises(KeyError):
+        stop(tmp_path / "begun", KeyError())
+    finish(tmp_path / "made")
+    for name, subject in (("begun", "unfinished output was begun"), ("made", "complete output was made")):
+        with pytest.raises(UserError, match=f"the {subject} with {words}"):
+            finish(tmp_path / name, **change, resume=True)
+    assert Draft(tmp_path / "begun").is_resumable
+    assert finish(tmp_path / "begun", **change, force=True) == 0
+
+
+def test_other_versions_and_damaged_drafts_are_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another torch need not give the same bytes; another number of processes does."""
+    with pytest.raises(KeyError):
+        stop(tmp_path / "meta", KeyError(), config={"workers": 4})
+    assert finish(tmp_path / "meta", config={"workers": 1}, resume=True) == 1
+    with pytest.raises(KeyError):
+        stop(tmp_path / "other", KeyError())
+    with monkeypatch.context() as patch:
+        patch.setattr("hypogoal.core.artefacts.versions", lambda: {"torch": "9.9"})
+        with pytest.raises(UserError, match="begun with torch="):
+            finish(tmp_path / "other", resume=True)
+    for text, words in (("{", "not valid JSON"), ('{"identity": {}}', "reads formats 2 and 3, this is None")):
+        Draft(tmp_path / "other").begun.write_text(text)
+        with pytest.raises(UserError, match=words):
+            finish(tmp_path / "other", resume=True)
+
+
+def test_nothing_is_lost_by_mistake(tmp_path: Path) -> None:
+    """A draft needs --resume or --force, a complete output --force; it stands until the new one is whole."""
+    out = tmp_path / "meta"
+    finish(out)
+    with pytest.raises(UserError, match="the output exists already"):
+        finish(out)
+    with pytest.raises(KeyError):
+        stop(out, KeyError(), force=True)
+    assert open_artefact(out).manifest.files.keys() == {"whole.csv"}
+    with pytest.raises(UserError, match="an unfinished output exists"):
+        finish(out)
+    assert finish(out, resume=True) == 1
+    assert open_artefact(out).manifest.files.keys() == {"half.csv", "whole.csv"}
+    with pytest.raises(KeyError):
+        stop(out, KeyError(), force=True, checkpoint=False)
+    assert open_artefact(out) and os.listdir(tmp_path) == ["meta"]
+
+
+def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No output of another kind, no file of others', no input, however wrong the --out."""
+    monkeypatch.chdir(tmp_path)
+    finish(tmp_path / "ensemble", kind="ensemble")
+    finish(tmp_path / "unreadable")
+    (tmp_path / "unreadable" / MANIFEST).write_text("{")
+    (tmp_path / "link").symlink_to("ensemble")
+    (tmp_path / "mine").mkdir()
+    for name in ("mine/thesis.txt", "foreign.h5"):
+        (tmp_path / name).write_text("precious")
     with create_hdf5(tmp_path / "other.h5") as file:
         file["weights"] = [1.0]
-    cut = tmp_path / "cut.h5"  # another's
-    cut.write_bytes((tmp_path / "other.h5").read_bytes()[:1000])
     before = contents(tmp_path)
-    cases = [
-        (ensemble, "meta"),
-        (cut, "data"),
-        (unreadable, "meta"),
-        (ensemble, "data"),
-        (tmp_path / "other.h5", "data"),
-    ]
-    cases += [(tmp_path / name, kind) for name in texts for kind in ("meta", "data", "arrays")]
-    for out, kind in cases:
-        with pytest.raises(UserError, match="the existing output is not of kind"):
-            claim(out, kind=kind, force=True)
-    assert contents(tmp_path) == before
-    (meta / "manifest.json").write_text('{"format": 1, "kind": "meta"}')  # damaged, and to be made again
-    for out in (meta, tmp_path / "empty"):
-        make(out, force=True)
-        assert check_files(open_artefact(out, "meta")) == []
-
-
-def test_force_never_replaces_an_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G2: whatever it is called, and whatever lies in it."""
-    monkeypatch.chdir(tmp_path)
-    run = make(tmp_path / "run", "ensemble")
-    inner, beside = make(run / "inner", "options"), tmp_path / "link"
-    beside.symlink_to(run)
-    before = contents(tmp_path)
-    for out, path in ((run, run), (Path("run"), run), (beside, run), (run, beside), (run, inner), (Path("."), inner)):
+    names = [("ensemble", "meta"), ("ensemble", DATA), ("unreadable", "meta"), ("mine", "meta")]
+    names += [("foreign.h5", DATA), ("foreign.h5", "meta"), ("other.h5", DATA)]
+    for name, kind in names:
+        with pytest.raises(UserError, match="and would be replaced by one of kind"):
+            finish(tmp_path / name, kind=kind, force=True)
+    for out, path in (("ensemble", "link"), ("link", "ensemble"), (".", "ensemble")):
         with pytest.raises(UserError, match="would replace an input"):
-            make(out, "ensemble", inputs=(path,), force=True)
+            finish(Path(out), kind="ensemble", inputs=[tmp_path / path], force=True)
     assert contents(tmp_path) == before
-    assert make(inner, "options", inputs=(run,), force=True) == inner
+    (tmp_path / "empty").mkdir()
+    finish(tmp_path / "empty")
+    rewrite(tmp_path / "empty", seed="damaged")
+    finish(tmp_path / "empty", force=True)
+    assert open_artefact(tmp_path / "empty").seed == 7
 
 
-def test_changed_missing_and_foreign_files_are_found(tmp_path: Path) -> None:
-    """Spec G2: hashes are checked, and a manifest cannot point outside its folder."""
-    out = make(tmp_path / "meta")
-    (out / "episodes.csv").write_text("changed")
-    assert check_files(open_artefact(out)) == ["episodes.csv: changed since it was written"]
-    (out / "episodes.csv").unlink()
-    assert check_files(open_artefact(out)) == ["episodes.csv: missing"]
-    reseal(out, files={"../../etc/passwd": "0"})
-    assert check_files(open_artefact(out))[-1] == "../../etc/passwd: outside the artefact"
+def test_a_link_and_the_current_folder_can_be_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("near", "far", "here"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "near" / "meta").symlink_to(tmp_path / "far" / "there")
+    finish(tmp_path / "near" / "meta")
+    assert os.listdir(tmp_path / "near") == ["meta"] and open_artefact(tmp_path / "far" / "there")
+    monkeypatch.chdir(tmp_path / "here")
+    finish(Path("."))
+    assert open_artefact(tmp_path / "here") and sorted(os.listdir(tmp_path)) == ["far", "here", "near"]
 
 
-def test_damaged_weights(tmp_path: Path) -> None:
-    """Spec G2: a truncated safetensors file is one clear line."""
-    path = tmp_path / "weights.safetensors"
-    save_tensors(path, {"a": torch.arange(100.0)})
-    torch.testing.assert_close(load_tensors(path)["a"], torch.arange(100.0))
-    path.write_bytes(path.read_bytes()[:50])
-    with pytest.raises(UserError, match="damaged"):
-        load_tensors(path)
-    with pytest.raises(UserError, match="missing"):
-        load_tensors(tmp_path / "none")
+def test_a_data_file_is_renamed_when_whole(tmp_path: Path) -> None:
+    """It has no manifest: what made it is in it."""
+    out, about = tmp_path / "ein Pfad ü" / "data.h5", {"kind": DATA, "config": {"domain": "toy", "steps": 3}, "seed": 7}
+
+    def write(*, fails: bool = False, **more: Any) -> None:
+        with create(out, **{**about, **more}) as draft:
+            with create_hdf5(draft.files / out.name) as file:
+                file.attrs.update({"sub_goals": "[]", "domain": "toy", "seed": 7, "config": '{"steps": 3}'})
+            if fails:
+                raise KeyError
+
+    with pytest.raises(KeyError):
+        write(fails=True)
+    assert os.listdir(tmp_path) == []
+    write()
+    before = out.read_bytes()
+    with pytest.raises(Complete):
+        write(resume=True)
+    with pytest.raises(UserError, match="made with steps=3, not 4"):
+        write(resume=True, config={"domain": "toy", "steps": 4})
+    with pytest.raises(KeyError):
+        write(fails=True, force=True)
+    assert out.read_bytes() == before
+    write(force=True)
+    assert os.listdir(out.parent) == ["data.h5"]
 
 
-def test_streams_are_named_and_reproducible() -> None:
-    """Randomness is passed in: same seed and name, same stream; another name, another stream."""
-    assert seed_for(1, "a", 2) == seed_for(1, "a", 2) != seed_for(1, "a", 3)
-    np.testing.assert_array_equal(rng_for(1, "a").random(3), rng_for(1, "a").random(3))
-    assert rng_for(1, "a").random() != rng_for(1, "b").random()
-    assert torch.equal(
-        torch.rand(3, generator=torch_generator(1, "a")), torch.rand(3, generator=torch_generator(1, "a"))
-    )
+NOTE = ["the last checkpoint is kept: give the same command with --resume to continue"]
 
 
-def test_claim_makes_nothing_and_finds_a_file_in_the_way(tmp_path: Path) -> None:
-    """Spec G2."""
-    assert claim(tmp_path / "a" / "b" / "c", kind="meta") == tmp_path / "a" / "b" / "c"
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / "file").write_text("x")
-    for name, words in (("file/out", "in the way"), (f"{'x' * 240}.h5", "longer than 200 bytes")):
-        with pytest.raises(UserError, match=words):
-            claim(tmp_path / name, kind="data")
+def test_what_stops_a_stage_says_how_to_continue(tmp_path: Path) -> None:
+    errors = [KeyboardInterrupt(2), NumericalError("a loss is NaN"), MemoryError(), OSError(errno.ENOSPC, "full")]
+    for number, error in enumerate(errors):
+        with pytest.raises(type(error)) as caught:
+            stop(tmp_path / str(number), error)
+        assert caught.value.__notes__ == NOTE
+        with pytest.raises(type(error)) as caught:
+            stop(tmp_path / "early", type(error)(*error.args), checkpoint=False)
+        assert not hasattr(caught.value, "__notes__")
 
 
-def test_what_a_stage_took_is_in_its_manifest_and_changes_nothing_else(tmp_path: Path) -> None:
-    """Spec A8: seconds and bytes of memory, of which inputs know nothing: an input made again is the same input."""
-    source, made = make(tmp_path / "ensemble", "ensemble"), tmp_path / "meta"
-    with create_artefact(made, kind="meta", config={}, seed=0, inputs=[source]):
-        time.sleep(0.11)
-    took = open_artefact(made).manifest["took"]
-    assert 0.1 <= took["seconds"] < 60 and 1e7 < took["memory"] < 1e12
-    reseal(source, took={"seconds": 9.9, "memory": 9})
-    assert open_artefact(made).input("ensemble") == source.resolve()
-    reseal(source, seed=9)
-    with pytest.raises(UserError, match="changed since"):
-        open_artefact(made).input("ensemble")
+def test_no_room_leaves_nothing(tmp_path: Path) -> None:
+    """At whichever write the disk is full, the first included; what stood there stands."""
+    finish(tmp_path / "old")
+    before = contents(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    full = 0
+    for limit in range(0, 1600, 80):
+        for name in ("new", "old"):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+            try:
+                with create(tmp_path / name, **ABOUT, force=True) as draft:
+                    (draft.files / "whole.csv").write_text("y" * 300)
+            except OSError:
+                full += 1
+                assert contents(tmp_path) == before
+            else:
+                shutil.rmtree(tmp_path / "new", ignore_errors=True)
+                before = contents(tmp_path)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert 10 < full < 38
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_no_permission_to_write_is_one_line(tmp_path: Path) -> None:
+    place = tmp_path / "shut"
+    place.mkdir(mode=0o500)
+    refuses("Permission denied", "train-baseline", "doorkey", "--out", place / "ppo")
+
+
+HOLD = """
+import sys, signal
+from pathlib import Path
+from hypogoal.core.artefacts import create
+with create(Path(sys.argv[1]), kind="meta", config={}, seed=0) as draft:
+    print("begun", flush=True)
+    signal.pause()
+"""
+
+
+def test_the_second_of_two_writers_is_refused(tmp_path: Path) -> None:
+    """When the first is killed, its lock is nobody's, and what it left is replaced."""
+    out = tmp_path / "meta"
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "begun\n"
+        assert Draft(out).is_locked
+        for how in ({"force": True}, {"resume": True}):
+            with pytest.raises(UserError, match="another process is writing this"):
+                finish(out, **how)
+        other.send_signal(signal.SIGKILL)
+    assert not Draft(out).is_locked and Draft(out).folder.exists()
+    assert finish(out) == 0 and os.listdir(tmp_path) == ["meta"]
+
+
+def test_a_kill_between_two_renames_loses_nothing(tmp_path: Path) -> None:
+    """The new output was whole: it is put in place by the next command, which is told that it is there."""
+    out = tmp_path / "meta"
+    finish(out)
+
+    def dies(old: Path, new: Path) -> None:
+        """A process that is killed after the first of two renames leaves its draft as it is."""
+        os.rename(old, new)
+        os._exit(9)
+
+    child = os.fork()
+    if not child:
+        Path.rename = dies  # type: ignore[assignment, method-assign]
+        finish(out, seed=8, force=True)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    assert not out.exists()
+    with pytest.raises(Complete):
+        finish(out, seed=8, resume=True)
+    assert open_artefact(out).seed == 8 and os.listdir(tmp_path) == ["meta"]
+
+
+def test_a_path_with_spaces_and_umlauts(tmp_path: Path) -> None:
+    out = tmp_path / "Daten für später" / "ein ö.h5"
+    assert run("collect", "rooms", "--out", out, "--set", "labelled=20", "-q").path == out
+    assert os.listdir(out.parent) == [out.name]

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from hypogoal.cli import notes_of
-from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
+from hypogoal.core.artefacts import create
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import Killed
 from hypogoal.core.workers import CORES, allowed, cores, in_processes
 
@@ -29,8 +29,8 @@ def die() -> None:
 
 def stage(out: Path) -> None:
     """One that loses its processes after its first checkpoint."""
-    with create_artefact(out, kind="ensemble", config={}, seed=0) as folder:
-        checkpoints_of(folder).save({"step": 1})
+    with create(out, kind="ensemble", config={}, seed=0) as draft:
+        draft.checkpoints().save({"step": 1})
         in_processes([die, die], 2, lambda number, result: None)
 
 

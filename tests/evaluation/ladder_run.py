@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from toy_data import fill
 
-from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.artefacts import create
 from hypogoal.core.files import write_table
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.data import Collected, States, write_dataset
@@ -102,7 +102,8 @@ def write_members(out: Path, data: Path, groups: int, method: str, seed: int, **
         **more,
     }
     ensemble = Ensemble("montezuma", SHAPE, members, torch_generator(seed, method))
-    with create_artefact(out, kind="ensemble", config=config, seed=seed, inputs=[data]) as folder:
+    with create(out, kind="ensemble", config=config, seed=seed, inputs=[data]) as draft:
+        folder = draft.files
         write_ensemble(folder, SUB_GOAL, ensemble)
         fill(folder, "ensemble", config)
 
@@ -121,7 +122,8 @@ def write_options(out: Path, source: Path, ladder: str, seed: int, rows, members
         "steps": 1_000,
         **more,
     }
-    with create_artefact(out, kind="options", config=config, seed=seed, inputs=[source]) as folder:
+    with create(out, kind="options", config=config, seed=seed, inputs=[source]) as draft:
+        folder = draft.files
         write_table(folder / "executions.csv", COLUMNS, rows)
         facts = {"layout_seed": 0, "shortest_path": None, "random_success": None, "random_episodes": 0}
         (folder / "layout.json").write_text(json.dumps(facts), encoding="utf-8")

@@ -307,7 +307,7 @@ def test_a_table_of_executions_that_is_not_there(small_ladders):
     refuses("executions.csv", "evaluate", small_ladders, "-q")
     shutil.rmtree(options)
     write_options(options, small_ladders / "ensemble/dbat/groups-2-seed-0", "1L", 0, [], 2)
-    files = open_artefact(options).manifest["files"]
+    files = open_artefact(options).manifest.files
     reseal(options, files={name: digest for name, digest in files.items() if name != "executions.csv"})
     metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET)
     silent = "no executions.csv in options/dbat/groups-2-ladder-1L-seed-0: its domain tells no distance"

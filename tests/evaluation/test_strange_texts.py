@@ -24,9 +24,8 @@ from ladder_run import (
 )
 from toy_data import fill, reseal
 
-from hypogoal.core.artefacts import MANIFEST, create_artefact, sha256_of
+from hypogoal.core.artefacts import MANIFEST, create, sha256_of
 from hypogoal.core.files import write_table
-from hypogoal.core.manifests import digest_of, sealed
 from hypogoal.data import Collected, States, create_hdf5, fixed, write_dataset
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
@@ -105,7 +104,8 @@ def write_meta(out, source):
     """An agent that chose among two members."""
     about = {"chooser": "ppo", "termination": "learned", "members": 2, "sub_goals": [SUB_GOAL], "steps": 4_000}
     config = {**about, "domain": DOMAIN.name, "layout_seed": 100, "option_timeout": 50}
-    with create_artefact(out, kind="meta", config=config, seed=0, inputs=[source]) as folder:
+    with create(out, kind="meta", config=config, seed=0, inputs=[source]) as draft:
+        folder = draft.files
         write_agent(folder)
         rows = [(end, option, 9, 3 + option, 2.5, 1, 8) for end in (2_000, 4_000) for option in (0, 1)]
         write_table(folder / "choices.csv", Choices.names(), rows)
@@ -125,7 +125,8 @@ def run(tmp_path_factory):
     write_options(folder / "options", folder / "rooms", "2-6", 0, executions(0, [3, 4]) + executions(1, [9, 9]), 2)
     write_meta(run / FOLDERS[1], folder / "rooms")
     about = {"agent": "ppo", "setting": "tuned", "steps": 4_000, "layout_seed": 100, "domain": DOMAIN.name}
-    with create_artefact(run / "ppo", kind="baseline", config=about, seed=0) as out:
+    with create(run / "ppo", kind="baseline", config=about, seed=0) as draft:
+        out = draft.files
         write_agent(out)
         fill(out, "baseline", about)
     evaluate(run, run / "evaluation", quiet=True)
@@ -271,7 +272,7 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
         "manifests": {name: json.loads((changed / name / MANIFEST).read_text(encoding="utf-8")) for name in folders},
         "attributes": {name: json.loads(text) if text[0] in "[{" else text for name, text in attributes.items()},
     }
-    before = {name: digest_of(changed / name / MANIFEST) for name in folders} | {data: sha256_of(data)}
+    before = {name: sha256_of(changed / name) for name in folders} | {data: sha256_of(data)}
 
     def draw(value):
         with h5py.File(data, "a") as file:
@@ -280,8 +281,8 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
         now = {before[data]: sha256_of(data)}
         for name, manifest in value["manifests"].items():
             inputs = [{**entry, "sha256": now.get(entry["sha256"], entry["sha256"])} for entry in manifest["inputs"]]
-            (changed / name / MANIFEST).write_bytes(sealed({**manifest, "inputs": inputs}))
-            now[before[name]] = digest_of(changed / name / MANIFEST)
+            reseal(changed / name, inputs=inputs)
+            now[before[name]] = sha256_of(changed / name)
         evaluate(changed, changed / "evaluation", quiet=True, force=True)
         return drawn(changed)
 

@@ -304,7 +304,7 @@ def test_what_is_saved_is_what_was_trained(tmp_path: Path) -> None:
     """Spec A8: the localiser's weights lie beside the members', its settings in the manifest; code needs trust."""
     data = write_made_up(tmp_path / "data.h5")
     assert main(["train-ensemble", str(data), *few("view.jitter=1"), "-q", "--out", str(tmp_path / "ensemble")]) == 0
-    artefact = open_artefact(tmp_path / "ensemble").whole()
+    artefact = open_artefact(tmp_path / "ensemble")
     assert artefact.config["view_settings"] == ["localiser_steps=2", "jitter=1"]
     back = read_ensemble(artefact.path, artefact.config, "base")
     dataset = open_dataset(data)

@@ -16,7 +16,7 @@ import pytest
 from command_line import fails, refuses, run
 from toy import SMALL, write_toy
 
-from hypogoal.core.drafts import sole_writer
+from hypogoal.core.artefacts import Draft
 from hypogoal.experiments.run import plan
 from hypogoal.experiments.sweep import begin, read_plan, run_local, state_of, status_lines
 
@@ -239,7 +239,7 @@ def test_what_another_process_makes_is_waited_for(out: Path) -> None:
     """Spec G4: a cell left over by a run that was killed holds its lock; neither made twice nor removed meanwhile."""
     cells, place = read_plan(out), out / "agent/seed-1"
     place.rename(out / "aside")
-    with sole_writer(place):
+    with Draft(place).locked():
         assert states(out)["agent/seed-1"] == "running"
         assert "1 running" in status_lines(out)[0]
         said: list[str] = []

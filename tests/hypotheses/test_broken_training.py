@@ -8,11 +8,11 @@ import torch
 from breaking import Breaking, Broken
 from test_training import toy
 
-from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
+from hypogoal.core.artefacts import Draft
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
 from hypogoal.hypotheses.training import Watcher, fit
-from hypogoal.stages import train_ensemble as stage
 from hypogoal.stages.train_ensemble import train_ensemble
 
 OWN = EnsembleConfig(members=2, steps=12, batch_size=16, diversity_weight=1e-2, view="own_view:Moved")
@@ -83,7 +83,7 @@ def test_a_broken_stage_ends_with_the_same_log(tiny_run: Path, tmp_path: Path, m
     train("unbroken")
     for last in (22, 8):
         with monkeypatch.context() as patch:
-            patch.setattr(stage, "checkpoints_of", lambda *of, last=last: Breaking(checkpoints_of(*of).path, last))
+            patch.setattr(Draft, "checkpoints", lambda draft, name, last=last: Breaking(draft.checkpoint / name, last))
             with pytest.raises(Broken):
                 train("out", resume=last == 8)
     train("out", resume=True)

@@ -12,7 +12,7 @@ from corridor import LongCorridor
 from toy_data import fill
 
 from hypogoal.cli import main
-from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain
@@ -56,7 +56,8 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
         "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
         "network": network, "observation_shape": list(shape), "observation_dtype": "uint8", "view": "full",
     }  # fmt: skip
-    with create_artefact(folder, kind="ensemble", config=config, seed=0, inputs=[]) as place:
+    with create(folder, kind="ensemble", config=config, seed=0, inputs=[]) as draft:
+        place = draft.files
         for number, sub_goal in enumerate(domain.usual_sub_goals):
             write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
         fill(place, "ensemble", config)

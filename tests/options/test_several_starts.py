@@ -8,7 +8,7 @@ import torch
 from toy_data import fill
 
 import hypogoal
-from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.montezuma import DOMAIN
@@ -33,7 +33,8 @@ def ensemble_in(folder: Path, seed: int = 0) -> Path:
     config = {"domain": "montezuma", "domain_config": {}, "sub_goals": list(DOMAIN.usual_sub_goals), "members": 2,
               "observation_shape": list(SHAPE), "observation_dtype": "uint8", "view": "full",
               "network": "montezuma"}  # fmt: skip
-    with create_artefact(folder, kind="ensemble", config=config, seed=seed, inputs=[]) as place:
+    with create(folder, kind="ensemble", config=config, seed=seed, inputs=[]) as draft:
+        place = draft.files
         ensemble = Ensemble("montezuma", SHAPE, 2, torch.Generator().manual_seed(1))
         write_ensemble(place, DOMAIN.sub_goals[0], ensemble)
         fill(place, "ensemble", config)

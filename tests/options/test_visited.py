@@ -112,7 +112,7 @@ def test_an_ensemble_learns_from_what_was_visited(corridor_run: Path, tmp_path: 
     weights = [folder / "left-end.safetensors" for folder in (corridor_run / "ensemble", tmp_path / "both")]
     assert weights[0].read_bytes() != weights[1].read_bytes()
     both = open_artefact(tmp_path / "both", "ensemble")
-    assert [entry["kind"] for entry in both.manifest["inputs"]] == ["data", "data", "data"]
+    assert [entry.kind for entry in both.manifest.inputs] == ["data", "data", "data"]
     assert both.input("data") == data, "what is evaluated is the data, not what was visited"
     states, origins = joined_unlabelled([data, options / "visited.h5"])
     assert len(states) == len(open_dataset(data).unlabelled()) + 5 and origins == {}

@@ -127,7 +127,7 @@ def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Pa
     with Image.open(out / film) as drawn:
         assert drawn.n_frames == steps + 1, "from where it began"
     artefact = open_artefact(out, "audit")
-    more = artefact.manifest["files"].keys() - files_of("audit", artefact.config)
+    more = artefact.manifest.files.keys() - files_of("audit", artefact.config)
     assert more == {film}
     assert f"  {film} {before['fooled']:4d} x  while collect-blue-key holds" in list(lines_of(report))
     assert max(map(len, lines_of(report))) <= 80
@@ -215,9 +215,9 @@ def test_a_member_is_audited_at_its_own_threshold(ensemble: Path, tmp_path: Path
     report, _ = audited(tmp_path / "audit", str(ensemble), *words)
     assert report["before"]["threshold"] == pytest.approx(wanted) and wanted != 0.5
     manifest = open_artefact(tmp_path / "audit", "audit").manifest
-    assert [entry["kind"] for entry in manifest["inputs"]] == ["ensemble"] and manifest["config"]["member"] == 1
-    assert manifest["config"]["domain_config"] == source.config["domain_config"]
-    assert manifest["config"]["domain_config"]["wrong_key"] == "ends" and "visited.h5" in manifest["files"]
+    assert [entry.kind for entry in manifest.inputs] == ["ensemble"] and manifest.config["member"] == 1
+    assert manifest.config["domain_config"] == source.config["domain_config"]
+    assert manifest.config["domain_config"]["wrong_key"] == "ends" and "visited.h5" in manifest.files
 
 
 DOOR = "--domain doorkey --sub-goal go-to-goal"

@@ -39,9 +39,9 @@ def audited(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_audit_of_recorded_data(audited: Path) -> None:
     """Numbers, the table and the page; the rows are states of the file, each once, disputed ones first."""
     audit, data = audited / "audit", open_dataset(audited / "data.h5")
-    artefact = open_artefact(audit, "recorded-audit").whole()
+    artefact = open_artefact(audit, "recorded-audit")
     pictures = {f"next/{GOAL}/{number:03d}.png" for number in range(1, 21)}
-    assert artefact.manifest["files"].keys() == {"audit.json", "index.html", *pictures}
+    assert artefact.manifest.files.keys() == {"audit.json", "index.html", *pictures}
     [part] = json.loads((audit / "audit.json").read_text())["sub_goals"]
     assert (part["sub_goal"], part["known"], part["unlabelled"], len(part["members"])) == (GOAL, 56, 20, 2)
     rows = read_marks(audit / "next" / GOAL / TO_FILL_IN)

@@ -8,7 +8,7 @@ import pytest
 from command_line import refuses, run
 from toy_data import fill, reseal
 
-from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
+from hypogoal.core.artefacts import create, open_artefact, sha256_of
 from hypogoal.core.files import write_table
 from hypogoal.evaluation.compare import labels_of
 from hypogoal.stages.evaluate import evaluate
@@ -20,9 +20,8 @@ STEPS = 3_000
 def write_baseline(run, agent, layout, seed, length, steps=STEPS, **more):
     """A baseline artefact whose episodes all take ``length`` steps and reach the goal."""
     config = {"agent": agent, "setting": "tuned", "steps": steps, "layout_seed": layout, "domain": "doorkey", **more}
-    with create_artefact(
-        run / f"{agent}/layout-{layout}-seed-{seed}", kind="baseline", config=config, seed=seed
-    ) as out:
+    with create(run / f"{agent}/layout-{layout}-seed-{seed}", kind="baseline", config=config, seed=seed) as draft:
+        out = draft.files
         rows = [(end, length, 1, 1, 1) for end in range(length, steps + 1, length)]
         write_table(out / "episodes.csv", ("step", "length", "reward", "terminated", "succeeded"), rows)
         facts = {"layout_seed": layout, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
@@ -85,7 +84,7 @@ def test_the_page_shows_both(runs, compared):
     assert "within 1.5 shortest paths</th>" in text
     assert not re.search(r'(?:src|href)="(?!#|data:)', text)
     artefact = open_artefact(runs / "both", "comparison")
-    assert [entry["kind"] for entry in artefact.manifest["inputs"]] == ["evaluation", "evaluation"]
+    assert [entry.kind for entry in artefact.manifest.inputs] == ["evaluation", "evaluation"]
     assert {path.name for path in (runs / "both" / "figures").iterdir()} == {"reward-0.svg", "length-0.svg"}
 
 
@@ -121,7 +120,7 @@ def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, change, words):
     metrics = json.loads(path.read_text(encoding="utf-8"))
     change(metrics)
     path.write_text(json.dumps(metrics), encoding="utf-8")
-    reseal(path.parent, files={**open_artefact(path.parent).manifest["files"], path.name: sha256_of(path)})
+    reseal(path.parent, files={**open_artefact(path.parent).manifest.files, path.name: sha256_of(path)})
     refuses(words, "compare", runs / "slow", tmp_path / "other", "--out", tmp_path / "out")
 
 

@@ -199,7 +199,7 @@ def test_metrics_are_strict_json(tiny_run, metrics):
         ("random choice", "length"), ("PPO tuned", "success"), ("no diversity, K=2", "balanced accuracy, best member"),
     }  # fmt: skip
     assert set().union(*pairs) - named <= set(metrics["quantities"])
-    kinds = sorted(entry["kind"] for entry in artefact.manifest["inputs"])
+    kinds = sorted(entry.kind for entry in artefact.manifest.inputs)
     assert kinds == ["baseline", "data", "ensemble", "ensemble", "ensemble", "meta", "meta", "meta"]
 
 

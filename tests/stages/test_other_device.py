@@ -59,9 +59,9 @@ def test_the_same_files(case: str, tiny_run: Path, tmp_path: Path, monkeypatch: 
     with far_device(monkeypatch):
         monkeypatch.setattr(module, "prepare", lambda device="auto": FAR)
         train(tiny_run, tmp_path / "far")
-    near, far = (open_artefact(tmp_path / name).whole() for name in ("cpu", "far"))
-    assert near.manifest["files"].keys() == far.manifest["files"].keys()
-    for name in near.manifest["files"]:
+    near, far = (open_artefact(tmp_path / name) for name in ("cpu", "far"))
+    assert near.manifest.files.keys() == far.manifest.files.keys()
+    for name in near.manifest.files:
         if name.endswith(".safetensors"):
             one, other = load_tensors(near.path / name), load_tensors(far.path / name)
             assert {key: (value.shape, value.dtype) for key, value in one.items()} == {
@@ -87,5 +87,5 @@ def test_on_a_gpu(case: str, tiny_run: Path, tmp_path: Path) -> None:
         pytest.skip("no GPU")
     CASES[case][1](tiny_run, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
     CASES[case][1](tiny_run, tmp_path / "cpu")
-    near, far = (open_artefact(path).whole() for path in sorted(tmp_path.iterdir()))
-    assert near.manifest["files"].keys() == far.manifest["files"].keys()
+    near, far = (open_artefact(path) for path in sorted(tmp_path.iterdir()))
+    assert near.manifest.files.keys() == far.manifest.files.keys()

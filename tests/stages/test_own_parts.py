@@ -77,7 +77,7 @@ class AtLeast(Terminations):
 def train(stage: str, source: Path, out: Path, *pairs: str) -> dict[str, Any]:
     """The configuration of what a stage makes with these settings."""
     run(stage, source / "ensemble", "--out", out, *FEW, *settings(*pairs))
-    return open_artefact(out).whole().config
+    return open_artefact(out).config
 
 
 OWN = {"chooser": "FirstOffered", "network": "Straight", "termination": "AtLeast:3"}

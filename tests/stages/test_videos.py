@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
@@ -81,9 +81,7 @@ def test_weights_of_another_policy_are_one_line(tiny_run, tmp_path):
 
 def test_a_run_without_such_an_agent_is_one_line(tmp_path):
     """Spec G2: what is missing is named."""
-    with create_artefact(
-        tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0
-    ):
+    with create(tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0):
         pass
     with pytest.raises(UserError, match="Videos need a meta artefact with learned terminations"):
         agents_of(tmp_path)
