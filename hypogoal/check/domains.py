@@ -18,6 +18,7 @@ from hypogoal.domains.base import Domain, Engine, Step
 from hypogoal.settings import CONFIGS
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
+STATE_NOW = "A label is a function of the state now: count, keep and draw nothing in it."
 SEEDED = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."
 
 
@@ -27,9 +28,8 @@ def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, se
     Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
     (None: the defaults). ``seed`` is for both. A sub-goal that play does not reach is a warning.
     """
-    laws = [_Played.settings, _Played.steps, _Played.labels, _Played.two_engines, _Played.restore, _Played.collect]
-    if domain.has_env:
-        laws.insert(1, _Played.gymnasium)
+    laws = [_Played.settings, _Played.gymnasium] if domain.has_env else [_Played.settings]
+    laws += [_Played.steps, _Played.observations, _Played.labels, _Played.two_engines, _Played.restore, _Played.collect]
     return verdicts(laws, _Played(domain, config, layout_seed, seed))
 
 
@@ -63,29 +63,35 @@ class _Played:
 
     def steps(self) -> str:
         """Arrays of the right type and shape, finite rewards, episodes that end in time."""
-        domain, engine, ended = self.domain, self.make_engine(), 0
-        if domain.doubt:
-            warnings.warn(domain.doubt, stacklevel=1)
-        types = {"next_ids": np.dtype(np.int64), "rewards": np.dtype(np.float32), "images": domain.observation_dtype}
+        engine, domain, ended = self.make_engine(), self.domain, 0
+        types = {"next_ids": np.int64, "rewards": np.float32, "images": domain.observation_dtype}
         shapes = {"images": domain.observation_shape, "labels": (len(domain.sub_goals),)}
         for actions in self.actions(engine):
             elapsed = engine.elapsed + 1
             step = engine.step(actions)
             for name, values in _shown(engine, step).items():
-                _require_array(name, values, types.get(name, np.dtype(np.bool_)), COUNT, *shapes.get(name, ()))
-            promise(bool(np.isfinite(step.rewards).all()), f"rewards are {step.rewards}", "Give finite numbers.")
+                _require_array(name, values, types.get(name, np.bool_), COUNT, *shapes.get(name, ()))
+            finite = bool(np.isfinite(step.rewards).all())
+            promise(finite, f"rewards are {step.rewards}", "Give finite numbers.")
             over = step.terminated | step.truncated
-            promise(bool(over[elapsed >= MAX_STEPS].all()), "an episode went on after max_steps", "Truncate it there.")
+            cut = bool(over[elapsed >= MAX_STEPS].all())
+            promise(cut, "an episode went on after max_steps", "Truncate it there.")
             counted = np.array_equal(engine.elapsed, np.where(over, 0, elapsed))
             promise(counted, f"elapsed is {engine.elapsed}, ended {over}", "Count the steps of each episode.")
-            going_on = np.array_equal(engine.ids[~over], step.next_ids[~over])
-            promise(going_on, "ids differ from next_ids", "They differ only where an episode ended.")
             ended += int(over.sum())
+        return f"{STEPS} at random in {COUNT} environments, {ended} episodes ended"
+
+    def observations(self) -> str:
+        """Written into ``out``, too."""
+        engine = self.make_engine()
         images = engine.images(engine.ids)
         out = np.zeros_like(images)
         engine.images(engine.ids, out)
-        promise(np.array_equal(images, out), "images(ids, out) does not fill out", "Write the images into it.")
-        return f"{STEPS} at random in {COUNT} environments, {ended} episodes ended"
+        filled = np.array_equal(images, out)
+        promise(filled, "images(ids, out) does not fill out", "Write the images into it.")
+        if self.domain.doubt:
+            warnings.warn(self.domain.doubt, stacklevel=1)
+        return f"{images.dtype} {images.shape[1:]}"
 
     def labels(self) -> str:
         """The same when computed twice; a warning where observations do not show them."""
@@ -94,14 +100,14 @@ class _Played:
         for actions in self.actions(engine):
             engine.step(actions)
             labels = engine.labels(engine.ids)
-            named = ", ".join(goals[(engine.labels_now() != labels).any(0)])
-            do = "A label is a function of the state now: count, keep and draw nothing in it."
-            promise(not named, f"asked twice in the same state, labels differ: {named}", do)
+            changed = (engine.labels_now() != labels).any(0)
+            text = f"asked twice in the same state, labels differ: {', '.join(goals[changed])}"
+            promise(not changed.any(), text, STATE_NOW)
             for image, row in zip(engine.images(engine.ids), labels, strict=True):
                 seen.setdefault(image.tobytes(), set()).add(row.tobytes())
         ambiguous = sum(len(rows) > 1 for rows in seen.values())
-        text = f"{ambiguous} of {len(seen)} observations have different labels: no classifier can tell them apart"
         if ambiguous:
+            text = f"{ambiguous} of {len(seen)} observations have different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=1)
         return f"the same when asked twice, in {len(seen)} observations"
 
@@ -131,19 +137,21 @@ class _Played:
         except Unmet as error:
             warnings.warn(str(error), stacklevel=1)
             return "not looked at: play did not reach the states"
-        promise(tuple(first.sub_goals) == goals, f"sub_goals are {first.sub_goals}, not {goals}", "Give the domain's.")
+        same = tuple(first.sub_goals) == goals
+        promise(same, f"sub_goals are {first.sub_goals}, not {goals}", "Give the domain's, in their order.")
         for name in ("labelled", "unlabelled", "heldout"):
             states, others = getattr(first, name), getattr(again, name)
             count = len(states.labels)
             promise(count > 0, f"there are no {name} states", "Collect some: other seeds, or more steps.")
             _require_array(name, states.observations, domain.observation_dtype, count, *domain.observation_shape)
-            _require_array(f"labels of {name}", states.labels, np.dtype(np.bool_), count, len(goals))
+            _require_array(f"labels of {name}", states.labels, np.bool_, count, len(goals))
             same = np.array_equal(states.labels, others.labels)
             same &= np.array_equal(states.observations, others.observations)
             promise(same, f"{name} states differ when collected again with seed {self.seed}", SEEDED)
         require_classes(first.labelled.labels, goals, "collect", GET_MORE)
-        positives = zip(goals, first.labelled.labels.sum(0), strict=True)
-        return f"{len(first.labelled.labels)} labelled: " + ", ".join(f"{count} {goal}" for goal, count in positives)
+        counts = zip(goals, first.labelled.labels.sum(0), strict=True)
+        positives = ", ".join(f"{count} {goal}" for goal, count in counts)
+        return f"positives of {len(first.labelled.labels)}: {positives}"
 
     def collected(self) -> Collected:
         config = self.domain.small(self.config)
@@ -174,9 +182,9 @@ def _require_same(first: Engine, second: Engine, actions: NDArray[np.int64], do:
             promise(np.array_equal(left[name], right[name]), f"{name} differ in step {number}", do)
 
 
-def _require_array(name: str, value: Any, dtype: np.dtype[Any], *shape: int) -> None:
+def _require_array(name: str, value: Any, dtype: Any, *shape: int) -> None:
     """Refuse anything but a NumPy array of this type and shape."""
     found = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
-    wanted = f"{dtype} {shape}"
+    wanted = f"{np.dtype(dtype)} {shape}"
     fits = isinstance(value, np.ndarray) and found == wanted
     promise(fits, f"{name}: {found} instead of {wanted}", "Give a NumPy array of that type and shape.")

@@ -31,35 +31,43 @@ def check_network(
 
 class _Network:
     def __init__(self, name: str, states: Observations):
-        self.name, self.states, self.view = name, states, full_view(states, states)
+        self.name, self.states = name, states
+        self.view = full_view(states, states)
         self.inputs = as_input(as_tensor(self.view.see(states)), states.dtype)
 
     def ensemble(self) -> Ensemble:
-        return Ensemble(self.name, self.view.shape, 2, torch_generator(0, "check"), self.view)
+        generator = torch_generator(0, "check")
+        return Ensemble(self.name, self.view.shape, 2, generator, self.view)
 
     def logits(self) -> str:
         """Members get the same tensor, one after the other."""
-        member, inputs = self.ensemble().members[0], self.inputs.clone()
+        member = self.ensemble().members[0]
+        inputs = self.inputs.clone()
         shape = tuple(member(inputs).shape)
         promise(shape == (COUNT, 2), f"logits are {shape}", "Leave the last layer to hypogoal.")
-        promise(torch.equal(inputs, self.inputs), "the network changes its input", "Have it change a copy.")
+        unchanged = torch.equal(inputs, self.inputs)
+        promise(unchanged, "the network changes its input", "Have it change a copy.")
         return f"{shape}, explained by {method_of(member)}"
 
     def members(self) -> str:
         """They share nothing, and their weights come from the seed."""
         ensemble, again = self.ensemble(), self.ensemble()
         first, second = ensemble.members
-        promise(not _parts(first) & _parts(second), "two members share modules or weights", ANEW)
+        shared = _parts(first) & _parts(second)
+        promise(not shared, "two members share modules or weights", ANEW)
         for weights, others in zip(ensemble.parameters(), again.parameters(), strict=True):
-            promise(torch.equal(weights, others), "two ensembles of one seed differ", ANEW)
+            same = torch.equal(weights, others)
+            promise(same, "two ensembles of one seed differ", ANEW)
         return "each has its own weights, which the seed draws"
 
     def gradients(self) -> str:
         member = self.ensemble().members[0]
-        member(self.inputs).square().sum().backward()
+        loss = member(self.inputs).square().sum()
+        loss.backward()
         for name, weight in member.named_parameters():
             learns = weight.grad is not None and bool(weight.grad.any())
-            promise(learns or not weight.requires_grad, f"weight {name} gets no gradient", "Is it used, not detached?")
+            kept = learns or not weight.requires_grad
+            promise(kept, f"weight {name} gets no gradient", "Is it used, not detached?")
         return "every weight that is not frozen learns"
 
     def answers(self) -> str:
@@ -67,7 +75,8 @@ class _Network:
         ensemble = self.ensemble()
         many = ensemble.predict(np.concatenate([self.states] * 40))
         for place in range(COUNT):
-            worst = np.abs(many[place] - ensemble.predict(self.states[place : place + 1])).max()
+            alone = ensemble.predict(self.states[place : place + 1])
+            worst = np.abs(many[place] - alone).max()
             text = f"probabilities alone and among others differ by {worst:.2g}"
             promise(bool(worst < CLOSE), text, "Use layers that act on each state alone.")
         return "a state's do not depend on others"
@@ -75,7 +84,8 @@ class _Network:
     def storage(self) -> str:
         ensemble = self.ensemble()
         again = Ensemble.from_state(self.name, self.view.shape, 2, ensemble.state(), self.view)
-        same = np.array_equal(ensemble.predict(self.states), again.predict(self.states))
+        before, after = ensemble.predict(self.states), again.predict(self.states)
+        same = np.array_equal(before, after)
         promise(same, "a stored network gives other answers", "Keep all state in parameters and buffers.")
         return "the same answers after safetensors"
 

@@ -36,10 +36,11 @@ def shape(objective: Objective) -> str:
 
 def order(objective: Objective) -> str:
     context = context_of()
-    turned = replace(context, labelled=context.labelled.flip(0), unlabelled=context.unlabelled.flip(0, 1))
-    same = torch.allclose(objective.losses(context).sum(), objective.losses(turned).sum())
-    do = "Make it symmetric, for example by means."
-    promise(same, "the loss changes when members, and states, change places", do)
+    labelled, unlabelled = context.labelled.flip(0), context.unlabelled.flip(0, 1)
+    turned = replace(context, labelled=labelled, unlabelled=unlabelled)
+    loss, other = objective.losses(context).sum(), objective.losses(turned).sum()
+    text = "the loss changes when members, and states, change places"
+    promise(torch.allclose(loss, other), text, "Make it symmetric, for example by means.")
     return "members and states may change places"
 
 
@@ -53,8 +54,10 @@ def extreme_logits(objective: Objective) -> str:
 
 def gradients(objective: Objective) -> str:
     _, gradient = _derived(objective, context_of())
-    least = gradient.abs().amax(dim=(1, 2)).min().item()
-    promise(least >= LEAST_GRADIENT, f"a member gets a gradient of {least:.1g}", f"Do not detach it. {LOG_SPACE}")
+    of_members = gradient.abs().amax(dim=(1, 2))
+    least = of_members.min().item()
+    text = f"a member gets a gradient of {least:.1g}"
+    promise(least >= LEAST_GRADIENT, text, f"Do not detach it. {LOG_SPACE}")
     return f"at least {least:.2g} for each member"
 
 
@@ -64,11 +67,11 @@ def disagreement(objective: Objective) -> str:
     member = confident(1, 1, 0, 0).requires_grad_()
     agreeing = objective.pair_loss(member, member.detach())
     differing = objective.pair_loss(member, confident(1, 0, 1, 0))
-    text = (
-        f"{agreeing.item():.4g} where two members agree, {differing.item():.4g} where they differ on half of the states"
-    )
-    promise(bool(differing < agreeing), text, "The loss must be lower where they differ: has a sign been lost?")
-    largest = torch.autograd.grad(agreeing, member)[0].abs().max().item()
+    text = f"{agreeing:.4g} where two members agree, {differing:.4g} where they differ on half of the states"
+    lower = bool(differing < agreeing)
+    promise(lower, text, "The loss must be lower where they differ: has a sign been lost?")
+    (gradient,) = torch.autograd.grad(agreeing, member)
+    largest = gradient.abs().max().item()
     fault = f"sure members that agree get a gradient of {largest:.1g}"
     promise(largest >= LEAST_GRADIENT, fault, LOG_SPACE)
     return text
