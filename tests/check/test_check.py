@@ -105,7 +105,7 @@ BROKEN = [
     (having(defaults={"train-ensemble": {"memberz": 4}}), "settings", "memberz"),
     (having(defaults={"train_ensemble": {"members": 4}}), "settings", "'train_ensemble', which is not a stage"),
     (domain_of(images=lambda self, ids, out=None: np.zeros((len(ids), 64, 64, 3), np.float32)), "steps", "float32"),
-    (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "steps", "does not fill out"),
+    (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "observations", "does not fill out"),
     (domain_of(images=lambda self, ids, out=None: 1 // 0), "steps", "ZeroDivisionError"),
     (stepping(rewards=lambda values: values.astype(np.float64)), "steps", "float64"),
     (stepping(rewards=lambda values: values * np.nan), "steps", "finite"),
@@ -138,7 +138,8 @@ def test_domains_that_keep_the_contract_pass() -> None:
     defaults = {"train-ensemble": {"members": 4}, "collect": {"copies": 2}, "train-baseline": {}}
     found = [*check_domain(having(defaults=defaults))]
     require(found)
-    assert [verdict.name for verdict in found] == ["settings", "steps", "labels", "two engines", "restore", "collect"]
+    laws = ["settings", "steps", "observations", "labels", "two engines", "restore", "collect"]
+    assert [verdict.name for verdict in found] == laws
     assert not any(verdict.warnings for verdict in found)
     both = GymnasiumDomain(CorridorEnv, ("left-end", "right-end"), labels=all_labels, success=swift)
     require(check_domain(both, SMALL))
@@ -318,11 +319,11 @@ def test_the_command_prints_a_line_for_each_law(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(TESTS)
     small = settings("steps=150", "heldout_seeds=4,5")
     told = run("check", "corridor_env:DOMAIN", *small).out.splitlines()
-    assert len(told) == 7 and all(line.startswith("ok   ") for line in told)
+    assert len(told) == 8 and all(line.startswith("ok   ") for line in told)
     told = fails("check", "corridor_env:RESTLESS", *small).out.splitlines()
     assert told[-1].startswith("FAIL two engines") and "np_random" in told[-1]
     told = run("check", "corridor_env:SENSED", *small, "--network", "mlp").out.splitlines()
-    assert len(told) == 12 and not any(line.startswith("FAIL") for line in told)
+    assert len(told) == 13 and not any(line.startswith("FAIL") for line in told)
     told = fails("check", "corridor_env:SENSED", *small, "--network", "doorkey").out.splitlines()
     assert told[-1].startswith("FAIL logits: the network 'doorkey' does not take these observations")
     monkeypatch.chdir(TESTS.parent / "examples")
