@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from hypogoal.core.compute import prepare
 from hypogoal.core.progress import Progress
-from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.evaluation.numbers import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking

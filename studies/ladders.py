@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
-from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
+from hypogoal.evaluation.numbers import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking

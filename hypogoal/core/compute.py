@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from hypogoal.core.errors import UserError
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
+    pass
 
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -39,10 +36,3 @@ def check_name(device: str) -> None:
     """Refuse (``UserError``) an unknown device; whether this machine has it is not checked."""
     if device not in DEVICES:
         raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
-
-
-def tensor(values: NDArray[Any], device: torch.device) -> Tensor:
-    """An array as a tensor on a device; on the CPU it shares the array's memory."""
-    import torch
-
-    return torch.from_numpy(values).to(device)

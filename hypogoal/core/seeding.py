@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +12,16 @@ if TYPE_CHECKING:
 
 
 def _sequence(seed: int, names: tuple[str | int, ...]) -> np.random.SeedSequence:
-    keys = [zlib.crc32(name.encode()) if isinstance(name, str) else int(name) for name in names]
-    return np.random.SeedSequence([int(seed), *keys])
+    keys = [int(seed)]
+    for name in names:
+        keys.append(zlib.crc32(name.encode()) if isinstance(name, str) else int(name))
+    return np.random.SeedSequence(keys)
 
 
 def seed_for(seed: int, *names: str | int) -> int:
     """A 63-bit seed for the stream called ``names`` of run ``seed``."""
-    return int(_sequence(seed, names).generate_state(1, np.uint64)[0] >> 1)
+    state = _sequence(seed, names).generate_state(1, np.uint64)
+    return int(state[0] >> 1)
 
 
 def rng_for(seed: int, *names: str | int) -> np.random.Generator:
@@ -40,13 +42,16 @@ def global_state(device: torch.device) -> list[torch.Tensor]:
     """The states of torch's global generators (CPU and a CUDA ``device``), for code that cannot be passed another."""
     import torch
 
-    return [torch.get_rng_state(), *([torch.cuda.get_rng_state(device)] if device.type == "cuda" else [])]
+    states = [torch.get_rng_state()]
+    if device.type == "cuda":
+        states.append(torch.cuda.get_rng_state(device))
+    return states
 
 
-def restore_global(state: Sequence[torch.Tensor], device: torch.device) -> None:
+def restore_global(states: list[torch.Tensor], device: torch.device) -> None:
     """Restore torch's global generators to a :func:`global_state`."""
     import torch
 
-    torch.set_rng_state(state[0])
+    torch.set_rng_state(states[0])
     if device.type == "cuda":
-        torch.cuda.set_rng_state(state[1], device)
+        torch.cuda.set_rng_state(states[1], device)

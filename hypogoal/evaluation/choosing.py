@@ -19,13 +19,12 @@ from rich.table import Table as Printed
 from scipy.stats import rankdata
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.rounding import DIGITS, above, at_least
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, NEARLY, titled
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import Metrics, mean_of
+from hypogoal.evaluation.numbers import DIGITS, Metrics, above, at_least, mean_of
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import takes
 from hypogoal.evaluation.table import Number, Row, Table, by_run, rows_of, select, tabulate

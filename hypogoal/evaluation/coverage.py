@@ -6,7 +6,7 @@ Pure functions of probabilities on states in which all features are crossed, see
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.rounding import at_least
+from hypogoal.evaluation.numbers import at_least
 from hypogoal.hypotheses.scores import ranking
 
 Table = NDArray[np.float64]  # (K, F)

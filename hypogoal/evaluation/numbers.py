@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 from scipy.stats import binomtest, bootstrap, trim_mean
 
-from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 
+DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
+ROUNDING = 10.0**-DIGITS
 Metrics = Mapping[str, Any]
 Rows = list[dict[str, Any]]
 Item = TypeVar("Item")
@@ -40,6 +41,16 @@ METHODS = {"dbat": "D-BAT", "no diversity": "an ensemble without diversity", "si
 ORACLE = "oracle termination"
 OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis"}
 ONE = "one classifier"
+
+
+def at_least(values: Any, bound: Any) -> Any:
+    """Whether values (...) are at least ``bound`` (...), up to rounding, as .3 - .1 is .2: bool (...)."""
+    return values >= bound - ROUNDING
+
+
+def above(values: Any, bound: Any) -> Any:
+    """Whether values (...) exceed ``bound`` (...) by more than rounding: bool (...)."""
+    return values > bound + ROUNDING
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:

@@ -14,12 +14,21 @@ from typing import Any
 import numpy as np
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.rounding import DIGITS
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN, UNIFORM, UNIFORM_CHOICE
 from hypogoal.evaluation.curves import LEARNED, RANDOM, Run, base_name, titled
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import ONE, ORACLE, Metrics, by_unit, compare_pairs, ensemble_title, grouped, mean_of
+from hypogoal.evaluation.numbers import (
+    DIGITS,
+    ONE,
+    ORACLE,
+    Metrics,
+    by_unit,
+    compare_pairs,
+    ensemble_title,
+    grouped,
+    mean_of,
+)
 from hypogoal.evaluation.page import Block, Material, Question, listed, percent, picture, section
 from hypogoal.evaluation.table import Row, select
 from hypogoal.evaluation.zero_shot import SCOPE as NEW_LAYOUTS

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.compute import tensor
+from hypogoal.core.arrays import tensor
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.views import FullView

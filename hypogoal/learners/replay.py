@@ -11,8 +11,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Columns
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.core.columns import Columns
 
 FAN = 64  # children of a node: 1e5 leaves are three levels, and NumPy's cost is by the call
 Rows = TypeVar("Rows", bound=Columns)

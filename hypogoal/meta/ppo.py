@@ -9,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.core.arrays import Columns, tensor
 from hypogoal.core.checkpoints import State
-from hypogoal.core.columns import Columns
-from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit

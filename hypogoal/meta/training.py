@@ -14,7 +14,6 @@ from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
@@ -150,7 +149,7 @@ def cut(engine: Engine, cap: float) -> None:
     if cap:
         if (shortest := engine.shortest_path()) is None:
             raise UserError("this layout's shortest path is not known", f"cap={cap:g}", "Give cap=0.")
-        engine.max_steps = math.ceil(round(cap * shortest, DIGITS))  # 1.1 * 50 is 55
+        engine.max_steps = math.ceil(round(cap * shortest, 9))  # 1.1 * 50 is 55
 
 
 def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence[str]) -> dict[str, Any]:

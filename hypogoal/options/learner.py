@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.compute import tensor
+from hypogoal.core.arrays import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.compute import tensor
+from hypogoal.core.arrays import tensor
 from hypogoal.hypotheses import patches
 
 SAVED = "gru.weight_ih_l0"  # the state dict's name for ``rows``, which are there as nn.GRU has them

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.arrays import Columns
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.core.columns import Columns
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.columns import Columns
+from hypogoal.core.arrays import Columns
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, write_table
 from hypogoal.learners.episodes import LAST

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hypogoal.core.compute import tensor
+from hypogoal.core.arrays import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hypogoal.core.columns import Columns
+from hypogoal.core.arrays import Columns
 from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay, SumTree
 

@@ -1,13 +1,19 @@
 """Dataclasses of arrays: a row for each of n things, such as decisions, transitions, lines of a table."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, Self, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Self, get_args, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable, State
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
@@ -27,26 +33,41 @@ class Columns(Resumable):
     def types(cls) -> dict[str, type[np.generic]]:
         """The NumPy type that each field's annotation says."""
         hints = get_type_hints(cls)
-        return {name: get_args(get_args(hints[name])[1])[0] for name in cls.names()}
+        found = {}
+        for name in cls.names():
+            _shape, dtype = get_args(hints[name])
+            found[name] = get_args(dtype)[0]
+        return found
 
     @classmethod
     def zeros(cls, *shape: int) -> Self:
         """So many rows of zeros, for all columns alike."""
-        return cls(*(np.zeros(shape, kind) for kind in cls.types().values()))
+        return cls(**{name: np.zeros(shape, dtype) for name, dtype in cls.types().items()})
 
     @classmethod
     def cast(cls, *columns: Any) -> Self:
         """From a sequence for each column, of whatever type."""
-        return cls(*(np.asarray(values, kind) for values, kind in zip(columns, cls.types().values(), strict=True)))
+        arrays = []
+        for values, dtype in zip(columns, cls.types().values(), strict=True):
+            arrays.append(np.asarray(values, dtype))
+        return cls(*arrays)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all parts, one part after another."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.names()))
+        columns = {}
+        for name in cls.names():
+            columns[name] = np.concatenate([getattr(part, name) for part in parts])
+        return cls(**columns)
 
     def at(self, rows: Any) -> Self:
         """Some rows, by whatever NumPy takes for an index."""
-        return type(self)(*(getattr(self, name)[rows] for name in self.names()))
+        return type(self)(**{name: getattr(self, name)[rows] for name in self.names()})
+
+    def put(self, rows: Any, values: Self) -> None:
+        """Write other values into some rows, in place."""
+        for name in self.names():
+            getattr(self, name)[rows] = getattr(values, name)
 
     def snapshot(self) -> State:
         return {name: getattr(self, name).copy() for name in self.names()}
@@ -54,7 +75,9 @@ class Columns(Resumable):
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         self.put(slice(None), type(self)(**snapshot))
 
-    def put(self, rows: Any, values: Self) -> None:
-        """Write other values into some rows, in place."""
-        for name in self.names():
-            getattr(self, name)[rows] = getattr(values, name)
+
+def tensor(values: NDArray[Any], device: torch.device) -> torch.Tensor:
+    """An array as a tensor on a device; on the CPU it shares the array's memory."""
+    import torch
+
+    return torch.from_numpy(values).to(device)

@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from hypogoal.core.rounding import above, at_least
 from hypogoal.domains import montezuma_states
 from hypogoal.evaluation.curves import NEAR, SOLVED
+from hypogoal.evaluation.numbers import above, at_least
 
 
 def test_what_misses_a_bound_by_rounding_meets_it() -> None:
