@@ -25,8 +25,8 @@ import torch  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from hypogoal.core.compute import prepare  # noqa: E402
 from hypogoal.core.config import resolve  # noqa: E402
+from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey_engine import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402

@@ -28,8 +28,8 @@ import torch  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
 from hypogoal.core.checkpoints import Checkpoints  # noqa: E402
-from hypogoal.core.compute import prepare  # noqa: E402
 from hypogoal.core.config import resolve  # noqa: E402
+from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.data import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
 from hypogoal.domains.base import defaults_of  # noqa: E402

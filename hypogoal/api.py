@@ -16,6 +16,7 @@ from typing import Any
 from hypogoal import stages
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.processes import own_settings
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import say
 from hypogoal.domains.base import BUILT_IN, REGISTERED, Domain, load_domain
@@ -109,11 +110,12 @@ def _made(stage: str, source: str | Path, out: Place, arguments: dict[str, Any],
 
 def _called(out: Path, run: Callable[[], object]) -> Made:
     """Call a stage; with ``resume`` the result may be complete already."""
-    with contextlib.suppress(Complete):
+    with contextlib.suppress(Complete), own_settings():
         run()
     return Made(out)
 
 
+@own_settings()
 def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
     """The hypotheses of one sub-goal.
 
@@ -139,6 +141,7 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
     return ensemble_at(Path(path), sub_goal)
 
 
+@own_settings()
 def load_options(path: str | Path, ensemble: str | Path | None = None) -> Options:
     """The options of an options or meta artefact: policies and termination classifiers.
 

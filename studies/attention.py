@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.compute import prepare
+from hypogoal.core.processes import prepare
 from hypogoal.core.seeding import seed_for
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE
 from hypogoal.domains.montezuma_emulator import observed_pixel

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from examples.figure6 import LAYOUTS, SEEDS, STEPS
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.core.compute import prepare
+from hypogoal.core.processes import prepare
 from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.evaluation.curves import Run

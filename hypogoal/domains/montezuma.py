@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.workers import allowed, in_processes
+from hypogoal.core.processes import allowed, in_processes
 from hypogoal.data import Collected, States, joined
 from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, picture, pixel

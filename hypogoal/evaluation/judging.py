@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
+from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
-from hypogoal.core.workers import in_processes
 from hypogoal.data import States, fixed, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
@@ -202,7 +202,7 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
 
 def judge(case: Case) -> Judged:
     """What the members of one case say."""
-    from hypogoal.core.compute import prepare
+    from hypogoal.core.processes import prepare
 
     prepare()
     split, unlabelled = states_of(case.data, case.sub_goal)

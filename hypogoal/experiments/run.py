@@ -6,11 +6,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.compute import check_name
 from hypogoal.core.config import DOMAIN, parse_assignments, resolve
 from hypogoal.core.errors import UserError
+from hypogoal.core.processes import check_device, cores
 from hypogoal.core.terminal import amount
-from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments import slurm
 from hypogoal.experiments.experiment import Command, Experiment
@@ -56,7 +55,7 @@ def plan(
     ``assignments`` are ``SETTING=VALUES`` of the experiment and, where it has a domain, ``STAGE.KEY=VALUE``; so have
     ``preset`` and ``device`` to have one. ``seeds`` are the run seeds, ``0-9``.
     """
-    check_name(device)
+    check_device(device)
     experiment, preset, fixed = find_experiment(name, preset)
     if experiment.domain is None and (preset or device != "auto"):
         problem = "an experiment of your own takes no preset and no device"

@@ -4,6 +4,7 @@ The plan is ``sweep.json``. A cell is done when its output is there, runs while 
 its last attempt did (``logs/NAME.code``). Nothing else is recorded: a run may be killed and started again anywhere.
 """
 
+import contextlib
 import multiprocessing
 import os
 import re
@@ -13,7 +14,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import zip_longest
@@ -26,11 +27,12 @@ from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.own_code import environment
+from hypogoal.core.processes import CORES
 from hypogoal.core.terminal import amount
-from hypogoal.core.workers import CORES, SAFE_PATH, with_environment
 from hypogoal.experiments.experiment import MEND, Command, Value
 from hypogoal.settings import STAGES
 
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # of a Python that multiprocessing starts
 PLAN, LOGS = "sweep.json", "logs"
 NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's folder
 OPTION = re.compile(r"--[\w-]+=")  # before the place of an output: --data=@data
@@ -372,3 +374,16 @@ def in_the_making(path: Path) -> list[str]:
     outs = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in hidden]
     begun = [out for out in outs if Draft(out).begun.is_file()]
     return [f"{out}: {'in progress' if Draft(out).is_locked else INTERRUPTED}" for out in begun]
+
+
+@contextlib.contextmanager
+def with_environment(**values: str) -> Iterator[None]:
+    """Set environment variables within the block."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import create, open_artefact
-from hypogoal.core.compute import prepare
 from hypogoal.core.files import write_table
+from hypogoal.core.processes import cores, prepare
 from hypogoal.core.progress import Progress
-from hypogoal.core.workers import cores
 from hypogoal.data import create_hdf5
 from hypogoal.evaluation.curves import SOLVED, group_runs, read_run
 from hypogoal.evaluation.distance import INSIDE, NEAR

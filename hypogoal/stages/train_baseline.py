@@ -4,9 +4,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
+from hypogoal.core.processes import prepare
 from hypogoal.core.tensors import save_tensors
 from hypogoal.core.training import training
 from hypogoal.data import open_dataset

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import LOG, Draft, open_artefact
-from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_end
+from hypogoal.core.processes import allowed, in_processes, prepare
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.training import training
-from hypogoal.core.workers import allowed, in_processes
 from hypogoal.data import Dataset, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.core.compute import prepare
+from hypogoal.core.processes import prepare
 from hypogoal.core.training import training
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainMetaConfig

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
+from hypogoal.core.processes import prepare
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.training import training
 from hypogoal.domains.base import Engine, load_domain

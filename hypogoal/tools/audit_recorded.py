@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import TO_FILL_IN, Artefact, create, open_artefact, versions
-from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
+from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.data import States, joined, open_dataset
 from hypogoal.evaluation import page, recorded

@@ -147,7 +147,7 @@ def export_episodes(
     ``seed`` determines the draws of options; ``infos/option`` is the option that led to each state, -1 at the start.
     A missing agent, another name, or an existing ``out`` is a ``UserError``.
     """
-    from hypogoal.core.compute import prepare
+    from hypogoal.core.processes import prepare
     from hypogoal.meta.episodes import agent_of, play_episodes
 
     try:

@@ -2,31 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
-
-from hypogoal.core.workers import in_processes
 
 ROOT = Path(__file__).parents[2]
 POSIX_MODULES = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "syslog", "curses", "readline"}
-
-
-def _whoami(number: int) -> tuple[int, int, str | None]:
-    import multiprocessing
-
-    return number, os.getpid(), multiprocessing.get_start_method(allow_none=True)
-
-
-def test_workers_are_spawned() -> None:
-    """Whatever the system's default is: workers are started anew, and tasks go to them by name."""
-    results: dict[int, tuple[int, int, str | None]] = {}
-    in_processes([partial(_whoami, number) for number in range(3)], 2, results.__setitem__)
-    assert [results[number][0] for number in range(3)] == [0, 1, 2]
-    assert os.getpid() not in {row[1] for row in results.values()}
-    assert {row[2] for row in results.values()} == {"spawn"}
 
 
 WITHOUT = """

@@ -1,0 +1,173 @@
+"""Where work runs: in processes of their own, on a device, with one thread of torch's; and how a process is stopped."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
+from types import FrameType
+from typing import TypeVar
+
+from hypogoal.core import own_code
+from hypogoal.core.errors import Killed, UserError
+
+T = TypeVar("T")
+CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use
+DEVICES = ("auto", "cpu", "cuda")
+SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
+TOGETHER = 0.5  # seconds within which signals count as one: a second one would interrupt the clean-up
+RESEND_SECONDS = 1.0
+
+_stopped_at = float("-inf")
+
+
+def stop(number: int, _frame: FrameType | None) -> None:
+    """A handler of signals: wherever Python is, ``KeyboardInterrupt`` with the signal's number as its argument."""
+    global _stopped_at
+    now = time.monotonic()
+    if now - _stopped_at > TOGETHER:
+        _stopped_at = now
+        raise KeyboardInterrupt(number)
+
+
+def cores() -> int:
+    """How many cores this process may use: those the system allows, or fewer with ``HYPOGOAL_CORES``."""
+    return allowed(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+def allowed(wanted: int) -> int:
+    """How many of ``wanted`` processes (0: one per core) a stage may use."""
+    if not wanted:
+        return cores()
+    setting = os.environ.get(CORES, "")
+    return min(wanted, max(1, int(setting))) if setting.isdigit() else wanted
+
+
+def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
+    """Run tasks, ``workers`` at once; ``done`` gets each task's number and result.
+
+    One at once runs in this process, and so do all in a process that may not have others, as those of a ``Pool``. In
+    other processes tasks and results must be picklable. If a task fails, or at Ctrl-C, running ones get SIGTERM and are
+    waited for, so that they can save a checkpoint.
+    """
+    if min(workers, len(tasks)) <= 1 or multiprocessing.current_process().daemon:
+        for number, task in enumerate(tasks):
+            done(number, task())
+        return
+    others = set(multiprocessing.active_children())
+    processes: set[BaseProcess] = set()
+    # Spawned, not forked: a fork would copy the caller's threads and locks.
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (own_code.environment(),))
+    try:
+        futures = {pool.submit(_run, task): number for number, task in enumerate(tasks)}
+        processes = set(multiprocessing.active_children()) - others
+        for future in as_completed(list(futures)):
+            done(futures.pop(future), future.result())
+    except BrokenProcessPool:
+        raise _broken(processes) from None
+    except BaseException:
+        _terminate(processes)
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(environment: Mapping[str, str]) -> None:
+    """What a process does first."""
+    os.environ.update(environment)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C; it sends SIGTERM
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """An orphan would write beside its successor."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _run(task: Callable[[], T]) -> T:
+    try:
+        return task()
+    except KeyboardInterrupt:  # the pool would give this process the next task
+        os._exit(128 + signal.SIGTERM)
+    except Exception as error:
+        user_error = own_code.of_user(error)  # its place is only known here: tracebacks are not sent to the parent
+        if user_error is None:
+            raise
+        raise user_error from error
+
+
+def _broken(processes: Iterable[BaseProcess]) -> Killed:
+    """Why a pool broke."""
+    if any((process.exitcode or 0) > 0 for process in processes):
+        do = "In a script call hypogoal below 'if __name__ == \"__main__\":', or give workers=1."
+        return Killed("a process of the stage could not start", None, do)
+    do = f"Run fewer at once: --set workers=1, or {CORES}=1 in the environment."
+    return Killed("a process was killed by the system, most likely for lack of memory", None, do)
+
+
+def _terminate(processes: Iterable[BaseProcess]) -> None:
+    """Repeated until none is left.
+
+    A process that fails holds the first signal back for a checkpoint that never comes, and then waits for the next task
+    behind a lock that a killed process may hold.
+    """
+    left = list(processes)
+    while left:
+        for process in left:
+            process.terminate()
+        left[0].join(RESEND_SECONDS)
+        left = [process for process in left if process.is_alive()]
+
+
+def check_device(device: str) -> None:
+    """Refuse (``UserError``) an unknown device; whether this machine has it is not checked."""
+    if device not in DEVICES:
+        raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
+
+
+def prepare(device: str = "auto") -> str:
+    """Use one torch thread without denormal numbers; returns ``cpu`` or ``cuda`` (``auto`` is the CPU, decision 26).
+
+    One thread per process is as fast on small networks, does not suffer from busy neighbours, and gives the same bytes
+    again on the same machine; other processors round differently. Denormal numbers (below 1e-38, where Adam's moments
+    of unused weights end) count as 0: arithmetic with them takes many times as long. An unknown device, or one that
+    torch does not find, is a ``UserError``.
+    """
+    import torch
+
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        os._exit(1)  # it imports a script that calls a stage without main guard: see _broken
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    check_device(device)
+    if device == "cuda" and not torch.cuda.is_available():
+        installed = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
+        raise UserError("torch finds no GPU", installed, "Use --device cpu, or see docs/gpu.md.")
+    return "cuda" if device == "cuda" else "cpu"
+
+
+@contextmanager
+def own_settings() -> Iterator[None]:
+    """torch as if nobody had changed its settings; afterwards they are the caller's again."""
+    import torch
+
+    threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
+    torch.set_default_dtype(torch.float32)
+    torch.set_default_device(None)
+    try:
+        with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_flush_denormal(False)
+        torch.set_default_dtype(dtype)
+        torch.set_default_device(device if device.type != "cpu" else None)

@@ -1,0 +1,134 @@
+"""Work in other processes: how many there may be, how they end, and what they leave of the caller's settings."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.errors import Killed, UserError
+from hypogoal.core.processes import CORES, allowed, cores, in_processes, own_settings, prepare
+
+
+def ignore(number: int, result: object) -> None:
+    """What is done with a result that nobody wants."""
+
+
+def test_no_stage_uses_more_processes_than_it_was_allotted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G4: a cell's own ``workers`` stays within what its sweep gave it; on its own it is what was asked."""
+    monkeypatch.delenv(CORES, raising=False)
+    assert allowed(4096) == 4096 and allowed(0) == cores()
+    monkeypatch.setenv(CORES, "2")
+    assert allowed(4096) == 2 and allowed(1) == 1 and allowed(0) == cores() <= 2
+
+
+def whoami(number: int) -> tuple[int, int, str | None]:
+    return number, os.getpid(), multiprocessing.get_start_method(allow_none=True)
+
+
+def test_processes_are_spawned() -> None:
+    """Whatever the system's default is: they are started anew, and tasks go to them by name."""
+    results: dict[int, tuple[int, int, str | None]] = {}
+    in_processes([partial(whoami, number) for number in range(3)], 2, results.__setitem__)
+    assert [results[number][0] for number in range(3)] == [0, 1, 2]
+    assert os.getpid() not in {row[1] for row in results.values()}
+    assert {row[2] for row in results.values()} == {"spawn"}
+
+
+def die() -> None:
+    """As the system has it where memory is used up."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_the_system_kills_is_one_line() -> None:
+    """Spec G1, G2: what happened and what to do."""
+    with pytest.raises(Killed, match=r"lack of memory.*workers=1"):
+        in_processes([die, die], 2, ignore)
+
+
+def fail_after(begun: Path) -> None:
+    """When the other one has begun."""
+    while not begun.exists():
+        os.sched_yield()
+    raise ValueError("first")
+
+
+def fail_when_told_to_stop(begun: Path) -> None:
+    """Its own error is what ends it: the SIGTERM was for the next checkpoint, of which there is none."""
+    with Checkpoints(None) as checkpoints:
+        begun.touch()
+        while checkpoints._signal is None:
+            os.sched_yield()
+        raise ValueError("second")
+
+
+def test_processes_that_fail_at_once_are_not_waited_for_for_ever(tmp_path: Path) -> None:
+    """The first error is told, with its line in user code, though the others fail of their own as they are stopped."""
+    tasks = [partial(fail, tmp_path / "begun") for fail in (fail_after, fail_when_told_to_stop)]
+    with pytest.raises(UserError, match=r"your code raised ValueError: first: test_processes.py, line \d+"):
+        in_processes(tasks, 2, ignore)
+
+
+NO_GUARD = """
+from functools import partial
+from hypogoal.core.processes import in_processes, prepare
+prepare()
+try:
+    in_processes([partial(print, "a"), partial(print, "b")], 2, print)
+except Exception as error:
+    print(error)
+"""
+POOL = """
+import multiprocessing
+from functools import partial
+from hypogoal.core.processes import in_processes
+
+def work(number):
+    in_processes([partial(abs, -number), partial(abs, -2)], 2, print)
+
+if __name__ == "__main__":
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        pool.apply(work, (1,))
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [(NO_GUARD, "could not start. In a script call hypogoal below 'if __name__ == \"__main__\":'"), (POOL, "0 1\n1 2")],
+)
+def test_scripts_without_a_guard_and_pools(tmp_path: Path, code: str, said: str) -> None:
+    """The first is told in a line; processes of a pool may have none of their own, so there tasks are done in turn."""
+    (tmp_path / "script.py").write_text(code)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, tmp_path / "script.py"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
+    assert said in done.stdout and done.stderr == ""
+
+
+def test_the_callers_settings_of_torch_hold_again() -> None:
+    """In the block they are torch's own, whatever they were."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            with own_settings():
+                prepare()
+                weights = torch.ones(2, 2, requires_grad=True)
+                product = weights @ weights
+                assert product.requires_grad and product.device.type == "cpu" and product.dtype == torch.float32
+                assert torch.get_num_threads() == 1
+            assert not torch.is_grad_enabled() and torch.is_autocast_enabled("cpu")
+        assert (torch.get_num_threads(), torch.get_default_dtype()) == (2, torch.float64)
+        assert torch.get_default_device().type == "meta"
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+        torch.set_num_threads(threads)
