@@ -324,24 +324,3 @@ def test_formats_are_readable_without_hypogoal(
     (ensemble / "open-red-door.safetensors").write_bytes(b"changed")
     with pytest.raises(AssertionError, match="open-red-door"):
         exec(compile(snippets[1], "docs/formats.md", "exec"), {})
-
-
-def test_one_way_to_print_and_one_to_open() -> None:
-    """Spec G2: what a stranger wrote passes through ``core/terminal`` to be shown, through ``core/files`` to be read.
-
-    What is opened by other means is named here: files that the process itself writes, or that come with the package.
-    """
-    printing = re.compile(r"typer\.echo\(|(?<![\w.])print\(|Console\(|sys\.std(out|err)\.write")
-    opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
-    own = {
-        "core/artefacts.py", "core/config.py", "core/files.py",
-        "core/progress.py", "core/terminal.py", "evaluation/page.py", "experiments/sweep.py",
-        "hypotheses/load.py", "own_data/arrays.py", "own_data/images.py", "own_data/lerobot.py",
-        "own_data/videos.py", "tools/export.py", "stages/train_ensemble.py",
-    }  # fmt: skip
-    found = set()
-    for path in sorted((ROOT / "hypogoal").rglob("*.py")):
-        name, text = path.relative_to(ROOT / "hypogoal").as_posix(), path.read_text(encoding="utf-8")
-        assert name == "core/terminal.py" or not printing.search(text), f"{name} prints by itself"
-        found |= {name} if opening.search(text) else set()
-    assert found == own
