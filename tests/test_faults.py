@@ -13,7 +13,6 @@ import torch
 from command_line import refuses, run
 from corridor import Corridor
 
-import hypogoal
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.files import replace_text
 from hypogoal.core.tensors import save_tensors
@@ -179,17 +178,3 @@ def test_folders_that_may_not_be_written(tmp_path: Path) -> None:
         refuses("no permission to write", "collect", "doorkey", "--out", tmp_path / "new.h5")
     finally:
         tmp_path.chmod(0o755)
-
-
-def test_nothing_depends_on_the_clock() -> None:
-    """Spec G1: no decision reads the time of day or when a file was changed; durations are of the monotonic clock.
-
-    Shown to a person it may be: a sweep's ``status`` says for how long a cell has run (``records`` has when it began).
-    ``slurm`` and ``status`` ask whether a checkpoint or an output is another one than before.
-    """
-    every = sorted(Path(hypogoal.__file__).parent.rglob("*.py"))
-    known = ("status.py", "records.py", "slurm.py")
-    sources = [path for path in every if path.name not in known]
-    told = re.compile(r"\btime\.time\(|\bdatetime\b|st_[mca]time|get[mca]time")
-    assert len(sources) > 50
-    assert [str(path) for path in sources if told.search(path.read_text(encoding="utf-8"))] == []

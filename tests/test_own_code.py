@@ -222,14 +222,14 @@ class Raises(nn.Module):
         (lambda channels: None, "the network gave None"),
         (lambda channels: ([nn.Conv2d(channels, 4, 3, 2)], (0,)), "the network gave layers"),
         (lambda channels: (["layer"], (8,)), "the network gave layers"),
-        (lambda channels: ([nn.Conv2d(channels, 4, 3, 2).double()], (8,)), "the network keeps weights of type"),
+        (lambda channels: ([nn.Conv2d(channels, 4, 3, 2).double()], (8,)), "does not take these observations"),
         (lambda channels: ([Raises()], (8,)), "your code raised ZeroDivisionError"),
     ],
 )
 def test_networks(layers: Any, fault: str, told: Callable[..., str], data: Path) -> None:
     """Spec C5, G2."""
     told(layers, ["train-ensemble", str(data), *settings(f"network={NAME}", "steps=5", "workers=1"), "-q"], fault)
-    assert "FAIL builds: " in fails("check", "--network", NAME).out
+    assert "FAIL logits: " in fails("check", "--network", NAME).out
 
 
 def test_in_processes_of_a_stage(data: Path, tmp_path: Path) -> None:

@@ -246,7 +246,7 @@ class _LayoutPlay:
     def step(self, action: int) -> tuple[Any, bool]:
         """Play one step: the observation, and whether the episode is over."""
         result = self.env.step(action)
-        if not self.groups:
+        if self.episode == self.elapsed == 0:
             engines.check_step(result)
         observation, _reward, terminated, truncated, _info = result
         self.elapsed += 1

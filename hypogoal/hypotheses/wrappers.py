@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from pathlib import Path
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
@@ -56,8 +57,7 @@ class SubgoalReward:
 
     def __init__(self, source: str | os.PathLike[str] | Ensemble, sub_goal: str = "", by: By = "vote"):
         ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
-        member = isinstance(by, int | np.integer) and not isinstance(by, bool)
-        rule = by if isinstance(by, str) else int(by) if member else None
+        rule = by if isinstance(by, str) else _member(by)
         if rule not in RULES and rule not in range(len(ensemble)):
             do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
             raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
@@ -86,6 +86,14 @@ class SubgoalReward:
         other observations than those of training is a ``UserError``.
         """
         return RewardedEnv(env, self, scale=scale, add=add, ends=ends)
+
+
+def _member(by: Any) -> int | None:
+    """The number of a member, from Python or any array library; None for anything else."""
+    try:
+        return None if isinstance(by, bool) else operator.index(by)
+    except TypeError:
+        return None
 
 
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

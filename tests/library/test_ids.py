@@ -9,11 +9,18 @@ import pytest
 MADE = "print(gymnasium.make({id!r}).observation_space.shape)"
 PLAIN, NAMED = "hypogoal/DoorKey-8x8-v0", "hypogoal.envs:hypogoal/DoorKey-8x8-v0"
 CHANGES = """
-import json, os, sys
-finders, variables, modules = [*sys.meta_path], {**os.environ}, {*sys.modules}
+import json, os, signal, sys, warnings
+import torch
+handled = signal.SIGINT, signal.SIGTERM
+def state():
+    process = [*sys.meta_path], {**os.environ}, [*map(signal.getsignal, handled)], torch.random.initial_seed()
+    return process, torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled()
+before, filters, modules = state(), [*warnings.filters], {*sys.modules}
 import hypogoal
-heavy = sorted({"torch", "numpy", "gymnasium"} & ({*sys.modules} - modules))
-print(json.dumps([finders == sys.meta_path, variables == {**os.environ}, heavy]))
+heavy = sorted({"gymnasium", "h5py", "typer"} & ({*sys.modules} - modules))
+same = [filters == warnings.filters, before == state()]
+hypogoal.OptionEnv
+print(json.dumps([*same, before == state(), heavy]))
 """
 
 
@@ -38,5 +45,5 @@ def test_an_environment_is_made_by_its_id(imports: str, name: str) -> None:
 
 
 def test_importing_hypogoal_changes_nothing_in_its_users_process() -> None:
-    """No finder, no environment variable; neither torch nor NumPy nor Gymnasium is loaded."""
-    assert json.loads(printed(CHANGES)) == [True, True, []]
+    """No finder, variable, handler, filter or setting of torch, then and once its parts are used; nothing is loaded."""
+    assert json.loads(printed(CHANGES)) == [True, True, True, []]
