@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
@@ -150,7 +151,9 @@ def reading(path: Path, subject: str = "the data file", do: str = RECOLLECT) -> 
         with h5py.File(path, "r", locking="best-effort") as file:
             yield file
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise UserError(f"{subject} cannot be read: {error.strerror}", path, "Is it the right path?") from None
+        raise UserError(
+            f"{subject} cannot be read: {os.strerror(error.errno)}", path, "Is it the right path?"
+        ) from None
     except UNREADABLE as error:
         what = str(error)
         if "h5clear" in what:
