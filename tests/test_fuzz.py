@@ -23,5 +23,5 @@ def test_every_case_is_read_or_refused(box: Sandbox, name: str) -> None:
 
 def test_a_crash_would_be_seen(box: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
     """The harness itself: an exception that is no ``UserError`` is told."""
-    monkeypatch.setattr("tests.attacks.fuzz.faults_of", lambda path: [][0])
+    monkeypatch.setattr("tests.attacks.fuzz.command", lambda *words: [][0])
     assert outcome_of(box, "csv", 1).startswith("IndexError")

@@ -23,14 +23,10 @@ from functools import partial
 from pathlib import Path
 
 import hypogoal
-import hypogoal.cli
+from hypogoal import cli
 from hypogoal.core.artefacts import MANIFEST, sha256_of
-from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.named import EXPERIMENTS
-from hypogoal.experiments.run import plan
-from hypogoal.inspection import describe_path, faults_of, lines
-from hypogoal.settings import CONFIGS, TABLES
 from tests.attacks.mutations import (
     Rng,
     bytes_changed,
@@ -93,7 +89,7 @@ def command(*words: object) -> None:
     """Run a command that must succeed or refuse; raises ``UserError`` where it refuses."""
     said = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
-        code = hypogoal.cli.main([str(word) for word in words])
+        code = cli.main([str(word) for word in words])
     if code == 2:
         raise UserError(said.getvalue().strip())
     if code:
@@ -113,22 +109,16 @@ def is_accepted(calls: list[Callable[[], object]]) -> bool:
     return accepted
 
 
-def check(path: Path) -> None:
-    """Raise ``UserError`` for the first fault that ``verify`` finds."""
-    for fault in faults_of(path):
-        raise UserError(fault)
-
-
 def readers(box: Sandbox, path: Path, case: int) -> list[Callable[[], object]]:
     """What reads a file of the run; commands that take long at times."""
     run, artefact = box.run, path.parent
-    calls: list[Callable[[], object]] = [partial(check, run), lambda: lines(describe_path(run))]
+    calls: list[Callable[[], object]] = [partial(command, "verify", artefact), partial(command, "show", artefact)]
     if artefact.name == "ensemble":
         calls.append(partial(hypogoal.load_ensemble, artefact, "left-end"))
     if artefact.name.startswith(("options", "meta")):
         calls.append(partial(hypogoal.load_options, artefact))
     if case % 10 == 0:
-        calls += [partial(command, "verify", run), partial(command, "show", artefact)]
+        calls += [partial(command, "verify", run), partial(command, "show", run)]
         calls.append(partial(command, "evaluate", run, "--out", box.out / "evaluation", "-q"))
     if case % 50 == 0:
         few = ("--set", "steps=20", "--set", "workers=1", "-q")
@@ -157,12 +147,13 @@ def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
     path = box.out / "own.toml"
     text = toml_of(tree_changed(PRESET if case % 2 else EXPERIMENT, rng)).encode(errors="replace")
     path.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
+    out = ("--out", box.out / "run", "--dry-run")
     if case % 2 == 0:
-        return is_accepted([partial(plan, str(path))])
-    calls: list[Callable[[], object]] = [
-        partial(resolve, config, stage=stage, preset=str(path), tables=TABLES) for stage, config in CONFIGS.items()
-    ]
-    return is_accepted([*calls, *(partial(plan, name, preset=str(path)) for name in EXPERIMENTS)])
+        return is_accepted([partial(command, "run", path, *out)])
+    stages = [stage for stage in PRESET if stage != "run"]
+    calls: list[Callable[[], object]] = [partial(command, "config", stage, "--preset", path) for stage in stages]
+    calls += [partial(command, "run", name, "--preset", path, *out) for name in EXPERIMENTS]
+    return is_accepted(calls)
 
 
 FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {
