@@ -48,12 +48,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize(("named", "words"), NAMED)
 def test_a_file_cannot_have_code_loaded(folder: Path, named: str, words: str) -> None:
-    """One line; with ``--trust`` it is loaded, and found to be none of ours."""
+    """One line; with ``--trust`` it is loaded."""
     (folder / "own.toml").write_text(EXPERIMENT.format(own="evilmod:obj", command=named))
     refuses("a file names code of its own as its", *words.split())
     assert not (folder / "ran").exists()
     if not words.startswith("run"):
-        assert "evilmod:obj" in fails(*words.split(), "--trust").err
+        fails(*words.split(), "--trust")
         assert (folder / "ran").exists()
 
 
