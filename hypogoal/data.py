@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import NO_FILE_NAME, path_part, plain_name, plain_names, replacing
+from hypogoal.core.files import NO_FILE_NAME, plain_name, plain_names, replacing
 from hypogoal.core.terminal import amount
 from hypogoal.observations import (
     NUMBERS,
@@ -253,7 +253,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
 def _write_states(group: Any, states: States) -> None:
     write_observations(group, states.observations)
     for name, values in states.origins.items():
-        if not path_part(name):
+        if not plain_name(name):
             raise UserError("an origin's name must be usable as a file name", repr(name), "Leave out separators.")
         _write_column(group, f"origin/{name}", values)
 

@@ -31,16 +31,12 @@ def open_file(path: Path, subject: str, do: str) -> BufferedReader:
         raise UserError(f"{subject} not readable ({getattr(error, 'strerror', error)})", path, do) from None
 
 
-def read_bytes(path: Path, subject: str, do: str) -> bytes:
-    """The bytes of a file."""
-    with open_file(path, subject, do) as file:
-        return file.read()
-
-
 def read_text(path: Path, subject: str, do: str) -> str:
     """The text of a file in UTF-8, with or without a byte order mark, with line feeds as line ends."""
+    with open_file(path, subject, do) as file:
+        data = file.read()
     try:
-        text = read_bytes(path, subject, do).decode("utf-8-sig")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UserError(f"{subject} not text in UTF-8", path, do) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
@@ -56,15 +52,10 @@ def read_end(path: Path) -> list[str]:
 
 def read_json(path: Path, subject: str, do: str) -> Any:
     """The contents of a JSON file."""
-    return parse_json(read_text(path, subject, do), path, subject, do)
-
-
-def parse_json(text: str, where: object, subject: str, do: str) -> Any:
-    """The value of a JSON text."""
     try:
-        return json.loads(text)
+        return json.loads(read_text(path, subject, do))
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{subject} not valid JSON ({error})", where, do) from None
+        raise UserError(f"{subject} not valid JSON ({error})", path, do) from None
 
 
 def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:

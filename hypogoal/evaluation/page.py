@@ -4,6 +4,7 @@ A table is said once, as columns, and drawn here for the page and for the termin
 """
 
 import base64
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from hypogoal.core.artefacts import AGAIN
-from hypogoal.core.files import parse_json
+from hypogoal.core.errors import UserError
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import STATES, image_png, reduced
@@ -249,7 +250,10 @@ def encoded(png: bytes) -> str:
 def texts(packed: Any) -> list[str]:
     """A JSON list of texts out of the arrays."""
     raw = packed.item() if isinstance(packed, np.ndarray) else packed
-    return list(parse_json(raw.decode() if isinstance(raw, bytes) else raw, None, "a list of texts is", AGAIN))
+    try:
+        return list(json.loads(raw))
+    except (ValueError, TypeError) as error:
+        raise UserError(f"a list of texts is damaged ({error})", None, AGAIN) from None
 
 
 def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:
