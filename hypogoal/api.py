@@ -23,7 +23,7 @@ from hypogoal.domains.base import BUILT_IN, REGISTERED, Domain, load_domain
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, ensemble_at
-from hypogoal.inspection import describe_path, lines, numbers_in, outcome
+from hypogoal.look import describe, lines, outcome
 from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.learner import make_policies
 from hypogoal.options.termination import rule_of, set_thresholds
@@ -45,19 +45,18 @@ class Made:
     @property
     def metrics(self) -> dict[str, Any]:
         """Its numbers: counts of states, a training's last log entry, or all of an evaluation or a comparison."""
-        return numbers_in(describe_path(self.path)["kind"], self.path)
+        return dict(describe(self.path).get("numbers", {}))
 
     def __repr__(self) -> str:
-        summary = describe_path(self.path)
-        return "\n".join([lines(summary)[0], *outcome(summary["kind"], self.path)])
+        details = describe(self.path)
+        return "\n".join([lines(details)[0], *outcome(details)])
 
     def _repr_html_(self) -> str:
         return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'
 
     def show(self) -> None:
         """Print what ``hypogoal show`` prints: result, configuration, inputs."""
-        summary = describe_path(self.path)
-        for line in [*repr(self).splitlines(), *lines({**summary, "counts": None})[1:]]:
+        for line in [*repr(self).splitlines(), *lines(describe(self.path))[1:]]:
             say(line)
 
 

@@ -193,7 +193,7 @@ def run_of(data: Path) -> Path:
 
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
     """Print the numbers of states of a data file; nothing if there are none."""
-    from hypogoal.inspection import count_lines
+    from hypogoal.look import count_lines
 
     for line in [] if quiet or not counts else count_lines(counts):
         say(line)

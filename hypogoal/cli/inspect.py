@@ -14,7 +14,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.config import DOMAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.core.terminal import draw, say
+from hypogoal.core.terminal import say
 from hypogoal.settings import CONFIGS, OFTEN, TABLES, described, preset_text
 
 Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
@@ -27,19 +27,13 @@ def show(
     pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
     """Describe a file or folder: kind, result, settings, inputs."""
-    from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
+    from hypogoal.look import describe, lines, outcome
 
-    details, numbers = describe_path(path), None
-    try:
-        numbers = numbers_of(path)
-    except UserError as error:  # the rest can be shown all the same
-        say(f"hypogoal: {error}", err=True)
-    if numbers is not None and not as_json:
-        draw(summary_of(numbers, path), 100)
-    cli.print_counts(details.get("counts", {}), as_json)
-    shown = details if numbers is None else {**details, "metrics": numbers}
-    cli.echo(shown, as_json, lines({key: value for key, value in details.items() if key != "counts"}))
+    details = describe(path)
+    cli.echo(details, as_json, [] if as_json else [*outcome(details), *lines(details)])
     if pictures is not None:
+        from hypogoal.evaluation.pictures import write_contact_sheets
+
         for sheet in write_contact_sheets(path, pictures):
             say(sheet, err=as_json)
 
@@ -48,31 +42,27 @@ def show(
 def verify(path: Made, as_json: cli.AsJson = False) -> None:
     """Check for missing or changed files; exit code 2 if there are any.
 
-    Checks schema, hashes, numbers, and the inputs within PATH. What is still being made is named, not checked.
+    Reads every file, and those inputs that lie within PATH. What is still being made is named, not checked.
     """
     from hypogoal.experiments.sweep import in_the_making
-    from hypogoal.inspection import faults_of, is_made, notes_of
+    from hypogoal.look import faults, parts_of
 
-    making = in_the_making(path)
-    checked = not making or is_made(path)
-    faults, notes = faults_of(path) if checked else [], [*making, *notes_of(path)]
-    whole = f"{path}: whole{' so far' if making else ''}" if checked else f"{path}: nothing is complete yet"
-    cli.echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [whole]), *notes])
-    if faults:
+    found, notes = faults(path), in_the_making(path)
+    state = "whole so far" if notes else "whole"
+    verdict = f"{path}: {state if parts_of(path) else 'nothing is complete yet'}"
+    cli.echo({"path": str(path), "faults": found, "notes": notes}, as_json, [*(found or [verdict]), *notes])
+    if found:
         raise typer.Exit(2)
 
 
 @cli.command(cli.LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: cli.AsJson = False) -> None:
-    """Say which artefacts are stale, why, and which commands renew them."""
+    """Say what is stale or unfinished, why, and which commands renew it."""
     from hypogoal.experiments.sweep import in_the_making
-    from hypogoal.inspection import is_made
-    from hypogoal.staleness import lines, states_of
+    from hypogoal.look import stale, stale_lines
 
-    making = in_the_making(path)
-    states = states_of(path) if not making or is_made(path) else []
-    details = [{"path": str(each.path), "reasons": each.reasons, "command": each.command} for each in states]
-    cli.echo(details, as_json, [*making, *(lines(states) if states else [])])
+    rows = stale(path)
+    cli.echo(rows, as_json, [*in_the_making(path), *stale_lines(rows)])
 
 
 @cli.command(cli.LOOK, "config train-ensemble --domain montezuma")

@@ -34,7 +34,7 @@ def train_ensemble(
 ) -> None:
     """Train diverse classifiers (members) of each sub-goal."""
     from hypogoal.domains.base import installed_domain
-    from hypogoal.inspection import result_of
+    from hypogoal.look import numbers_of
 
     trained = call.make(data, unlabelled=tuple(unlabelled or ()), tensorboard=tensorboard)
     accuracies = [each["heldout"] for each in trained]
@@ -43,7 +43,7 @@ def train_ensemble(
     run, practised = call.out.parent, "train-options" in defaults or "train-meta" not in defaults
     then = ("train-options", call.out, "--out", run / "options")
     then = then if practised else ("train-meta", call.out, "--out", run / "meta")
-    call.end(_mean_accuracy(accuracies) or result_of(call.out), *(then if installed else ("evaluate", run)))
+    call.end(_mean_accuracy(accuracies) or numbers_of(call.out), *(then if installed else ("evaluate", run)))
 
 
 def _mean_accuracy(accuracies: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -215,13 +215,13 @@ def compare(
     force: cli.Force = False,
 ) -> None:
     """Put evaluated runs side by side: what differs, who wins."""
-    from hypogoal.inspection import outcome
+    from hypogoal.look import describe, outcome
     from hypogoal.tools.compare import compare as compared
 
     with tempfile.TemporaryDirectory() as folder:
         place = out or Path(folder, "comparison")
         page = compared(runs, place, force=force)
-        for line in outcome("comparison", place):
+        for line in outcome(describe(place)):
             say(line)
     if out is not None:
         say(page)

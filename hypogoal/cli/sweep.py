@@ -7,7 +7,7 @@ from typing import Annotated
 from typer import Argument, Context, Option
 
 from hypogoal.cli import common as cli
-from hypogoal.core.terminal import draw, say
+from hypogoal.core.terminal import say
 
 KNOWN = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: "
@@ -41,7 +41,7 @@ def run(
     from hypogoal.core.processes import prepare
     from hypogoal.experiments.run import in_part, plan
     from hypogoal.experiments.run import run as run_cells
-    from hypogoal.inspection import numbers_of, summary_of
+    from hypogoal.look import describe, outcome
 
     out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
     if engine not in ("local", "slurm"):
@@ -64,11 +64,11 @@ def run(
         only=only,
         say=(lambda text: None) if quiet else (lambda text: say(text, err=True)),
     )
-    metrics = out / "evaluation" / "metrics.json"
-    if engine == "slurm" or only or not metrics.is_file():
+    if engine == "slurm" or only or not (out / "report").is_dir():
         say(out)
         return
-    draw(summary_of(numbers_of(out) or {}, metrics), 100)
+    for line in outcome(describe(out / "evaluation")):
+        say(line)
     say(out / "report" / "index.html")
 
 

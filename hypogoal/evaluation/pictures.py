@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.data import States
+from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import command
+from hypogoal.data import SPLITS, States, open_dataset
+from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.plots import PALETTE
-from hypogoal.observations import spread_rows
+from hypogoal.observations import PICTURE, spread_rows, type_text
 
 if TYPE_CHECKING:
     from hypogoal.meta.episodes import Frame
@@ -123,6 +127,35 @@ def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     shown, count = states[whole], unusual.sum(0)
     others = np.where(unusual, states, 0).sum(0, dtype=np.float64) / np.maximum(count, 1)
     return np.where((count > 0) & ~unusual[whole], (shown + others) / 2, shown).round().astype(np.uint8)
+
+
+def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
+    """Draw a data file's labelled and held-out states, one picture per room and label, to check labels by eye.
+
+    The files are ``labelled/room-01-positives.png`` and so on in ``folder``, in a folder per sub-goal if there are
+    several. A path that is no data file and states that are not pictures are a ``UserError``.
+    """
+    from PIL import Image
+
+    if not path.is_file():
+        raise UserError("contact sheets need a data file", path, "Give the .h5 file of the states.")
+    dataset = open_dataset(path)
+    if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
+        actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
+        do = f"Read them as arrays: {command('export', path, '--out', path.stem + '.npz')}"
+        raise UserError("the states are not pictures", actual, do)
+    domain = installed_domain(dataset.domain)
+    kinds = domain.kinds if domain else ()
+    written = []
+    for split in SPLITS:
+        for sub_goal in dataset.sub_goals:
+            place = folder / split / (sub_goal if len(dataset.sub_goals) > 1 else "")
+            sheets = contact_sheets(getattr(dataset, split)(sub_goal), kinds)
+            for name, sheet in sheets.items():
+                place.mkdir(parents=True, exist_ok=True)
+                written.append(place / f"{name}.png")
+                Image.fromarray(sheet).save(written[-1])
+    return written
 
 
 def contact_sheets(split: States, kinds: Sequence[str] = ()) -> dict[str, NDArray[np.uint8]]:

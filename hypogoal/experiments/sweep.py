@@ -30,6 +30,7 @@ from hypogoal.core.own_code import environment
 from hypogoal.core.processes import CORES
 from hypogoal.core.terminal import amount
 from hypogoal.experiments.experiment import MEND, Command, Value
+from hypogoal.look import unfinished
 from hypogoal.settings import STAGES
 
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # of a Python that multiprocessing starts
@@ -46,7 +47,6 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 SLOW = ("torch._dynamo", "networkx", "h5py", "minigrid")  # imports that stages put off until they need them
 POLL_SECONDS, REPORT_SECONDS = 0.05, 15.0
 MOST_SHOWN = 20
-INTERRUPTED = "interrupted; its command with --resume continues it"
 
 
 class Cell(BaseModel):
@@ -368,12 +368,7 @@ def status_lines(run: Path) -> list[str]:
 
 def in_the_making(path: Path) -> list[str]:
     """A line for each output at or below a path that is not complete; of a run how far it is."""
-    if (path / PLAN).exists():
-        return status_lines(path)
-    hidden = [Draft(path).folder, *sorted(path.rglob(".*.partial"))]
-    outs = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in hidden]
-    begun = [out for out in outs if Draft(out).begun.is_file()]
-    return [f"{out}: {'in progress' if Draft(out).is_locked else INTERRUPTED}" for out in begun]
+    return status_lines(path) if (path / PLAN).exists() else unfinished(path)
 
 
 @contextlib.contextmanager

@@ -19,14 +19,13 @@ from toy_data import reseal
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.terminal import draw
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.questions import summary_table
 from hypogoal.evaluation.run import find, read_evaluation
 from hypogoal.experiments.sweep import Cell, begin
 from hypogoal.hypotheses.config import TrainEnsembleConfig
-from hypogoal.inspection import summary_of
+from hypogoal.look import outcome
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.stages.evaluate import evaluate, missing
 from hypogoal.stages.report import draw_figures, report
@@ -245,22 +244,21 @@ def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypat
     assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
     for path in (tmp_path, tmp_path / "evaluation"):
         assert line in run("show", path).out.splitlines()
-    assert json.loads(run("show", tmp_path, "--json").out)["metrics"] == metrics
+    assert json.loads(run("show", tmp_path / "evaluation", "--json").out)["numbers"] == metrics
     (tmp_path / "evaluation" / "metrics.json").write_text("{}", encoding="utf-8")
-    for more in ([], ["--json"]):
-        said = run("show", tmp_path, *more)  # what it is can be told all the same; whether it is whole, verify asks
-        assert "metrics.json" in said.err and "evaluation" in said.out and "balanced" not in said.out.lower()
+    refuses("the evaluation's numbers are damaged", "show", tmp_path)
 
 
-def test_numbers_of_another_shape_are_told(capsys):
+def test_numbers_of_another_shape_are_told():
     """Spec G2: a table of a stranger's evaluation is drawn whatever stands in it, or is damaged in one line."""
     row = {"sub_goal": "y"} | {which: {"mean": 0.5} for which in ("best", "mean", "worst", "disagreement_heldout")}
     numbers = {"rooms": [], "distance": {"options": []}, "agents": [], "missing": [], "choosing": []}
-    with pytest.raises(UserError, match="the evaluation is damaged: here"):
-        summary_of(numbers | {"hypotheses": [{"name": 3}]}, "here")
+    details = {"kind": "evaluation", "path": "here"}
+    with pytest.raises(UserError, match="the evaluation's numbers are damaged: here"):
+        outcome({**details, "numbers": numbers | {"hypotheses": [{"name": 3}]}})
     for name in (3, None, True, ["x"], 1e308):
-        draw(summary_of(numbers | {"hypotheses": [row | {"name": name}]}, "here"), 80)
-        assert str(name)[:4] in capsys.readouterr().out
+        told = outcome({**details, "numbers": numbers | {"hypotheses": [row | {"name": name}]}})
+        assert str(name)[:4] in "\n".join(told)
 
 
 def test_tables_fit_a_terminal(metrics):

@@ -1,0 +1,214 @@
+"""What is there, is it whole, is it up to date: for ``show``, ``verify`` and ``status`` (Spec A8, G2)."""
+
+import shlex
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.artefacts import AGAIN, LOG, MANIFEST, Artefact, Draft
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import json_lines, read_end, read_json, visible
+from hypogoal.core.terminal import drawn
+from hypogoal.data import SPLITS, open_dataset
+from hypogoal.observations import type_text
+
+WIDTH = 80  # columns
+METRICS = "metrics.json"
+EVALUATION = "evaluation"
+# Of a training's log, in the order in which they are shown, with their titles.
+LOGGED = {"labelled": "labelled loss"}
+LOGGED |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
+Rows = Sequence[Mapping[str, Any]]
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The data files and artefacts at or below a path; a ``UserError`` if nothing is there or being made."""
+    if path.is_file() or (path / MANIFEST).is_file():
+        return [path]
+    artefacts = [manifest.parent for manifest in visible(path, MANIFEST)]
+    data = [file for file in visible(path, "*.h5") if file.parent not in artefacts]
+    if not (artefacts or data or unfinished(path)):
+        what = "no artefact and no data file here" if path.exists() else "no such file or folder"
+        raise UserError(what, path, "Give what a stage wrote.")
+    return [*data, *artefacts]
+
+
+def unfinished(path: Path) -> list[str]:
+    """A line for each output at or below a path that is being made, or was interrupted."""
+    lines = []
+    below = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in path.rglob(".*.partial")]
+    for out in (path, *sorted(below)):
+        draft = Draft(out)
+        if draft.begun.is_file():
+            state = "in progress" if draft.is_locked else "interrupted; its command with --resume continues it"
+            lines.append(f"{out}: {state}")
+    return lines
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Kind, numbers, settings and inputs of a data file or an artefact; of a run those of all its parts."""
+    parts = parts_of(path)
+    if parts != [path]:
+        return {"path": str(path), "kind": "run", "parts": [describe(part) for part in parts]}
+    if path.is_dir():
+        return {"path": str(path), "numbers": numbers_of(path), **Artefact(path).manifest.model_dump()}
+    dataset = open_dataset(path)
+    details = {"path": str(path), "kind": "data", "numbers": dataset.counts(), "domain": dataset.domain}
+    details["observations"] = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
+    return {**details, "seed": dataset.seed, "config": dataset.config}
+
+
+def numbers_of(path: Path) -> dict[str, Any]:
+    """The numbers of an evaluation or a comparison; of a training the last in its log, means over sub-goals."""
+    if (path / METRICS).is_file():
+        return dict(read_json(path / METRICS, "the numbers are", AGAIN))
+    last = {str(row.get("sub_goal")): row for row in json_lines(read_end(path / LOG))}
+    numbers = {}
+    for name, title in LOGGED.items():
+        values = [row[name] for row in last.values() if isinstance(row.get(name), int | float)]
+        if values:
+            numbers[title] = sum(values) / len(values)
+    return numbers
+
+
+def outcome(details: Mapping[str, Any]) -> list[str]:
+    """The numbers of what is described, as lines; of a run those of its evaluation."""
+    kind, numbers = details["kind"], details.get("numbers", {})
+    if kind == "run":
+        evaluations = [part for part in details["parts"] if part["kind"] == EVALUATION]
+        return outcome(evaluations[0]) if evaluations else []
+    if kind == "data":
+        return count_lines(numbers)
+    if kind == EVALUATION:
+        return _summary(numbers, details["path"])
+    if kind == "comparison":
+        from hypogoal.evaluation.compare import winners
+
+        return winners(numbers["comparisons"])
+    return []
+
+
+def _summary(numbers: Mapping[str, Any], path: str) -> list[str]:
+    from hypogoal.evaluation.questions import summary_table
+
+    try:
+        return drawn(summary_table(numbers), WIDTH).splitlines()
+    except (LookupError, TypeError, ValueError, AttributeError):
+        raise UserError("the evaluation's numbers are damaged", path, "Evaluate the run again.") from None
+
+
+def count_lines(counts: Mapping[str, Any]) -> list[str]:
+    """The numbers of states of a data file."""
+    text = []
+    for split in SPLITS:
+        for goal, row in counts[split].items():
+            text.append(f"{split:9} {goal:20} {row['states']:7} states {row['positives']:7} positives")
+    return [*text, f"{'unlabelled':30} {counts['unlabelled']:7} states"]
+
+
+def lines(details: Mapping[str, Any]) -> list[str]:
+    """What it is, a training's numbers, then how it was made, a fact a line; of a run a line for each part."""
+    if details["kind"] == "run":
+        return [lines(part)[0] for part in details["parts"]]
+    facts = dict(details)
+    numbers = facts.pop("numbers")
+    logged = [f"{name} {round(value, 4):g}" for name, value in numbers.items() if isinstance(value, float)]
+    text = ["; ".join([f"{facts.pop('path')}: {facts.pop('kind')}", *filter(None, [", ".join(logged)])])]
+    for name, value in facts.items():
+        if name == "config":
+            text += ["config:", *(f"  {key}={_typed(setting)}" for key, setting in value.items())]
+        else:
+            known = {"command": shlex.join, "inputs": _inputs, "files": ", ".join}.get(name, _typed)
+            text += textwrap.wrap(f"{name}: {known(value)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+    return text
+
+
+def _inputs(entries: Rows) -> str:
+    return ", ".join(f"{entry['kind']} {entry['path']}" for entry in entries)
+
+
+def _typed(value: Any) -> str:
+    """A value as one would type it."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_typed(part)}" for name, part in value.items())
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def faults(path: Path) -> list[str]:
+    """A line for each data file that cannot be read, and each file or input within that is missing or changed."""
+    found = []
+    for part in parts_of(path):
+        try:
+            found += [f"{part}: {fault}" for fault in _faults_of(part, path.resolve())]
+        except UserError as error:
+            found.append(str(error))
+    return found
+
+
+def _faults_of(part: Path, within: Path) -> list[str]:
+    if part.is_file():
+        _read_all(part)
+        return []
+    artefact = Artefact(part)
+    found = [f"{name}: {fault}" for name, fault in artefact.file_faults().items()]
+    for entry in artefact.manifest.inputs:
+        fault = artefact.input_fault(entry)
+        if fault and artefact.place_of(entry).is_relative_to(within):
+            found.append(f"its input {entry.path} ({entry.kind}) is {fault}")
+    return found
+
+
+def _read_all(data: Path) -> None:
+    dataset = open_dataset(data)
+    dataset.unlabelled()
+    dataset.unlabelled_origins()
+    for goal in dataset.sub_goals:
+        dataset.labelled(goal)
+        dataset.heldout(goal)
+
+
+def stale(run: Path) -> list[dict[str, Any]]:
+    """The data files and artefacts of a run, inputs first.
+
+    Of each its path, why it is stale (no reasons: it is up to date), and the command that made it.
+    """
+    reasons: dict[Path, list[str]] = {}
+    parts = {part.resolve(): part for part in parts_of(run)}
+    for place in parts:
+        _find_reasons(place, reasons)
+    rows = []
+    for place, why in reasons.items():
+        if place in parts:
+            command = shlex.join(Artefact(place).manifest.command) if why else ""
+            typed = command if command.startswith("hypogoal ") else ""  # a program's cannot be given again
+            rows.append({"path": str(parts[place]), "reasons": why, "command": typed})
+    return rows
+
+
+def _find_reasons(place: Path, known: dict[Path, list[str]]) -> list[str]:
+    """Why a data file or an artefact is stale; enters it in ``known``, after its inputs."""
+    if place not in known:
+        reasons = []
+        if place.is_dir():
+            artefact = Artefact(place)
+            reasons = artefact.faults()
+            for entry in artefact.manifest.inputs:
+                source = artefact.place_of(entry)
+                if source.exists() and _find_reasons(source, known):
+                    reasons.append(f"its input {entry.path} is stale")
+        known[place] = reasons
+    return known[place]
+
+
+def stale_lines(rows: Rows) -> list[str]:
+    """What :func:`stale` found, as text."""
+    text = []
+    for row in rows:
+        text.append(f"{row['path']}: {'; '.join(row['reasons']) or 'up to date'}")
+        if row["command"]:
+            text.append(f"  {row['command']} --force")
+    count = sum(bool(row["reasons"]) for row in rows)
+    if rows:
+        text.append(f"{count} of {len(rows)} stale: renew them in this order" if count else "everything is up to date")
+    return text
