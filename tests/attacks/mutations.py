@@ -155,7 +155,7 @@ def _others(values: Any) -> list[Callable[[], Any] | None]:
         None,
         lambda: values[:0],
         lambda: values[: len(values) // 2],
-        lambda: values[0],
+        lambda: 1,
         lambda: values[..., None],
         lambda: values.astype(np.float64) + 0.5 if values.dtype.kind in "iufb" else 1,
         lambda: np.full(values.shape, -1),
