@@ -25,12 +25,13 @@ LONGEST = (
     "test_evaluate_report",
     "test_stopping",
     "test_cli",
-    "test_trust",
     "test_docs",
     "test_loop",
     "test_strange_texts",
     "test_rooms_domain",
-    "test_terminal",
+    "test_own_code",
+    "test_bad_files",
+    "test_fuzz",
 )
 
 

@@ -18,13 +18,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.judging import Judgement, Work
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import STATES, image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
-from hypogoal.evaluation.table import Pairs, Row
+from hypogoal.evaluation.table import EVALUATE_AGAIN, Pairs, Row
 
 Block = dict[str, Any]
 WIDTH = 79  # of tables in a terminal
@@ -253,7 +252,7 @@ def texts(packed: Any) -> list[str]:
     try:
         return list(json.loads(raw))
     except (ValueError, TypeError) as error:
-        raise UserError(f"a list of texts is damaged ({error})", None, AGAIN) from None
+        raise UserError(f"a list of texts is damaged ({error})", None, EVALUATE_AGAIN) from None
 
 
 def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:

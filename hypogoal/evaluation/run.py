@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact, sha256_of
+from hypogoal.core.artefacts import AGAIN, Artefact, find_artefacts, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.own_code import command
 from hypogoal.data import reading
-from hypogoal.options.tables import AGAIN, MAX_INTEGER
+from hypogoal.evaluation.table import EVALUATE_AGAIN
+from hypogoal.options.tables import MAX_INTEGER
 
 FORMAT = 4  # of ``metrics.json``
 
@@ -130,7 +131,7 @@ def fitting(where: object) -> Iterator[None]:
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise UserError("the evaluation does not fit this hypogoal, or is damaged", where, AGAIN) from error
+        raise UserError("the evaluation does not fit this hypogoal, or is damaged", where, EVALUATE_AGAIN) from error
 
 
 def evaluation_of(run: Path) -> Artefact:
@@ -150,7 +151,7 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     source = evaluation_of(run)
     metrics = read_numbers(source)
     metrics["missing"] = [*metrics["missing"], *_since(run, source)]
-    with reading(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
+    with reading(source.path / "arrays.h5", "the evaluation's arrays", EVALUATE_AGAIN) as file:
         names: list[str] = []
         file.visit(names.append)
         found = {name: file[name] for name in names if name.startswith(start)}
@@ -161,15 +162,15 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
 def read_numbers(source: Artefact) -> dict[str, Any]:
     """``metrics.json`` of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
     path = open_artefact(source.path).path / "metrics.json"
-    metrics = read_json(path, "the evaluation is", AGAIN)
+    metrics = read_json(path, "the evaluation is", EVALUATE_AGAIN)
     if not isinstance(metrics, dict) or not isinstance(metrics.get("missing"), list):
-        raise UserError("the evaluation is damaged", path, AGAIN)
+        raise UserError("the evaluation is damaged", path, EVALUATE_AGAIN)
     if (made_with := metrics.get("format", 1)) != FORMAT:
         difference = f"another version of hypogoal evaluated this (format {made_with}, needed: {FORMAT})"
         raise UserError(difference, path, "Evaluate the run again, with --force.")
     for name in _sub_goals(metrics):
         if not plain_name(name):
-            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, AGAIN)
+            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, EVALUATE_AGAIN)
     return metrics
 
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text
 from hypogoal.evaluation.numbers import by_groups, grouped, method_rank, over, pairs
-from hypogoal.options.tables import AGAIN
 
+EVALUATE_AGAIN = "Evaluate the run again."
 BEST, WORST, VALIDATED = "best_member", "worst_member", "validated_member"  # quantities: which member it is
 MEMBERS: Mapping[str, Callable[[Any], Any]] = {"best": np.max, "mean": np.mean, "worst": np.min}
 Entry = dict[str, Any]
@@ -101,12 +101,12 @@ def defined(rows: Iterable[Row]) -> Iterator[Row]:
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of ``numbers.csv``; a ``UserError`` where it is missing or damaged."""
-    text = read_text(path, "the table of numbers is", AGAIN)
+    text = read_text(path, "the table of numbers is", EVALUATE_AGAIN)
     try:
         lines = list(csv.DictReader(io.StringIO(text, newline="")))
         return [Row(**{name: _field(name, line[name]) for name in Row._fields}) for line in lines]
     except (ValueError, KeyError, TypeError, csv.Error):
-        raise UserError("the table of numbers is damaged", path, AGAIN) from None
+        raise UserError("the table of numbers is damaged", path, EVALUATE_AGAIN) from None
 
 
 def _field(name: str, text: str) -> Any:

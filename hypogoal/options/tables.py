@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Columns
+from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, write_table
 from hypogoal.learners.episodes import LAST
 
-AGAIN = "Evaluate the run again."
 MAX_INTEGER = 2**53  # integers that a float holds exactly
 MAX_OPTIONS = 2**16
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
