@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
-    source: Annotated[Path, Argument(help="Arrays, images, or episodes (Minari, LeRobot, robomimic, mp4 files).")],
+    source: Annotated[Path, Argument(help="Arrays, pictures, or episodes (Minari, LeRobot, robomimic, films).")],
     out: cli.Out,
     sub_goal: Annotated[
         list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
@@ -32,7 +32,7 @@ def import_(
         list[str] | None,
         Option(
             metavar="NAME=RULE",
-            help="Episodes: a column, last:N frames, FILE.csv; Minari: MODULE:FUNCTION; data file: FILE.csv.",
+            help="Episodes: a column, last:N frames, FILE.csv or MODULE:FUNCTION; data file: FILE.csv.",
         ),
     ] = None,
     key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
@@ -41,14 +41,16 @@ def import_(
     resize: Annotated[
         list[str] | None, Option(metavar="[KEY=]N", help="Most pixels on the longer side of pictures, or of a key's.")
     ] = None,
+    group: Annotated[str, Option(help="Arrays: which one says what states belong together; held out whole.")] = "",
     stack: Annotated[bool, Option("--stack", help="Axes of frames and colours become channels.")] = False,
     domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
     seed: cli.Seed = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Make a data file of your arrays, images or recorded episodes."""
-    from hypogoal.stages.import_data import import_data as stage
+    """Make a data file of your arrays, pictures or recorded episodes."""
+    from hypogoal.data import open_dataset
+    from hypogoal.importing.data_file import import_data
 
     labels = dict(text.partition("=")[::2] for text in label or ())
     if not all(name and function for name, function in labels.items()):
@@ -57,14 +59,15 @@ def import_(
     sizes = dict(text.rpartition("=")[::2] for text in resize or ())
     if not all(size.isdecimal() and int(size) <= MOST_INTEGER for size in sizes.values()):
         raise UserError("--resize needs a number of pixels", " ".join(resize or ()), "Give --resize 128 or KEY=128.")
-    longest = {name: int(size) for name, size in sizes.items() if int(size)}
-    counts = stage(
+    sides = {name: int(size) for name, size in sizes.items() if int(size)}
+    said = import_data(
         source, out, sub_goals=sub_goal or (), labels=labels, keys=[*filter(None, key or ())], share=heldout,
-        resize=longest if {*longest} - {""} else longest.get("", 0), every=every, stack=stack, domain=domain,
-        seed=seed, force=force,
+        sides=sides, every=every, stack=stack, group=group, domain=domain, seed=seed, force=force,
     )  # fmt: skip
-    _print_observations(out, bool(longest), quiet)
-    cli.print_counts(counts, quiet)
+    for line in said:
+        say(f"hypogoal: {line}", err=True)
+    _print_observations(out, bool(sides), quiet)
+    cli.print_counts(open_dataset(out).counts(), quiet)
     cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
     say(out)
 

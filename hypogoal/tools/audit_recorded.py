@@ -20,8 +20,8 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Block
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
+from hypogoal.importing.labels import COLUMNS
 from hypogoal.observations import Observations, digest, spread_rows
-from hypogoal.own_data.marks import COLUMNS
 
 COMPARED = 4_000  # unlabelled states, spread over the file
 SHOWN = 4  # negatives and pairs of a member on the page

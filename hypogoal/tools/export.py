@@ -18,8 +18,8 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import amount
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import Engine
+from hypogoal.importing.arrays import write_arrays
 from hypogoal.observations import PICTURE, fields_of
-from hypogoal.own_data.arrays import write_arrays
 
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # of a Minari dataset
 CARD = """---

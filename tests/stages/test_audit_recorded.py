@@ -15,10 +15,10 @@ from command_line import refuses, run, settings
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.recorded import picture_of
+from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
-from hypogoal.own_data.marks import read_marks
 from hypogoal.tools.audit_recorded import lines_of
-from tests.own_data import mixed
+from tests import mixed
 
 GOAL = "door-open"
 
@@ -44,7 +44,7 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     assert artefact.manifest.files.keys() == {"audit.json", "index.html", *pictures}
     [part] = json.loads((audit / "audit.json").read_text())["sub_goals"]
     assert (part["sub_goal"], part["known"], part["unlabelled"], len(part["members"])) == (GOAL, 56, 20, 2)
-    rows = read_marks(audit / "next" / GOAL / TO_FILL_IN)
+    rows = read_table(audit / "next" / GOAL / TO_FILL_IN, ("row", "digest"))
     places = [int(row["row"]) for row in rows]
     assert sorted(places) == list(range(20)) and places == part["next"]
     assert all(digest(data.unlabelled()[place]).hex() == row["digest"] for place, row in zip(places, rows, strict=True))
@@ -125,23 +125,6 @@ def damaged(table: Path, out: Path, **cells: str) -> Path:
         writer.writeheader()
         writer.writerows(rows)
     return out
-
-
-@pytest.mark.parametrize(
-    ("cells", "says"),
-    [
-        ({"label": "maybe"}, "this is no row and label"),
-        ({"row": "-1", "label": "1"}, "this is no row and label"),
-        ({"row": "9" * 5000, "label": "1"}, "this is no row and label"),
-        ({"row": "20", "label": "1"}, "the table is of other data"),
-        ({"digest": "00" * 16, "label": "1"}, "the table is of other data"),
-        ({}, "the table has no label yet"),
-    ],
-)
-def test_a_table_that_does_not_fit_is_refused(audited: Path, tmp_path: Path, cells: dict[str, str], says: str) -> None:
-    table = damaged(audited / "audit/next" / GOAL / TO_FILL_IN, tmp_path / "labels.csv", **cells)
-    out = tmp_path / "more.h5"
-    refuses(says, "import", audited / "data.h5", "--label", f"{GOAL}={table}", "--out", out)
 
 
 def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path) -> None:

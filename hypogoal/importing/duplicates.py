@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.terminal import amount
 from hypogoal.data import States
 from hypogoal.domains.observations import resized_picture
 from hypogoal.observations import PICTURE, Observations, digest, spread_rows
@@ -20,7 +21,6 @@ RULE = f"in {GRID} x {GRID} areas their brightness differs by at most {LEVELS} o
 MOST_COMPARED = 2_000  # pictures per set, spread evenly
 
 Looks: TypeAlias = NDArray[np.bytes_]
-Name: TypeAlias = Callable[[int], str]  # of a state, by its row
 
 
 def looks_of(observations: Observations) -> Looks:
@@ -28,44 +28,48 @@ def looks_of(observations: Observations) -> Looks:
     return np.array([digest(each) for each in observations])
 
 
-def contradictions(
-    looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name, *, kind: str = "picture"
-) -> list[str]:
-    """A line for each sub-goal with equal states whose labels (N, G) differ."""
+def contradictions(states: States, goals: Sequence[str], names: Sequence[str]) -> list[str]:
+    """A line for each sub-goal with equal states whose labels differ."""
+    looks = looks_of(states.observations)
+    kind = "picture" if states.observations.dtype == PICTURE else "observation"
     lines = []
-    for goal, column in zip(goals, labels.T, strict=True):
+    for goal, column in zip(goals, states.labels.T, strict=True):
         both = np.intersect1d(looks[column], looks[~column])
         if len(both):
-            count = f"1 {kind} carries" if len(both) == 1 else f"{len(both)} {kind}s carry"
-            pair = _pair(looks, column, both[0], name)
+            count = f"{amount(len(both), kind)} {'carries' if len(both) == 1 else 'carry'}"
+            pair = _pair(looks, column, both[0], names)
             lines.append(f"{count} both labels of {goal}, such as {pair}: no member can be right about both")
     return lines
 
 
-def require_own_pictures(looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name) -> None:
-    """Refuse (``UserError``) labels (N, G) if every state of a class equals one of the other class."""
-    for goal, column in zip(goals, labels.T, strict=True):
+def require_own_pictures(states: States, goals: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse (``UserError``) labels if every state of a class equals one of the other class."""
+    looks = looks_of(states.observations)
+    for goal, column in zip(goals, states.labels.T, strict=True):
         for kind, other, of_kind in (("positive", "negative", column), ("negative", "positive", ~column)):
             if np.isin(looks[of_kind], looks[~of_kind]).all():
-                pair = _pair(looks, column, looks[of_kind][0], name)
+                pair = _pair(looks, column, looks[of_kind][0], names)
                 do = "Remove the copies whose label is wrong."
                 raise UserError(f"every {kind} of {goal} is also a {other}", f"for example {pair}", do)
 
 
-def near_duplicates(labelled: States, heldout: States, goals: Sequence[str], names: tuple[Name, Name]) -> list[str]:
+def near_duplicates(
+    labelled: States, heldout: States, goals: Sequence[str], names: tuple[Sequence[str], Sequence[str]]
+) -> list[str]:
     """A line if held-out pictures nearly equal labelled ones, and one per sub-goal whose classes have such a pair.
 
     Equal pictures do not count, nor do numbers. ``names``: of labelled and of held-out states.
     """
     if labelled.observations.dtype != PICTURE:
         return []
-    lines = []
-    rows, test_rows = (spread_rows(len(states.labels), MOST_COMPARED) for states in (labelled, heldout))
+    rows = spread_rows(len(labelled.labels), MOST_COMPARED)
+    test_rows = spread_rows(len(heldout.labels), MOST_COMPARED)
     sketches, tests = _sketches(labelled.observations[rows]), _sketches(heldout.observations[test_rows])
+    lines = []
     nearest = _nearest(tests, sketches)
     near = np.flatnonzero(nearest >= 0)
     if len(near):
-        pair = f"{names[1](test_rows[near[0]])} and {names[0](rows[nearest[near[0]]])}"
+        pair = f"{names[1][test_rows[near[0]]]} and {names[0][rows[nearest[near[0]]]]}"
         text = f"{len(near)} of {len(test_rows)} held-out pictures nearly equal a labelled one, such as {pair} ({RULE})"
         lines.append(f"{text}: scores on them say little about new ones")
     looks = looks_of(labelled.observations[rows])
@@ -75,16 +79,16 @@ def near_duplicates(labelled: States, heldout: States, goals: Sequence[str], nam
         nearest = _nearest(sketches[positives], sketches[negatives])
         near = np.flatnonzero(nearest >= 0)
         if len(near):
-            pair = f"{names[0](rows[positives[near[0]]])} and {names[0](rows[negatives[nearest[near[0]]]])}"
+            pair = f"{names[0][rows[positives[near[0]]]]} and {names[0][rows[negatives[nearest[near[0]]]]]}"
             text = f"{len(near)} of {len(positives)} positives of {goal} nearly equal a negative, such as {pair}"
             lines.append(f"{text} ({RULE}): are their labels right?")
     return lines
 
 
-def _pair(looks: Looks, labels: NDArray[np.bool_], look: Any, name: Name) -> str:
+def _pair(looks: Looks, labels: NDArray[np.bool_], look: Any, names: Sequence[str]) -> str:
     """The names of the first positive and the first negative with this hash."""
-    positive, negative = (int(np.flatnonzero((looks == look) & kind)[0]) for kind in (labels, ~labels))
-    return f"{name(positive)} and {name(negative)}"
+    same = looks == look
+    return f"{names[np.flatnonzero(same & labels)[0]]} and {names[np.flatnonzero(same & ~labels)[0]]}"
 
 
 def _sketches(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -26,7 +26,7 @@ from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, net
 from hypogoal.hypotheses.training import fit
 from hypogoal.hypotheses.views import full_view
 from hypogoal.observations import mixed_type, packed, type_of, type_text
-from tests.own_data.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
+from tests.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
 
 GOAL = "door-open"
 FEW = settings("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3")
@@ -55,13 +55,6 @@ def test_a_file_keeps_each_key(made: Path) -> None:
     assert data.observation_bytes == np.prod(FRONT) + np.prod(WRIST) + 16
     assert data.features() == ["front", "state[0]", "state[1]", "state[2]", "state[3]", "wrist"]
     run("verify", made)
-
-
-def test_arrays_come_out_as_they_went_in(made: Path, tmp_path: Path) -> None:
-    run("export", made / "data.h5", "--out", tmp_path / "again.npz")
-    with np.load(tmp_path / "again.npz") as again:
-        for name, values in arrays().items():
-            np.testing.assert_array_equal(again[name].reshape(values.shape), values)
 
 
 def test_each_key_has_its_encoder(made: Path) -> None:
@@ -180,7 +173,7 @@ def test_an_agent_learns_from_cameras_and_numbers(made: Path, agent: type[PPO] |
 def test_options_say_that_they_cannot(made: Path, tmp_path: Path) -> None:
     """Spec G2: agents see one kind; the line says what does learn from both."""
     (tmp_path / "doors.py").write_text(
-        "from hypogoal import GymnasiumDomain\nfrom tests.own_data.mixed import DoorEnv\n"
+        "from hypogoal import GymnasiumDomain\nfrom tests.mixed import DoorEnv\n"
         "DOMAIN = GymnasiumDomain(DoorEnv, {'door-open': lambda env: env.unwrapped.open})\n"
     )
     with pytest.MonkeyPatch.context() as patch:
@@ -194,38 +187,6 @@ def test_options_say_that_they_cannot(made: Path, tmp_path: Path) -> None:
         command = ["train-options", tmp_path / "e", "--out", tmp_path / "o", "-q"]
         refuses("agents see pictures or numbers, not both: front, state, wrist. Reward", *command)
     assert not (tmp_path / "o").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"observations/state": np.zeros((39, 4), np.float32)}, "the labelled observations do not fit together"),
-        ({"unlabelled/arm": np.zeros((20, 4), np.float32)}, "the unlabelled observations differ in shape or type"),
-        ({"observations": np.zeros((40, 4), np.float32)}, "'observations' is one array and several by key"),
-        ({"observations/state": np.full((40, 4), np.nan)}, "have numbers that are not finite"),
-        ({"observations/..": np.zeros((40, 4), np.float32)}, "do not fit together"),
-        ({"labels/front": np.zeros(40)}, "unknown array 'labels/front'"),
-    ],
-)
-def test_what_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, np.ndarray], words: str) -> None:
-    """Spec G2: and nothing is written."""
-    np.savez(tmp_path / "odd.npz", **(arrays() | changes))
-    refuses(words, "import", tmp_path / "odd.npz", "--out", tmp_path / "data.h5")
-    assert [file.name for file in tmp_path.iterdir()] == ["odd.npz"]
-
-
-def test_cameras_are_resized_each(tmp_path: Path) -> None:
-    """Spec B6: all pictures, or one key's; numbers stay."""
-    np.savez(tmp_path / "own.npz", **arrays())
-    for words, front, wrist in (
-        (["--resize", "32"], (24, 32, 3), (32, 32, 3)),
-        (["--resize", "32", "--resize", "wrist=22"], (24, 32, 3), (22, 22, 3)),
-        (["--resize", "wrist=22"], FRONT, (22, 22, 3)),
-    ):
-        data = tmp_path / "data.h5"
-        run("import", tmp_path / "own.npz", "--out", data, "--force", "-q", *words)
-        dtype = open_dataset(data).observation_dtype
-        assert (dtype["front"].shape, dtype["wrist"].shape, dtype["state"].shape) == (front, wrist, STATE)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,12 @@ def picture(camera: str, place: float, episode: int) -> np.ndarray:
     return frame
 
 
-def write_video(path: Path, frames: list[np.ndarray], fps: int = FPS, codec: str = "") -> None:
+def episode_of(wrist: np.ndarray) -> int:
+    """Which episode a picture of the wrist's camera is of: its background says so."""
+    return round((float(np.median(wrist)) - 20) / 10)
+
+
+def write_film(path: Path, frames: list[np.ndarray], fps: int = FPS, codec: str = "") -> None:
     """An mp4 file, by default of the best codec that this build of FFmpeg has."""
     path.parent.mkdir(parents=True, exist_ok=True)
     codec = codec or next(name for name in ("libx264", "libopenh264", "mpeg4") if name in av.codecs_available)
@@ -129,7 +134,7 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video", code
             write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
             for key, camera in cameras.items() if kind == "video" else ():
                 frames = [picture(camera, place, episode) for place in places(episode)]
-                write_video(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames, codec=codec)
+                write_film(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames, codec=codec)
         return folder
     table = pa.concat_tables(tables)
     write_table(folder / "data/chunk-000/file-000.parquet", table)
@@ -149,7 +154,7 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video", code
         for file in (0, 1):
             some = [(at, place) for at in episodes if at // 3 == file for place in places(at)]
             frames = [picture(camera, place, at) for at, place in some]
-            write_video(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames, codec=codec)
+            write_film(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames, codec=codec)
     return folder
 
 
@@ -169,12 +174,12 @@ def write_robomimic(path: Path) -> Path:
     return path
 
 
-def write_videos(folder: Path) -> Path:
+def write_films(folder: Path) -> Path:
     """A folder of mp4 files, and a table of where the light is at the goal; the last episode is not in it."""
     folder.mkdir()
     lines = ["episode,from,to"]
     for episode, length in enumerate(LENGTHS):
-        write_video(folder / f"take-{episode}.mp4", [picture("top", place, episode) for place in places(episode)])
+        write_film(folder / f"take-{episode}.mp4", [picture("top", place, episode) for place in places(episode)])
         if episode < len(LENGTHS) - 1:
             lines.append(f"take-{episode},{int((places(episode) <= 0.5).sum())},{length}")
     (folder / "labels.csv").write_text("\n".join(lines) + "\n")

@@ -1,1 +1,0 @@
-"""Import of users' states (NumPy arrays, folders of images, Minari datasets), and export (Spec B6)."""

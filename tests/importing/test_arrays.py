@@ -1,0 +1,237 @@
+"""NumPy arrays become a data file; what is wrong with them is one line (Spec B3, B6, G2)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import refuses, run, settings
+
+from hypogoal.core.errors import UserError
+from hypogoal.data import Collected, open_dataset
+from hypogoal.importing.arrays import parts_of
+from hypogoal.importing.assemble import assemble, held_out
+from tests.importing.states import arrays, pictures
+from tests.mixed import FRONT, STATE
+from tests.mixed import arrays as mixed_arrays
+
+
+def assembled(given: dict[str, Any], **settings: Any) -> tuple[Collected, list[str]]:
+    return assemble(parts_of(given, Path("own.npz")), **settings)
+
+
+def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
+    """Spec B6, A2, A5: a .npz becomes a data file, an ensemble of it judges the held-out states."""
+    np.savez(tmp_path / "own.npz", **arrays())
+    folder = tmp_path / "run"
+    data = folder / "data.h5"
+    said = run("import", tmp_path / "own.npz", "--out", data, "--sub-goal", "at-right")
+    assert said.out.startswith("taken for pictures, 48 x 48 x 3 uint8\n") and not said.err
+    found = open_dataset(data)
+    np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
+    assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
+    few = settings("steps=40", "members=2", "learning_rate=1e-3")
+    run("train-ensemble", data, "--out", folder / "ensemble", "-q", *few)
+    run("evaluate", folder, "-q")
+    metrics = json.loads((folder / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    assert metrics["hypotheses"][0]["worst"]["mean"] > 0.9
+
+
+def test_options_of_states_of_no_domain_are_refused(tmp_path: Path) -> None:
+    """Spec B6, G2: what to do is said: which domain the states are of is told when they are imported."""
+    np.savez(tmp_path / "own.npz", **arrays())
+    run("import", tmp_path / "own.npz", "--out", tmp_path / "data.h5", "-q")
+    few = settings("steps=2", "members=1")
+    run("train-ensemble", tmp_path / "data.h5", "--out", tmp_path / "ensemble", "-q", *few)
+    command = ["train-options", tmp_path / "ensemble", "--out", tmp_path / "options", "-q"]
+    refuses("the domain of these imported states is not known: imported. Import them again with --domain", *command)
+
+
+def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
+    """Spec B6: labels (N, G), a folder of .npy files, and the way back as .npz, names included."""
+    labels = np.stack([np.arange(40) % 2, np.arange(40) % 3 == 0], axis=1)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name, values in arrays(labels=labels, heldout_labels=np.stack([np.arange(16) % 2] * 2, 1)).items():
+        np.save(folder / f"{name}.npy", values)
+    data, again = tmp_path / "data.h5", tmp_path / "again.h5"
+    run("import", folder, "--out", data, "--sub-goal", "odd", "--sub-goal", "third", "-q")
+    run("export", data, "--out", tmp_path / "out.npz")
+    run("import", tmp_path / "out.npz", "--out", again, "-q")
+    one, other = open_dataset(data), open_dataset(again)
+    assert one.sub_goals == other.sub_goals == ("odd", "third")
+    for split in ("labelled", "heldout"):
+        for goal in one.sub_goals:
+            left, right = getattr(one, split)(goal), getattr(other, split)(goal)
+            np.testing.assert_array_equal(left.observations, right.observations)
+            np.testing.assert_array_equal(left.labels, right.labels)
+    refuses("exists already", "export", data, "--out", tmp_path / "out.npz")
+    refuses("as .npz", "export", data, "--out", tmp_path / "out.csv")
+
+
+def test_cameras_and_numbers_by_key(tmp_path: Path) -> None:
+    """Spec B6, H6: arrays by key go in and come out; pictures are resized each, numbers stay."""
+    np.savez(tmp_path / "own.npz", **mixed_arrays())
+    data = tmp_path / "data.h5"
+    for words, front, wrist in (
+        (["--resize", "32"], (24, 32, 3), (32, 32, 3)),
+        (["--resize", "32", "--resize", "wrist=22"], (24, 32, 3), (22, 22, 3)),
+        (["--resize", "wrist=22"], FRONT, (22, 22, 3)),
+        ([], FRONT, (44, 44, 3)),
+    ):
+        run("import", tmp_path / "own.npz", "--out", data, "--force", "-q", *words)
+        dtype = open_dataset(data).observation_dtype
+        assert (dtype["front"].shape, dtype["wrist"].shape, dtype["state"].shape) == (front, wrist, STATE)
+    run("export", data, "--out", tmp_path / "again.npz")
+    with np.load(tmp_path / "again.npz") as again:
+        for name, values in mixed_arrays().items():
+            np.testing.assert_array_equal(again[name].reshape(values.shape), values)
+
+
+def test_a_share_is_held_out_where_nothing_else_is_given(tmp_path: Path) -> None:
+    """Spec B3: of each class, and it is said that this tells nothing of other contexts."""
+    np.savez(tmp_path / "own.npz", **arrays(heldout_observations=None, heldout_labels=None))
+    data = tmp_path / "data.h5"
+    said = run("import", tmp_path / "own.npz", "--out", data, "--heldout", "0.25", "-q")
+    assert "says nothing about other contexts" in said.err
+    counts = open_dataset(data).counts()
+    assert counts["heldout"]["sub-goal"] == {"states": 10, "positives": 5}
+    assert counts["labelled"]["sub-goal"] == {"states": 30, "positives": 15}
+
+
+def test_a_share_is_held_out_of_many_small_groups_too() -> None:
+    """Spec B3: what is too little of one combination of labels goes on to the next; never all of one, never nothing."""
+    labels = np.array([[bit >> goal & 1 for goal in range(6)] for bit in range(64)] * 2, dtype=np.bool_)
+    chosen = held_out(labels, 0.2, seed=0)
+    assert chosen.sum() == 26
+    assert len({tuple(row) for row in labels[~chosen].tolist()}) == 64
+    rare = np.arange(30) == 7
+    assert not held_out(rare[:, None], 0.9, seed=0)[7]
+    with pytest.raises(UserError, match=r"none of 64 labelled states can be held out: heldout=0\.2"):
+        held_out(labels[:64], 0.2, seed=0)
+
+
+def test_a_group_is_held_out_whole_or_not_at_all(tmp_path: Path) -> None:
+    """Spec B3: by an array of their names; unlabelled states of held-out groups are left out."""
+    given = arrays(heldout_observations=None, heldout_labels=None)
+    given |= {"take": np.arange(40) // 4, "unlabelled_take": np.arange(20) % 10}
+    np.savez(tmp_path / "own.npz", **given)
+    data = tmp_path / "data.h5"
+    run("import", tmp_path / "own.npz", "--out", data, "--group", "take", "-q")
+    found = open_dataset(data)
+    rows = {state.tobytes(): row for row, state in enumerate(given["observations"])}
+    held = {rows[state.tobytes()] // 4 for state in found.heldout("sub-goal").observations}
+    learned = {rows[state.tobytes()] // 4 for state in found.labelled("sub-goal").observations}
+    assert len(held) == 2 and held | learned == set(range(10)) and not held & learned
+    assert len(found.unlabelled()) == 20 - 2 * len(held)
+    refuses(
+        "no array 'tape' to group by", "import", tmp_path / "own.npz", "--out", tmp_path / "x.h5", "--group", "tape"
+    )
+    with pytest.raises(UserError, match="none of 1 groups can be held out"):
+        assemble(parts_of(given | {"take": np.zeros(40)}, tmp_path, "take"))
+
+
+def test_held_out_states_that_are_known_are_left_out() -> None:
+    """Spec B3: members are not judged by what they learned; how many were left out is said."""
+    (images, _), (others, _), (held, known) = pictures(40), pictures(20, 1), pictures(16, 2)
+    mixed = arrays(
+        heldout_observations=np.concatenate([images[:3], held, others[:4]]),
+        heldout_labels=np.concatenate([[0, 1, 0], known, [0, 1, 0, 1]]),
+    )
+    collected, said = assembled(mixed)
+    assert said == ["7 of 23 held-out states look like one to learn from: they are left out"]
+    np.testing.assert_array_equal(collected.heldout.observations, held)
+    np.testing.assert_array_equal(collected.heldout.labels[:, 0], known)
+    with pytest.raises(UserError, match="every held-out state looks like one to learn from"):
+        assembled(mixed | {"heldout_observations": images, "heldout_labels": arrays()["labels"]})
+
+
+def test_what_looks_alike_is_held_out_together() -> None:
+    """Spec B3: from the unlabelled states too."""
+    (images, labels), (others, _) = pictures(20), pictures(10, 1)
+    given = {"observations": np.tile(images, (3, 1, 1, 1)), "labels": np.tile(labels, 3)}
+    collected, said = assembled(given | {"unlabelled": np.concatenate([others, images])})
+    sets = [collected.labelled, collected.unlabelled, collected.heldout]
+    known = [{image.tobytes() for image in one.observations} for one in sets]
+    assert [len(one.labels) for one in sets] == [48, 26, 12] and [len(one) for one in known] == [16, 26, 4]
+    assert not (known[0] | known[1]) & known[2]
+    assert "4 of 30 unlabelled states look like one held out: they are left out" in said
+    with pytest.raises(UserError, match="every unlabelled state looks like one held out"):
+        assembled(given | {"unlabelled": collected.heldout.observations})
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"unlabelled": None}, "no array 'unlabelled'"),
+    ({"unlabelled": None, "unlabeled": pictures(5)[0]}, "unknown array 'unlabeled': .* Did you mean 'unlabelled'"),
+    ({"held_out_labels": np.zeros(3)}, "unknown array 'held_out_labels': .* Did you mean 'heldout_labels'"),
+    ({"rewards": np.zeros(3)}, "unknown array 'rewards': .* Known are observations, labels, unlabelled"),
+    ({"labels/front": np.zeros(40)}, "unknown array 'labels/front'"),
+    ({"observations/front": np.zeros((40, 4))}, "'observations' is one array and several by key"),
+    ({"heldout_labels": None}, "held-out states need observations and labels"),
+    ({"observations": pictures(40)[0] / 255}, "differ in shape or type from the labelled ones: uint8"),
+    ({"observations": np.full((40, 9), np.nan)}, "have numbers that are not finite: columns 0, 1, 2, 3 and 5 more"),
+    ({"features": np.array(["a"])}, "number of feature names is wrong: 1 for uint8"),
+    ({"observations": pictures(40)[0].astype(int) * 9}, "could be pictures or numbers.*Give pictures as uint8"),
+    ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"frames, first.*stacked frames among the channels"),
+    ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"frames, first: uint8 \(12, 48, 48\)"),
+    ({"observations": np.zeros((40, 0), np.uint8)}, "neither pictures nor numbers"),
+    ({"observations": np.zeros(40)}, "are not observations"),
+    ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "differ in shape or type from the labelled ones"),
+    ({"unlabelled": pictures(0)[0]}, "the unlabelled observations are empty"),
+    ({"labels": np.arange(39) % 2}, "do not fit 40 states"),
+    ({"labels": np.zeros(0)}, "do not fit 40 states"),
+    ({"sub_goals": np.array([b"won"])}, r"sub_goals are \|S3, not texts"),
+    ({"sub_goals": np.array(["a:b"])}, "a sub-goal's name must be usable as a file name: 'a:b'"),
+    ({"labels": np.arange(40) % 3}, r"are not only 0 and 1: \[2\]"),
+    ({"labels": np.full(40, np.nan)}, "are not only 0 and 1"),
+    ({"labels": np.zeros(40)}, "has no positives among 40 labelled states"),
+    ({"labels": np.ones(40)}, "has no negatives among 40 labelled states"),
+    ({"labels": np.stack([np.arange(40) % 2] * 2, 1)}, "2 sub-goals need as many names"),
+    ({"heldout_labels": np.stack([np.arange(16) % 2] * 2, 1)}, "are of 2 sub-goals, not 1"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), WRONG)
+def test_what_is_wrong_with_arrays_is_one_line(changes: dict[str, Any], message: str) -> None:
+    """Spec G2: names, shapes, types, label values."""
+    with pytest.raises(UserError, match=message):
+        assembled(arrays(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations/state": np.zeros((39, 4), np.float32)}, "the labelled observations do not fit together"),
+        ({"unlabelled/arm": np.zeros((20, 4), np.float32)}, "the unlabelled observations differ in shape or type"),
+        ({"observations/state": np.full((40, 4), np.nan)}, "observations 'state' have numbers that are not finite"),
+        ({"observations/front": np.zeros((40, 3, 48, 48), np.uint8)}, "observations 'front' have their channels"),
+        ({"observations/..": np.zeros((40, 4), np.float32)}, "do not fit together"),
+    ],
+)
+def test_keys_are_checked_as_one_array_is(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        assembled(mixed_arrays() | changes)
+
+
+def test_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
+    """Spec G2: no zip file, a damaged one, a pickle, a pointer of Git LFS, none at all; nothing is written."""
+    file, out = tmp_path / "own.npz", tmp_path / "data.h5"
+    np.savez(file, **arrays())
+    whole = bytearray(file.read_bytes())
+    whole[2000:4000] = bytes(2000)
+    pickle = tmp_path / "pickle.npz"
+    np.savez(pickle, labels=np.array([None] * 40))
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\n"
+    for data, said in (
+        (b"PK" + b"x" * 100, "this cannot be read"),
+        (bytes(whole), "this cannot be read"),
+        (pickle.read_bytes(), "allow_pickle=False"),
+        (pointer, "git lfs pull"),
+    ):
+        file.write_bytes(data)
+        refuses(said, "import", file, "--out", out)
+    refuses("no such file or folder", "import", tmp_path / "nowhere.npz", "--out", out)
+    refuses("this is no recording", "import", pickle, "--out", out, "--label", "a=rewards")

@@ -1,0 +1,253 @@
+"""Pictures as viewers show them, folders of them, and films turned as players turn them (Spec B6)."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import refuses, run
+from PIL import Image
+
+from hypogoal.core.errors import UserError
+from hypogoal.data import open_dataset
+from hypogoal.importing.pictures import picture_of, read_pictures
+from tests.importing.states import SIDE, arrays, pictures, save_minari, save_pictures
+
+UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
+HERE = Path("x.png")
+# How a picture is stored, by its EXIF orientation; and what a player's display matrix has of each.
+STORED = {
+    1: UPRIGHT,  # row 0 is at the top, column 0 at the left
+    2: UPRIGHT[:, ::-1],  # top, right
+    3: UPRIGHT[::-1, ::-1],  # bottom, right
+    4: UPRIGHT[::-1],  # bottom, left
+    5: UPRIGHT.swapaxes(0, 1),  # left, top
+    6: UPRIGHT[:, ::-1].swapaxes(0, 1),  # right, top
+    7: UPRIGHT[::-1, ::-1].swapaxes(0, 1),  # right, bottom
+    8: UPRIGHT[::-1].swapaxes(0, 1),  # left, bottom
+}
+
+
+def saved(values: np.ndarray, kind: str = "PNG", **more: Any) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(values)).save(file, kind, **more)
+    return file.getvalue()
+
+
+def deep_png(values: np.ndarray) -> bytes:
+    """A PNG of 16 bits a channel, which Pillow does not write: values uint16 (H, W, C)."""
+    height, width, channels = values.shape
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    facts = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
+    chunks = [(b"IHDR", facts), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    parts = [
+        struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part)) for name, part in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def exif_of(orientation: int, order: str = "<") -> bytes:
+    """EXIF with one entry, in either order of bytes."""
+    head = {"<": b"II", ">": b"MM"}[order] + struct.pack(f"{order}HI", 42, 8)
+    return b"Exif\0\0" + head + struct.pack(f"{order}HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+
+
+def check_upright(data: bytes, wanted: np.ndarray, off: int = 0) -> None:
+    seen = picture_of(data, HERE)
+    assert seen.shape == wanted.shape
+    assert np.abs(seen.astype(int) - wanted)[4::16, 4::16].max() <= off  # away from edges, which JPEG smears
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_a_picture_is_upright(orientation: int) -> None:
+    """Spec B6: as the EXIF orientation says, in all formats that have it, in colour and grey."""
+    stored, grey = STORED[orientation], UPRIGHT[..., :1]
+    exif = exif_of(orientation, "<>"[orientation % 2])
+    check_upright(saved(stored, exif=exif), UPRIGHT)
+    check_upright(saved(stored[..., 0], exif=exif), grey)
+    check_upright(saved(stored, "JPEG", exif=exif, quality=95), UPRIGHT, 40)
+    check_upright(saved(stored[..., 0], "JPEG", exif=exif, quality=95), grey, 40)
+    check_upright(saved(stored, "WEBP", exif=exif, lossless=True), UPRIGHT)
+    check_upright(
+        saved(np.asarray(Image.fromarray(np.ascontiguousarray(stored)).quantize(15).convert("RGB")), exif=exif), UPRIGHT
+    )
+    chunk = exif[6:]
+    chunk = struct.pack(">I", len(chunk)) + b"eXIf" + chunk + struct.pack(">I", zlib.crc32(b"eXIf" + chunk))
+    plain = saved(stored)
+    check_upright(plain[:-12] + chunk + plain[-12:], UPRIGHT)  # behind the pixels
+
+
+def test_an_orientation_that_is_none_is_ignored() -> None:
+    """Spec G2: of no known value, or in metadata that are damaged, as viewers do."""
+    for exif in (
+        exif_of(0),
+        exif_of(9),
+        exif_of(65_535),
+        b"",
+        b"Exif\0\0II*\0\xff\xff\xff\xff",
+        exif_of(6)[:18],
+        b"nonsense",
+    ):
+        check_upright(saved(UPRIGHT, exif=exif), UPRIGHT)
+        check_upright(saved(UPRIGHT, "JPEG", exif=exif, quality=95), UPRIGHT, 40)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_of_16_bits_the_upper_ones_are_taken(channels: int) -> None:
+    """Spec B6: the file says how deep it is, not the library; values of 12 bits would leave 16 levels."""
+    values = np.random.default_rng(0).integers(0, 1 << 16, (9, 7, channels)).astype(np.uint16)
+    if channels in (2, 4):
+        values[..., -1] = 65_535
+    seen = picture_of(deep_png(values), HERE)
+    colours = values[..., :1] if channels < 3 else values[..., :3]
+    np.testing.assert_array_equal(seen, np.broadcast_to(colours >> 8, seen.shape))
+    with pytest.raises(UserError, match="of the picture's 16 bits a channel the upper ones are unused"):
+        picture_of(deep_png(np.where(values == 65_535, values, values >> 4)), HERE)
+
+
+def test_of_several_pictures_the_first_is_taken() -> None:
+    frames = [Image.new("L", (SIDE, SIDE), value) for value in (90, 180, 0)]
+    for kind in ("GIF", "PNG", "WEBP", "TIFF"):
+        file = io.BytesIO()
+        frames[0].save(file, kind, save_all=True, append_images=frames[1:])
+        seen = picture_of(file.getvalue(), HERE)
+        assert seen.shape[:2] == (SIDE, SIDE) and np.unique(seen).tolist() == [90], kind
+
+
+def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
+    """Spec G2: the file is named, and PostScript is not even opened: Pillow would run a program."""
+    folder = save_pictures(tmp_path / "images")
+    file = folder / "positive" / "zz.png"
+    clear = saved(np.zeros((SIDE, SIDE, 4), np.uint8))
+    palette = io.BytesIO()
+    Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
+    for data, said in (
+        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size: positive/zz.png is 48 x 20 x 3"),
+        (b"no image", "this cannot be read"),
+        (saved(UPRIGHT)[:200], "this cannot be read"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
+        (clear, "the picture is transparent in places"),
+        (palette.getvalue(), "the picture is transparent in places"),
+        (saved(np.zeros((SIDE, SIDE), np.float32), "TIFF"), "the picture has the mode F, neither 8 nor 16 bits"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n", "git lfs pull"),
+    ):
+        file.write_bytes(data)
+        line = refuses(said, "import", folder, "--out", tmp_path / "data.h5")
+        assert "zz.png" in line
+    for other in (file, *(folder / "unlabelled").iterdir()):
+        other.unlink()
+    refuses("there are no pictures here", "import", folder, "--out", tmp_path / "data.h5")
+
+
+def test_folders_of_pictures_become_states(tmp_path: Path) -> None:
+    """Spec B6: the folder's name is the sub-goal's; grey pictures have one channel, unless others are coloured."""
+    data = tmp_path / "data.h5"
+    folder = save_pictures(tmp_path / "at-right")
+    run("import", folder, "--out", data, "-q")
+    found = open_dataset(data)
+    assert found.sub_goals == ("at-right",)
+    images, labels = pictures(24)
+    np.testing.assert_array_equal(found.labelled("at-right").observations[:12], images[labels])
+    assert found.counts()["heldout"]["at-right"] == {"states": 6, "positives": 3}
+    grey = save_pictures(tmp_path / "grey", change=lambda image: image[..., 0])
+    assert read_pictures(grey)[0].labelled.observations.shape == (24, SIDE, SIDE, 1)
+    (grey / "positive" / "01.png").write_bytes(saved(images[1]))
+    mixed = read_pictures(grey)[0].labelled.observations
+    np.testing.assert_array_equal(mixed[0], images[1])
+    np.testing.assert_array_equal(mixed[1], images[3][..., :1].repeat(3, 2))
+
+
+def test_what_is_not_read_is_counted_and_folders_are_groups(tmp_path: Path) -> None:
+    """Spec B3, B6: by suffix; links are followed; a folder within a kind is held out whole or not at all."""
+    folder = save_pictures(tmp_path / "goal", held=False)
+    for kind in ("positive", "negative", "unlabelled"):
+        for number, file in enumerate(sorted((folder / kind).iterdir())):
+            day = folder / kind / f"day{number % 4}"
+            day.mkdir(exist_ok=True)
+            file.rename(day / file.name.replace(".png", ".PNG"))
+        (folder / kind / "x.heic").write_bytes(b"x")
+        (folder / kind / ".hidden").write_bytes(b"x")
+    (folder / "positive" / "day1").rename(tmp_path / "elsewhere")
+    (folder / "positive" / "day1").symlink_to(tmp_path / "elsewhere")
+    said = run("import", folder, "--out", tmp_path / "data.h5", "--heldout", "0.3", "-q").err
+    assert "not read: 3 .heic\n" in said
+    found = open_dataset(tmp_path / "data.h5")
+    parts, left = read_pictures(folder)
+    assert left == Counter({".heic": 3}) and len(parts.labelled.names) == 24 and parts.labelled.groups is not None
+    rows = [state.tobytes() for state in np.asarray(parts.labelled.observations)]
+    day = dict(zip(rows, parts.labelled.groups.tolist(), strict=True))
+    held = {day[state.tobytes()] for state in found.heldout("goal").observations}
+    learned = {day[state.tobytes()] for state in found.labelled("goal").observations}
+    assert len(held) == 1 and held | learned == {f"day{number}" for number in range(4)} and not held & learned
+    others = {day.get(state.tobytes()) for state in found.unlabelled()}
+    assert not others & held
+
+
+def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
+    """Spec B6: their longer side has so many pixels, areas are averaged; what is small enough stays as it is."""
+    images, _ = pictures(24)
+    small = images.reshape(24, 24, 2, 24, 2, 3).mean((2, 4))
+    np.savez(tmp_path / "own.npz", **arrays())
+    sources = [save_pictures(tmp_path / "at-right"), tmp_path / "own.npz", save_minari(tmp_path / "own-v0")]
+    for number, source in enumerate(sources):
+        given = ["--label", "right=tests.importing.states:at_right"] if number == 2 else []
+        out = tmp_path / f"{number}.h5"
+        run("import", source, "--out", out, "--resize", "24", *given, "-q")
+        data = open_dataset(out)
+        assert data.observation_shape == (24, 24, 3) and data.config["resize"] == {"": 24}
+        if number == 0:
+            positives = small[np.arange(24) % 2 == 1]
+            assert np.abs(data.labelled("at-right").observations[:12] - positives).max() <= 1
+    large = sources[0] / "positive" / "01.png"
+    Image.open(large).resize((96, 96)).save(large)
+    refuses("states differ in size", "import", sources[0], "--out", tmp_path / "x.h5")
+    run("import", sources[0], "--out", tmp_path / "x.h5", "--resize", "30", "-q")
+    assert open_dataset(tmp_path / "x.h5").observation_shape == (30, 30, 3)
+    np.savez(tmp_path / "rows.npz", **{name: x.reshape(len(x), -1)[:, :9] for name, x in arrays().items()})
+    refuses(
+        "only pictures can be resized", "import", tmp_path / "rows.npz", "--out", tmp_path / "y.h5", "--resize", "24"
+    )
+
+
+def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
+    """Spec B6: a ``.npy`` file each; what their channels are is kept, and they are made smaller like pictures."""
+    states = np.random.default_rng(0).integers(0, 255, (6, 4, 64, 48, 3), dtype=np.uint8)
+    for number, state in enumerate(states):
+        folder = tmp_path / "goal" / ("positive", "negative", "unlabelled")[number % 3]
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"{number}.npy", state)
+    given = ["import", tmp_path / "goal", "--out", tmp_path / "goal.h5", "--heldout", "0.4", "--resize", "16", "-q"]
+    refuses("stacks of pictures: uint8 (4, 64, 48, 3). Give pictures as uint8", *given)
+    run(*given, "--stack")
+    found = open_dataset(tmp_path / "goal.h5")
+    whole = states[[2, 5]].transpose(0, 2, 3, 1, 4).reshape(2, 16, 4, 12, 4, 12).mean((2, 4))
+    assert np.abs(found.unlabelled() - whole).max() <= 1
+
+
+def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path) -> None:
+    """Spec B6, G1: in a line that is a command and works as it stands; never of what is small, or was made so."""
+    few = {name: states for name, states in arrays().items() if "heldout" not in name}
+    large = {name: states.repeat(5, 1).repeat(4, 2) if states.ndim == 4 else states for name, states in few.items()}
+    np.savez(tmp_path / "it's large.npz", **large)
+    given = [
+        "import",
+        tmp_path / "it's large.npz",
+        "--out",
+        tmp_path / "data.h5",
+        "--seed",
+        "4",
+        "--domain",
+        "montezuma",
+    ]
+    said = run(*given)
+    [line] = [line for line in said.err.splitlines() if "--resize" in line]
+    assert "pictures of 240 x 192 x 3 need much memory and time; add --resize 160 --force" in line
+    assert "--resize" not in run(*given, *line.partition("add ")[2].split()).err
+    after = open_dataset(tmp_path / "data.h5")
+    assert after.observation_shape == (160, 128, 3) and after.domain == "montezuma"

@@ -1,0 +1,419 @@
+"""Recorded episodes: LeRobotDataset, robomimic's HDF5, Minari, films; what is wrong is one line (Spec I6)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+import pytest
+from command_line import refuses, run
+
+from hypogoal.cli import main
+from hypogoal.data import Dataset, open_dataset
+from hypogoal.importing.episodes import kept, split_episodes
+from hypogoal.importing.films import count_frames, frames_at
+from tests.importing import robot_data
+from tests.importing.robot_data import LENGTHS, STATE, TOP, WRIST
+from tests.importing.states import SIDE, save_minari
+from tests.importing.test_pictures import STORED, UPRIGHT
+
+FORMATS = [("v2.1", "video"), ("v3.0", "video"), ("v2.1", "image"), ("v3.0", "image")]
+LABEL = ["--label", "reached=next.success"]
+RIGHT = ["--label", "right=tests.importing.states:at_right"]
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One dataset of each format, ``v3.0-video`` and so on, a robomimic file and a folder of films."""
+    folder = tmp_path_factory.mktemp("recorded")
+    for version, kind in FORMATS:
+        robot_data.write_lerobot(folder / f"{version}-{kind}", version, kind)
+    robot_data.write_robomimic(folder / "demo.hdf5")
+    robot_data.write_films(folder / "takes")
+    return folder
+
+
+def imported(source: Path, out: Path, *words: str) -> Dataset:
+    run("import", source, "--out", out, "-q", "--force", *words)
+    return open_dataset(out)
+
+
+def frames_of(data: Dataset, goal: str = "reached") -> list[tuple[np.ndarray, bool | None]]:
+    """Every state of a file, with its label where it has one."""
+    known = []
+    for part in (data.labelled(goal), data.heldout(goal)):
+        known += zip(part.observations, part.labels.tolist(), strict=True)
+    return known + [(state, None) for state in data.unlabelled()]
+
+
+@pytest.mark.parametrize(("version", "kind"), FORMATS)
+def test_a_lerobot_dataset_is_read_frame_by_frame(datasets: Path, tmp_path: Path, version: str, kind: str) -> None:
+    """Spec I6: each frame once, with its own state, picture and label; whole episodes are held out."""
+    data = imported(datasets / f"{version}-{kind}", tmp_path / "data.h5", *LABEL, "--resize", "64")
+    dtype = data.observation_dtype
+    assert {key: dtype[key].shape for key in dtype.names} == {TOP: (48, 64, 3), WRIST: (64, 64, 3), STATE: (3,)}
+    frames = frames_of(data)
+    assert len(frames) == sum(LENGTHS)
+    met = set()
+    for state, label in frames:
+        at, episode = float(state[STATE][0]), robot_data.episode_of(state[WRIST])
+        met.add((round(at, 4), episode))
+        assert label in (None, at > 0.5 and episode != 2)
+        for key, camera in ((TOP, "top"), (WRIST, "wrist")):
+            whole = robot_data.picture(camera, at, episode)
+            small = np.asarray(state[key], dtype=float)
+            exact = whole.reshape(small.shape[0], whole.shape[0] // small.shape[0], small.shape[1], -1, 3).mean((1, 3))
+            assert np.abs(small - exact).mean() < (0.6 if kind == "image" else 8), "another frame, or other colours"
+    assert met == {(round(float(at), 4), episode) for episode in range(6) for at in robot_data.places(episode)}
+    held = {robot_data.episode_of(state[WRIST]) for state in data.heldout("reached").observations}
+    learned = {robot_data.episode_of(state[WRIST]) for state in data.labelled("reached").observations}
+    assert held and learned and not held & learned
+
+
+@pytest.mark.parametrize("codec", ["libsvtav1", "libx264"])
+def test_films_of_any_codec_hold_the_same_frames(datasets: Path, tmp_path: Path, codec: str) -> None:
+    """LeRobot writes AV1 by default; the pictures are those of the table, up to compression."""
+    if codec not in av.codecs_available:
+        pytest.skip(f"this build of FFmpeg has no {codec}")
+    source = robot_data.write_lerobot(tmp_path / "source", codec=codec)
+    ours = frames_of(imported(source, tmp_path / "ours.h5", *LABEL))
+    exact = frames_of(imported(datasets / "v3.0-image", tmp_path / "exact.h5", *LABEL))
+    for (state, label), (whole, wanted) in zip(ours, exact, strict=True):
+        np.testing.assert_array_equal(state[STATE], whole[STATE])
+        assert label == wanted
+        for key in (TOP, WRIST):
+            assert np.abs(state[key].astype(int) - whole[key].astype(int)).mean() < 4
+
+
+def test_keys_are_chosen_and_one_picture_alone_is_a_picture(datasets: Path, tmp_path: Path) -> None:
+    source, out = datasets / "v3.0-image", tmp_path / "data.h5"
+    assert imported(source, out, *LABEL, "--key", TOP).observation_shape == (96, 128, 3)
+    assert imported(source, out, *LABEL, "--key", STATE).observation_shape == (3,)
+    both = imported(source, out, *LABEL, "--key", TOP, "--key", STATE, "--resize", f"{TOP}=32")
+    assert both.observation_dtype[TOP].shape == (24, 32, 3)
+
+
+def test_labels_of_last_frames_and_of_a_table(datasets: Path, tmp_path: Path) -> None:
+    """Spec I6: the last n frames of successful episodes; a table's frames, where other episodes are unlabelled."""
+    source, out = datasets / "v2.1-image", tmp_path / "data.h5"
+    for state, label in frames_of(imported(source, out, "--key", STATE, "--label", "reached=last:3")):
+        episode = next(e for e in range(6) if np.abs(robot_data.places(e) - state[0]).min() < 1e-6)
+        assert label in (None, state[0] >= robot_data.places(episode)[-3] and episode != 2)
+    table = tmp_path / "labels.csv"
+    table.write_text("episode,from,to\n0,8,12\n1,0,0\n3,7,10\n0,0,1\n")
+    data = imported(source, out, "--key", STATE, "--label", f"reached={table}")
+    assert len(data.unlabelled()) == LENGTHS[2] + LENGTHS[4] + LENGTHS[5]
+    positives = sorted(round(float(state[0]), 4) for state, label in frames_of(data) if label)
+    zero, three = robot_data.places(0), robot_data.places(3)
+    assert positives == sorted(round(float(at), 4) for at in [zero[0], *zero[8:], *three[7:]])
+
+
+def test_every_third_frame_and_the_last(datasets: Path, tmp_path: Path) -> None:
+    assert kept(7, 3).tolist() == [0, 3, 6] and kept(8, 3).tolist() == [1, 4, 7] and kept(2, 5).tolist() == [1]
+    few = imported(datasets / "v3.0-video", tmp_path / "few.h5", *LABEL, "--every", "3")
+    every = imported(datasets / "v3.0-video", tmp_path / "all.h5", *LABEL)
+    assert len(frames_of(few)) == sum(len(kept(length, 3)) for length in LENGTHS)
+    whole = {state[STATE].tobytes(): state.tobytes() for state, _ in frames_of(every)}
+    assert all(whole[state[STATE].tobytes()] == state.tobytes() for state, _ in frames_of(few))
+
+
+def test_episodes_are_split_whole_and_what_is_held_out_stays_so() -> None:
+    """Spec B3: two fifths, two fifths, one fifth of those with labels; the recording's own choice goes first."""
+    for listed, held, sizes in (
+        ([True] * 10, [False] * 10, (4, 4, 2)),
+        ([True] * 3, [False] * 3, (1, 1, 1)),
+        ([True] * 6 + [False] * 4, [False] * 10, (4, 4, 2)),
+        ([True] * 10, [False] * 8 + [True] * 2, (4, 4, 2)),
+        ([True] * 4 + [False] * 2, [True] + [False] * 5, (3, 2, 1)),
+    ):
+        parts = split_episodes(listed, held, 0, "here")
+        assert tuple(map(len, parts)) == sizes and sorted(np.concatenate(parts)) == list(range(len(listed)))
+        assert set(np.flatnonzero(np.array(held) & np.array(listed))) <= set(parts[2])
+        assert not any(held) or all(held[at] for at in parts[2])
+
+
+def test_robomimics_file_is_read(datasets: Path, tmp_path: Path) -> None:
+    """Spec I6: links followed, groups within ``obs`` by their path, ``mask/valid`` held out, texts told."""
+    data = imported(datasets / "demo.hdf5", tmp_path / "data.h5", "--label", "reached=rewards", "--resize", "64")
+    assert data.observation_dtype["agentview_image"].shape == (48, 64, 3)
+    assert len(frames_of(data)) == sum(LENGTHS)
+    for state, label in frames_of(data):
+        assert label in (None, state["robot0_eef_pos"][0] > 0.5)
+    with h5py.File(tmp_path / "merged.hdf5", "w") as file:
+        for demo in range(5):
+            file[f"data/demo_{demo}"] = h5py.ExternalLink(datasets / "demo.hdf5", f"/data/demo_{demo}")
+        file.copy(file["data/demo_0"], "data/demo_7")
+        for demo in file["data"].values():
+            del demo["obs/agentview_image"]
+            demo["obs/arm/speed"] = np.zeros((len(demo["rewards"]), 2))
+            demo["obs/task"] = ["open"] * len(demo["rewards"])
+        file["data/demo_9/obs/robot0_eef_pos"] = np.zeros((0, 3))
+        file["mask/valid"] = np.array([b"demo_1", b"demo_4"])
+    said = run("import", tmp_path / "merged.hdf5", "--out", tmp_path / "m.h5", "--label", "reached=rewards", "-q").err
+    assert "not read: task, neither pictures nor numbers" in said
+    assert "not read: 1 of 7 episodes, without frames" in said
+    held = open_dataset(tmp_path / "m.h5").heldout("reached").observations
+    assert held.dtype.names == ("arm.speed", "robot0_eef_pos") and len(held) == LENGTHS[1] + LENGTHS[4]
+
+
+def test_a_recorder_that_was_killed_is_named(tmp_path: Path) -> None:
+    """Spec G2: HDF5 tells how to clear the mark that it left."""
+    code = (
+        "import h5py, os, sys; f = h5py.File(sys.argv[1], 'w', libver='latest'); f['data/demo_0/obs/x'] = [1.0]; "
+        "f.flush(); os._exit(1)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.hdf5")], check=False)
+    command = ["import", tmp_path / "x.hdf5", "--out", tmp_path / "d.h5", "--label", "a=rewards"]
+    refuses(f"Once it has ended: h5clear -s {tmp_path / 'x.hdf5'}", *command)
+
+
+def test_minari_is_labelled_by_a_function(tmp_path: Path) -> None:
+    """Spec B6: whole episodes are labelled, unlabelled or held out, the same for the same seed."""
+    folder, data = save_minari(tmp_path / "own-v0"), tmp_path / "data.h5"
+    found = imported(folder, data, *RIGHT)
+    counts = found.counts()
+    assert counts["labelled"]["right"] == {"states": 24, "positives": 12}
+    assert counts["heldout"]["right"] == {"states": 12, "positives": 6} and counts["unlabelled"] == 24
+    assert found.config["labels"] == {"right": "tests.importing.states:at_right"}
+    before = found.unlabelled()
+    np.testing.assert_array_equal(imported(folder, data, *RIGHT).unlabelled(), before)
+    nested = save_minari(tmp_path / "nested-v0", nested=True)
+    assert imported(nested, data, *RIGHT, "--key", "image").observation_shape == (SIDE, SIDE, 3)
+    mine = ["--label", "right=tests.importing.test_recordings:goes_right", "--key", "image", "--key", "arm/speed"]
+    states = imported(nested, data, *mine).labelled("right")
+    assert states.labels.sum() == 12 and set(states.observations["arm.speed"][:, 0]) == {0, 2, 4, 6, 8, 10}
+
+
+def goes_right(observation: dict[str, np.ndarray]) -> bool:
+    return observation["arm/speed"][0] % 4 == 2 and bool(observation["image"][20, 35, 0] == 255)
+
+
+def is_unsure(_: np.ndarray) -> Any:
+    return np.nan
+
+
+def write_turned(path: Path, orientation: int) -> None:
+    """A film of two frames whose pixels lie as :data:`STORED` says, with the display matrix that turns them back."""
+    stored = np.ascontiguousarray(STORED[orientation])
+    robot_data.write_film(path, [stored, stored])
+    matrix = {
+        1: (1, 0, 0, 1), 2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1),
+        5: (0, 1, 1, 0), 6: (0, 1, -1, 0), 7: (0, -1, -1, 0), 8: (0, -1, 1, 0),
+    }[orientation]  # fmt: skip
+    data = bytearray(path.read_bytes())
+    place = data.index(b"tkhd") + 44
+    values = [matrix[0] << 16, matrix[1] << 16, 0, matrix[2] << 16, matrix[3] << 16, 0, 0, 0, 1 << 30]
+    data[place : place + 36] = np.array(values, ">i4").tobytes()
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_a_film_is_turned_as_players_turn_it(tmp_path: Path, orientation: int) -> None:
+    write_turned(tmp_path / "x.mp4", orientation)
+    assert count_frames(tmp_path / "x.mp4") == 2
+    [seen] = frames_at(tmp_path / "x.mp4", np.array([1]))
+    assert seen.shape == UPRIGHT.shape
+    assert np.abs(seen[4::16, 4::16].mean(-1) - UPRIGHT[4::16, 4::16].mean(-1)).max() < 40  # colours are compressed
+
+
+def test_a_folder_of_films_is_read(datasets: Path, tmp_path: Path) -> None:
+    """Spec B6: suffixes in any case; the film without labels is unlabelled; what is no film is counted."""
+    takes = tmp_path / "takes"
+    shutil.copytree(datasets / "takes", takes)
+    (takes / "take-1.mp4").rename(takes / "take-1.MP4")
+    (takes / "notes.txt").write_text("x")
+    words = ["--label", f"reached={takes / 'labels.csv'}", "--resize", "64"]
+    said = run("import", takes, "--out", tmp_path / "data.h5", *words, "-q").err
+    assert said == "hypogoal: not read: 1 .txt\n"
+    data = open_dataset(tmp_path / "data.h5")
+    assert data.observation_shape == (48, 64, 3) and len(data.unlabelled()) == LENGTHS[-1]
+    assert len(frames_of(data)) == sum(LENGTHS)
+    for state, label in frames_of(data):
+        bright = np.flatnonzero(state[20, :, 0] > 150).mean()
+        if label is not None and abs(bright - 31.5) > 0.3:  # half a pixel from the middle
+            assert label == (bright > 31.5), bright
+
+
+def test_links_out_of_a_folder_are_followed(datasets: Path, tmp_path: Path) -> None:
+    """Spec I6: as the hub's cache and data-version stores keep files."""
+    cache, snapshot = tmp_path / "blobs", tmp_path / "snapshot"
+    cache.mkdir()
+    for number, file in enumerate(sorted(file for file in (datasets / "v3.0-video").rglob("*") if file.is_file())):
+        shutil.copy(file, cache / str(number))
+        link = snapshot / file.relative_to(datasets / "v3.0-video")
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(cache / str(number), link.parent))
+    plain = imported(datasets / "v3.0-video", tmp_path / "plain.h5", *LABEL)
+    np.testing.assert_array_equal(imported(snapshot, tmp_path / "linked.h5", *LABEL).unlabelled(), plain.unlabelled())
+
+
+def without(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+def cut(name: str, share: float = 0.6) -> Callable[[Path], None]:
+    def work(folder: Path) -> None:
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: int(share * len(whole))])
+
+    return work
+
+
+def info(key: str = "", **changes: object) -> Callable[[Path], None]:
+    """Change the dataset's facts, or those of a feature."""
+
+    def work(folder: Path) -> None:
+        file = folder / "meta" / "info.json"
+        whole = json.loads(file.read_text())
+        (whole["features"][key] if key else whole).update(changes)
+        file.write_text(json.dumps(whole))
+
+    return work
+
+
+def other_film(camera: str, count: int, fps: int = robot_data.FPS) -> Callable[[Path], None]:
+    frames = [robot_data.picture(camera, 0.5, 0)] * count
+    return lambda folder: robot_data.write_film(folder / f"videos/{TOP}/chunk-000/file-000.mp4", frames, fps)
+
+
+FILM = f"videos/{WRIST}/chunk-000/file-001.mp4"
+TABLE, LIST = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (without(FILM), "no such file"),
+        (cut(FILM), "file-001.mp4"),  # which cannot be read, or whose frames do not match the table
+        (cut(FILM, 0), "this cannot be read"),
+        (other_film("top", 5), " s: its frames do not match the table"),
+        (other_film("top", 60, 3), " s: its frames do not match the table"),
+        (other_film("wrist", 60), "states differ in size"),
+        (cut(TABLE), "this cannot be read"),
+        (without(TABLE), "no such file"),
+        (cut(LIST), "this cannot be read"),
+        (without(LIST), "the list of episodes is empty"),
+        (cut("meta/info.json"), "this cannot be read"),
+        (info(codebase_version="v1.6"), "the format v1.6 is not read"),
+        (info(features=[1]), "this cannot be read"),
+        (info(fps=0), "this cannot be read"),
+        (info(data_path="{nothing}"), "this cannot be read"),
+        (info(STATE, shape=[4]), "this cannot be read"),
+        (info(STATE, dtype="string"), "no observation 'observation.state'"),
+    ],
+)
+def test_a_damaged_dataset_is_one_line(
+    datasets: Path, tmp_path: Path, damage: Callable[[Path], None], words: str
+) -> None:
+    """Spec G2: what, where, what to do; nothing half-written."""
+    source = tmp_path / "source"
+    shutil.copytree(datasets / "v3.0-video", source)
+    damage(source)
+    keys = ["--key", TOP, "--key", WRIST, "--key", STATE]
+    refuses(words, "import", source, "--out", tmp_path / "data.h5", *LABEL, *keys)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("episode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
+        ("episode,from,to\n0,0,99\n", "a label is of frames '0' up to '99', episode 0 has 12"),
+        ("episode,from,to\n0,5,2\n", "frames '5' up to '2'"),
+        ("episode,from,to\n0,a,2\n", "frames 'a' up to '2'"),
+        ("episode,from,to\n0,1\n", "frames '1' up to ''"),
+        ("take,begin\n0,1\n", "has no column 'episode'"),
+        ("episode;from;to\n0;1;2\n", "Give a CSV file, with commas"),
+        ("\ufeffepisode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
+        ("episode,from,to\n0,1,2\n", "1 episodes cannot be labelled, held out"),
+    ],
+)
+def test_labels_that_fit_no_frame_are_one_line(datasets: Path, tmp_path: Path, table: str, words: str) -> None:
+    (tmp_path / "labels.csv").write_text(table)
+    rule = ["--label", f"reached={tmp_path / 'labels.csv'}", "--key", STATE]
+    refuses(words, "import", datasets / "v3.0-image", "--out", tmp_path / "data.h5", *rule)
+
+
+@pytest.mark.parametrize(
+    ("source", "words", "said"),
+    [
+        ("v3.0-image", [], "nothing says where the sub-goal holds"),
+        ("v3.0-image", ["--label", "a"], "--label needs NAME=RULE"),
+        ("v3.0-image", ["--label", "a=next.sucess"], "no column 'next.sucess' to label by"),
+        ("v3.0-image", ["--label", "a=last:0"], "the number of last frames is not above 0"),
+        ("v3.0-image", ["--label", "a=missing.csv"], "no such file: missing.csv"),
+        ("v3.0-image", [*LABEL, "--key", "observation.stat"], "no observation 'observation.stat'"),
+        ("v3.0-image", [*LABEL, "--resize", "big"], "--resize needs a number of pixels"),
+        ("v3.0-image", [*LABEL, "--group", "task"], "--group is for arrays"),
+        ("demo.hdf5", ["--label", "a=actions"], "no column 'actions' to label by"),
+        ("takes", ["--label", "a=last:3", "--key", "top"], "It has video"),
+        ("takes", ["--label", "a=rewards"], "Its columns are none"),
+        (
+            "takes",
+            ["--label", "a=tests.importing.test_recordings:is_unsure"],
+            "the label function gave neither True nor False: nan",
+        ),
+        ("takes", ["--label", "a=tests.importing.test_recordings:goes_right"], "the label function raised IndexError"),
+    ],
+)
+def test_what_is_not_there_is_one_line(
+    datasets: Path, tmp_path: Path, source: str, words: list[str], said: str
+) -> None:
+    refuses(said, "import", datasets / source, "--out", tmp_path / "data.h5", *words)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words", "said"),
+    [
+        ({"episodes": 2}, RIGHT, "2 episodes cannot be"),
+        ({"jpeg": True}, RIGHT, "Make it with jpeg_encoding=False"),
+        ({"nested": True}, [*RIGHT, "--key", "imag"], "Did you mean 'image'"),
+        ({"nested": True}, [*RIGHT, "--key", "task"], "no observation 'task'"),
+    ],
+)
+def test_what_is_wrong_with_minari_is_one_line(
+    tmp_path: Path, settings: dict[str, Any], words: list[str], said: str
+) -> None:
+    folder = save_minari(tmp_path / "own-v0", **settings)
+    refuses(said, "import", folder, "--out", tmp_path / "data.h5", *words)
+
+
+@pytest.mark.parametrize("source", ["v2.1-video", "v3.0-image", "demo.hdf5", "takes"])
+def test_whatever_is_damaged_is_read_or_refused(
+    datasets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str
+) -> None:
+    """Spec G2: bytes changed, cut off or doubled anywhere: a data file, or one line and none."""
+    outcomes = set()
+    for case in range(12):
+        rng, place = np.random.default_rng(case), tmp_path / f"{case}-{source}"
+        (shutil.copytree if (datasets / source).is_dir() else shutil.copy)(datasets / source, place)
+        files = sorted(file for file in ([place] if place.is_file() else place.rglob("*")) if file.is_file())
+        damaged = files[int(rng.integers(len(files)))]
+        values = bytearray(damaged.read_bytes())
+        for at in rng.integers(len(values), size=int(rng.choice((1, 8, 64)))):
+            values[at] = int(rng.integers(256))
+        damaged.write_bytes(values[: int(rng.integers(len(values)))] if case % 3 == 0 else values)
+        label = {"demo.hdf5": "a=rewards", "takes": f"a={place / 'labels.csv'}"}.get(source, "a=next.reward")
+        out = tmp_path / f"{case}.h5"
+        code = main(["import", str(place), "--out", str(out), "--label", label, "--resize", "48", "-q"])
+        lines = capsys.readouterr().err.splitlines()
+        outcomes.add(code)
+        assert (code, out.exists()) in ((0, True), (2, False)), lines
+        assert code == 0 or (len(lines) == 1 and lines[0].startswith("hypogoal: ")), lines
+    assert 2 in outcomes, "nothing was refused: are the files damaged at all?"
+
+
+def test_the_extra_is_named_where_it_is_missing(
+    datasets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    words = ["import", datasets / "v3.0-video", "--out", tmp_path / "data.h5", *LABEL]
+    refuses("this needs av, which is not installed. pip install 'hypogoal[lerobot]'", *words)
