@@ -29,8 +29,9 @@ def parts_of(path: Path) -> list[Path]:
     artefacts = [manifest.parent for manifest in visible(path, MANIFEST)]
     data = [file for file in visible(path, "*.h5") if file.parent not in artefacts]
     if not (artefacts or data or unfinished(path)):
-        what = "no artefact and no data file here" if path.exists() else "no such file or folder"
-        raise UserError(what, path, "Give what a stage wrote.")
+        if not path.exists():
+            raise UserError("no such file or folder", path, "Check the path.")
+        raise UserError("no artefact and no data file here", path, "Give what a stage wrote.")
     return [*data, *artefacts]
 
 
@@ -93,7 +94,8 @@ def _summary(numbers: Mapping[str, Any], path: str) -> list[str]:
     from hypogoal.evaluation.questions import summary_table
 
     try:
-        return drawn(summary_table(numbers), WIDTH).splitlines()
+        table = drawn(summary_table(numbers), WIDTH)
+        return [line.rstrip() for line in table.splitlines()]
     except (LookupError, TypeError, ValueError, AttributeError):
         raise UserError("the evaluation's numbers are damaged", path, "Evaluate the run again.") from None
 
@@ -112,15 +114,17 @@ def lines(details: Mapping[str, Any]) -> list[str]:
     if details["kind"] == "run":
         return [lines(part)[0] for part in details["parts"]]
     facts = dict(details)
-    numbers = facts.pop("numbers")
+    numbers, config = facts.pop("numbers"), facts.pop("config")
+    heading = f"{facts.pop('path')}: {facts.pop('kind')}"
     logged = [f"{name} {round(value, 4):g}" for name, value in numbers.items() if isinstance(value, float)]
-    text = ["; ".join([f"{facts.pop('path')}: {facts.pop('kind')}", *filter(None, [", ".join(logged)])])]
+    text = [f"{heading}; {', '.join(logged)}" if logged else heading]
+    texts = {"command": shlex.join, "inputs": _inputs, "files": ", ".join}
     for name, value in facts.items():
-        if name == "config":
-            text += ["config:", *(f"  {key}={_typed(setting)}" for key, setting in value.items())]
-        else:
-            known = {"command": shlex.join, "inputs": _inputs, "files": ", ".join}.get(name, _typed)
-            text += textwrap.wrap(f"{name}: {known(value)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+        as_text = texts.get(name, _typed)
+        text += _wrapped(f"{name}: {as_text(value)}")
+    text.append("config:")
+    for name, value in config.items():
+        text += _wrapped(f"  {name}={_typed(value)}")
     return text
 
 
@@ -133,6 +137,10 @@ def _typed(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_typed(part)}" for name, part in value.items())
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _wrapped(line: str) -> list[str]:
+    return textwrap.wrap(line, WIDTH, subsequent_indent="    ", break_on_hyphens=False, break_long_words=False)
 
 
 def faults(path: Path) -> list[str]:
