@@ -2,7 +2,7 @@
 
 import shlex
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,7 @@ def lines(details: Mapping[str, Any]) -> list[str]:
     heading = f"{facts.pop('path')}: {facts.pop('kind')}"
     logged = [f"{name} {round(value, 4):g}" for name, value in numbers.items() if isinstance(value, float)]
     text = [f"{heading}; {', '.join(logged)}" if logged else heading]
-    texts = {"command": shlex.join, "inputs": _inputs, "files": ", ".join}
+    texts: dict[str, Callable[[Any], str]] = {"command": shlex.join, "inputs": _inputs, "files": ", ".join}
     for name, value in facts.items():
         as_text = texts.get(name, _typed)
         text += _wrapped(f"{name}: {as_text(value)}")
