@@ -188,23 +188,12 @@ def fixed(text: str) -> NDArray[np.bytes_]:
     return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
 
 
-def write_dataset(
-    path: Path,
-    collected: Collected,
-    *,
-    domain: str,
-    config: Mapping[str, Any],
-    seed: int,
-    force: bool = False,
-) -> None:
-    """Write collected states; the file appears under its name only once it is complete.
+def write_dataset(path: Path, collected: Collected, *, domain: str, config: Mapping[str, Any], seed: int) -> None:
+    """Write collected states; a file of that name is replaced once the new one is complete.
 
-    Raises ``UserError`` if a name cannot be a file name, labels are not truth values, or the file exists.
+    Raises ``UserError`` if a name cannot be a file name or labels are not truth values.
     """
     require_names(collected.sub_goals)
-    if path.exists() and not force:
-        raise UserError("the output exists already", path, "Choose another place, or give force=True to replace it.")
-    path.parent.mkdir(parents=True, exist_ok=True)
     attributes: dict[str, Any] = {
         "format": DATA_FORMAT,
         "domain": domain,
@@ -227,11 +216,6 @@ def write_dataset(
         file.attrs.modify("complete", True)
 
 
-def write_observations(group: Any, observations: Observations) -> None:
-    """Write ``observations`` to an HDF5 group, in compressed chunks of up to 64 states."""
-    _store(group, "observations", observations, 64, compression="gzip", compression_opts=1)
-
-
 def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
     """A group for each sub-goal; the same states are stored once, with a hard link in each group."""
     labels = np.asarray(states.labels)
@@ -251,7 +235,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
 
 
 def _write_states(group: Any, states: States) -> None:
-    write_observations(group, states.observations)
+    _store(group, "observations", states.observations, 64, compression="gzip", compression_opts=1)
     for name, values in states.origins.items():
         if not plain_name(name):
             raise UserError("an origin's name must be usable as a file name", repr(name), "Leave out separators.")

@@ -91,7 +91,7 @@ class Visited(Resumable):
         none = States(self.engine.room_for(0, None), np.zeros((0, len(sub_goals)), np.bool_))
         collected = Collected(self.engine.observation_shape, sub_goals, none, self.states(), none)
         named = {"domain": ensemble_config["domain"], "config": ensemble_config["domain_config"]}
-        write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)
+        write_dataset(folder / VISITED, collected, **named, seed=seed)
 
     def snapshot(self) -> dict[str, Any]:
         digests = sorted(self._kept)

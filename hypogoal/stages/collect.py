@@ -39,7 +39,7 @@ def collect(
         kept = {"kept": draft.checkpoints} if domain.resumes else {}
         with Progress(f"collect {name}", total=1, quiet=quiet) as progress:
             collected = domain.collect(config, seed, progress, **kept)
-        write_dataset(draft.files / out.name, collected, domain=name, config=settings, seed=seed, force=True)
+        write_dataset(draft.files / out.name, collected, domain=name, config=settings, seed=seed)
     if name not in BUILT_IN:
         warnings = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
         for line in warnings + hard_to_judge(collected.heldout.labels, collected.sub_goals):

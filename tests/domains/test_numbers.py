@@ -95,7 +95,7 @@ def test_collected_numbers_are_kept_with_their_names(tmp_path: Any) -> None:
     place = data.labelled("left-end").observations[:, 9]
     np.testing.assert_array_equal(data.labelled("left-end").labels, place == 0)
     found.unlabelled.observations[0, 0] = np.nan
-    write_dataset(path, found, domain="own", config={}, seed=0, force=True)
+    write_dataset(path, found, domain="own", config={}, seed=0)
     with pytest.raises(UserError, match="not finite"):
         open_dataset(path).unlabelled()
 
