@@ -151,9 +151,8 @@ def reading(path: Path, subject: str = "the data file", do: str = RECOLLECT) -> 
         with h5py.File(path, "r", locking="best-effort") as file:
             yield file
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise UserError(
-            f"{subject} cannot be read: {os.strerror(error.errno)}", path, "Is it the right path?"
-        ) from None
+        what = os.strerror(error.errno or 0).lower()
+        raise UserError(f"{subject} cannot be read: {what}", path, "Is it the right path?") from None
     except UNREADABLE as error:
         what = str(error)
         if "h5clear" in what:

@@ -111,7 +111,7 @@ def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
     refuses(f"{made_with} diversity=dbat, not none", *resumed(tiny_run, "ensemble", "--diversity", "none"))
     refuses(f"{made_with} seed=0, not 3", *resumed(tiny_run, "ensemble", "--seed", "3"))
     refuses(f"{made_with} other inputs", *resumed(tiny_run, "ensemble", "--unlabelled", str(data)))
-    refuses("No such file", "train-ensemble", tiny_run / "none.h5", "--out", ensemble, "--resume")
+    refuses("no such file", "train-ensemble", tiny_run / "none.h5", "--out", ensemble, "--resume")
     refuses("not of kind 'meta': it is of kind", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
     refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", meta, "--resume")
     refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
@@ -146,8 +146,8 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("train-ensemble {none}.h5 --out {out}", "No such file"),
-        ("train-ensemble {ensemble} --out {out}", "Is a directory"),
+        ("train-ensemble {none}.h5 --out {out}", "no such file"),
+        ("train-ensemble {ensemble} --out {out}", "is a directory"),
         ("train-meta {data} --out {out}", "not an artefact"),
         ("train-meta {made}/options --out {out}", "'options' artefact, but ensemble is needed"),
         ("train-meta {ensemble} --options {ensemble} --out {out}", "but options is needed"),
@@ -198,7 +198,7 @@ def test_mistakes(places: dict[str, Path], line: str, words: str) -> None:
 def test_a_failed_force_keeps_the_old_artefact(tiny_copy: Path) -> None:
     """Spec G2: nothing lost."""
     out = tiny_copy / "ensemble"
-    refuses("No such file", "train-ensemble", tiny_copy / "none.h5", "--out", out, "--force")
+    refuses("no such file", "train-ensemble", tiny_copy / "none.h5", "--out", out, "--force")
     run("verify", out)
 
 

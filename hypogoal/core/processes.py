@@ -37,7 +37,9 @@ def stop(number: int, _frame: FrameType | None) -> None:
 
 def cores() -> int:
     """How many cores this process may use: those the system allows, or fewer with ``HYPOGOAL_CORES``."""
-    return allowed(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+    count = len(affinity(0)) if affinity else os.cpu_count()
+    return allowed(count or 1)
 
 
 def allowed(wanted: int) -> int:
@@ -65,14 +67,17 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (own_code.environment(),))
     try:
-        futures = {pool.submit(_run, task): number for number, task in enumerate(tasks)}
-        processes = set(multiprocessing.active_children()) - others
+        futures = {}
+        for number, task in enumerate(tasks):
+            futures[pool.submit(_run, task)] = number
+            processes |= set(multiprocessing.active_children()) - others
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
+        pool.shutdown()  # waits for their exit codes
         raise _broken(processes) from None
     except BaseException:
-        _terminate(processes)
+        _terminate(set(multiprocessing.active_children()) - others)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -98,7 +103,7 @@ def _run(task: Callable[[], T]) -> T:
         return task()
     except KeyboardInterrupt:  # the pool would give this process the next task
         os._exit(128 + signal.SIGTERM)
-    except Exception as error:
+    except BaseException as error:
         user_error = own_code.of_user(error)  # its place is only known here: tracebacks are not sent to the parent
         if user_error is None:
             raise
@@ -107,7 +112,7 @@ def _run(task: Callable[[], T]) -> T:
 
 def _broken(processes: Iterable[BaseProcess]) -> Killed:
     """Why a pool broke."""
-    if any((process.exitcode or 0) > 0 for process in processes):
+    if 1 in [process.exitcode for process in processes]:
         do = "In a script call hypogoal below 'if __name__ == \"__main__\":', or give workers=1."
         return Killed("a process of the stage could not start", None, do)
     do = f"Run fewer at once: --set workers=1, or {CORES}=1 in the environment."

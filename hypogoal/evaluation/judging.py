@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.processes import in_processes
+from hypogoal.core.processes import in_processes, prepare
 from hypogoal.core.progress import Progress
 from hypogoal.data import States, fixed, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
@@ -202,8 +202,6 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
 
 def judge(case: Case) -> Judged:
     """What the members of one case say."""
-    from hypogoal.core.processes import prepare
-
     prepare()
     split, unlabelled = states_of(case.data, case.sub_goal)
     ensemble = case.read()
