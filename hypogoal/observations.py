@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from hypogoal.core.files import plain_names
 
 PICTURE, NUMBERS = np.dtype(np.uint8), np.dtype(np.float32)
-MAX_SIDE = 1 << 16
 DType: TypeAlias = np.dtype[Any]
 Shape: TypeAlias = tuple[int, ...]
 KINDS: dict[str, DType] = {"uint8": PICTURE, "float32": NUMBERS}
