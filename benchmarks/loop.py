@@ -73,9 +73,8 @@ def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: s
     """
     from hypogoal.meta import training
     from hypogoal.options.termination import Terminations
-    from hypogoal.stages import train_meta
 
-    judge, played = Terminations.of, 0.0
+    judge, loop, played = Terminations.of, training.train, 0.0
     judging = [0.0]
 
     def of(self: Terminations, ids: Any) -> Any:
@@ -88,11 +87,11 @@ def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: s
         nonlocal played
         judging[0] = 0.0
         begin = time.process_time()
-        training.train(*given)
+        loop(*given)
         played = time.process_time() - begin
 
     changes = (word for pair in ("random_episodes=1", f"steps={steps}", *more) for word in ("--set", pair))
-    with patch.object(Terminations, "of", of), patch.object(train_meta, "train", train):
+    with patch.object(Terminations, "of", of), patch.object(training, "train", train):
         out = folder / f"out-{time.monotonic_ns()}"
         quietly("train-meta", ensemble, "--layout-seed", LAYOUT, "--out", out, *changes)
     shares.append(judging[0] / played)

@@ -20,9 +20,10 @@ def command_line() -> str:
     import typer
     from typer.cli import get_docs_for_click
 
-    from hypogoal.cli import app
+    from hypogoal.cli import app, commands
 
-    command = typer.main.get_command(app)
+    command: Any = typer.main.get_command(app)
+    command.commands = commands()
     context = typer.Context(command) if not isinstance(command, click.Command) else click.Context(command)
     return get_docs_for_click(obj=command, ctx=context, name="hypogoal", title="Command line")
 

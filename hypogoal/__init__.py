@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.24.0"
 
 if TYPE_CHECKING:
-    from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options
-    from hypogoal.api import train_ensemble, train_meta, train_options  # isort: skip
+    from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options, report
+    from hypogoal.api import train_baseline, train_ensemble, train_meta, train_options  # isort: skip
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium_domain import GymnasiumDomain
     from hypogoal.hypotheses.wrappers import SubgoalReward
@@ -22,8 +22,9 @@ _LAZY = {
     "UserError": "hypogoal.core.errors",
 }
 __all__ = [
-    "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "UserError", "__version__", "collect",
-    "compare", "evaluate", "load_ensemble", "load_options", "train_ensemble", "train_meta", "train_options",
+    "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "UserError", "__version__", "collect", "compare",
+    "evaluate", "load_ensemble", "load_options", "report", "train_baseline", "train_ensemble", "train_meta",
+    "train_options",
 ]  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import csv
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.config import parse_integers
-from hypogoal.core.errors import Complete
 from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
 from hypogoal.domains.base import Domain
@@ -65,8 +63,7 @@ def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, A
 
 def collect_once(domain: Domain, config: Any, path: Path) -> None:
     """Collect into ``path``: go on where a killed study stopped, keep what is complete."""
-    with contextlib.suppress(Complete):
-        collect(domain, config, path, resume=True, quiet=True)
+    collect(domain, path, resume=True, quiet=True, **vars(config))
 
 
 def run_cells(

@@ -25,8 +25,6 @@ from hypogoal.core.processes import in_processes
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
 from hypogoal.domains.montezuma_ladders import GROUPS
 from hypogoal.evaluation.distance import NEAR, option_numbers
-from hypogoal.hypotheses.config import TrainEnsembleConfig
-from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
@@ -67,8 +65,7 @@ def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
     if not (out / "manifest.json").exists():
         usual = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1}
         settings = usual | {"steps": length(groups, method)} | METHODS[method][1]
-        config = TrainEnsembleConfig(**settings)
-        train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
+        train_ensemble(work / f"groups-{groups}.h5", out, seed=seed, force=True, quiet=True, **settings)
     return out
 
 
@@ -77,8 +74,7 @@ def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> li
     ensemble = ensemble_of(work, groups, ENSEMBLES.get(method, method), seed)
     out = work / f"options-{groups}-{method}-{seed}-{ladder}"
     usual = {**DOMAIN.defaults["train-options"], "start": ladder, "steps": STEPS}
-    config = TrainOptionsConfig(**(usual | METHODS[method][2]))
-    train_options(ensemble, config, out, seed=seed, force=True, quiet=True)
+    train_options(ensemble, out, seed=seed, force=True, quiet=True, **(usual | METHODS[method][2]))
     executions = Executions.read(out / "executions.csv")
     members = open_artefact(out, "options").config["members"]
     trained = open_artefact(ensemble, "ensemble").config["steps"]

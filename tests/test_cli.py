@@ -184,7 +184,6 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("evaluate {none}", "no such run: "),
         ("report {none}", "no such run: "),
         ("report {made} --format pdf", "--format is for --figures"),
-        ("report {made} --figures {out} --videos 2", "--videos is for the page"),
         ("config bake", "no such stage"),
         ("train-meta", "--help"),
         ("frobnicate", "--help"),

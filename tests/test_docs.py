@@ -81,15 +81,13 @@ def test_the_site_builds_and_needs_no_network(site: Path) -> None:
 
 def test_the_reference_is_that_of_the_code(site: Path) -> None:
     """Every command and every setting of every stage is in the reference."""
-    from typer.main import get_command
-
-    from hypogoal.cli import app
+    from hypogoal.cli import commands as made_commands
     from hypogoal.core.config import describe
     from hypogoal.experiments.run import config_class_of
     from hypogoal.settings import STAGES
 
     pages = {name: (site / f"reference/{name}.html").read_text(encoding="utf-8") for name in ("cli", "settings")}
-    for name in get_command(app).commands:  # type: ignore[attr-defined]
+    for name in made_commands():
         assert f"<code>hypogoal {name}</code>" in pages["cli"], name
     for stage in STAGES:
         for row in describe(config_class_of(stage)):
@@ -113,11 +111,9 @@ def test_the_tutorial_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_the_other_pages_name_commands_that_are_there() -> None:
     """A command in any page is one of ours with options that it has."""
-    from typer.main import get_command
+    from hypogoal.cli import commands as made_commands
 
-    from hypogoal.cli import app
-
-    ours = get_command(app).commands  # type: ignore[attr-defined]
+    ours = made_commands()
     seen = 0
     for page in (*DOCS.rglob("*.md"), ROOT / "README.md"):
         for words in commands(page):

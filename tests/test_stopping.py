@@ -116,7 +116,7 @@ import os, signal, sys
 import hypogoal.cli
 
 said = hypogoal.cli.notes_of
-hypogoal.cli._commands = lambda: lambda **_: os.kill(os.getpid(), signal.SIGINT)
+hypogoal.cli._called = lambda words: os.kill(os.getpid(), signal.SIGINT)
 hypogoal.cli.notes_of = lambda error: os.kill(os.getpid(), signal.SIGINT) or said(error)
 sys.exit(hypogoal.cli.main())
 """
@@ -146,7 +146,7 @@ STOPPED_AT_ONCE = """
 import os, signal, sys
 import hypogoal.cli
 
-hypogoal.cli._commands = lambda: lambda **_: os.kill(os.getpid(), signal.SIGTERM)
+hypogoal.cli._called = lambda words: os.kill(os.getpid(), signal.SIGTERM)
 sys.exit(hypogoal.cli.main())
 """
 
@@ -154,7 +154,7 @@ sys.exit(hypogoal.cli.main())
 STOPPED_WHILE_PARSING = """
 import os, signal, sys
 import hypogoal.cli
-from hypogoal.cli.common import TyperGroup
+from typer.core import TyperGroup
 
 TyperGroup.parse_args = lambda *_: os.kill(os.getpid(), signal.SIGTERM)
 sys.exit(hypogoal.cli.main())

@@ -5,28 +5,32 @@ its positive predictions. So options are learned that end at these, and the trut
 up.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.domains.base import Engine
-from hypogoal.evaluation.exploits import option_numbers
+from hypogoal.evaluation.exploits import COLUMNS, TABLE, option_numbers
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.pictures import episode_gif
 from hypogoal.evaluation.selection import states_met
-from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.episodes import Frame
-from hypogoal.observations import PICTURE
+from hypogoal.observations import PICTURE, Standard
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
+from hypogoal.options.tables import read_table
+from hypogoal.options.termination import Terminations, rule_of
 
 POLICIES = ("before", "mended")
 CHUNK = 256  # observations that own code is given at once
@@ -64,6 +68,54 @@ def member_of(ensemble: Ensemble, member: int) -> Classifier:
         return ensemble.log_odds(engine.images(ids))[:, member]
 
     return classify
+
+
+@dataclass(frozen=True)
+class Target:
+    """A classifier to audit."""
+
+    classify: Classifier
+    threshold: float  # the probability above which its prediction is positive
+    standard: Standard | None = None  # of observations that are no pictures; None: unknown
+    domain_config: Mapping[str, Any] = field(default_factory=dict)  # of the world that its data were collected in
+    inputs: Sequence[Path] = ()
+
+
+def target_of(name: str, sub_goal: str, member: int, domain: str, device: str) -> Target:
+    """A member of an ensemble artefact, or ``module:function``; anything else is a ``UserError``."""
+    if ":" in name and not Path(name).is_dir():
+        return Target(own_classifier(name), THRESHOLD)
+    source = open_artefact(Path(name), "ensemble")
+    ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
+    classify, threshold = member_of(ensemble, member), float(ensemble.thresholds[member])
+    world = source.config["domain_config"] if source.config["domain"] == domain else {}
+    return Target(classify, threshold, ensemble.view.standard, world, [source.path])
+
+
+def terminations_of(
+    classify: Classifier, edges: NDArray[np.float64], termination: str
+) -> Callable[[Engine], Terminations]:
+    """A function of an engine: options that end at a classifier's positives, one for each threshold (K,)."""
+
+    def ends(engine: Engine) -> Terminations:
+        def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
+            return np.repeat(classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
+
+        rule, length = rule_of(termination)
+        return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
+
+    return ends
+
+
+def report_of(loop: OptionLoop, edges: Sequence[float], sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
+    """Each policy's findings, and the threshold that it learned against; None for a policy that was not wanted."""
+    table = read_table(folder / TABLE, COLUMNS)
+    report: dict[str, Any] = dict.fromkeys(POLICIES)
+    for option, (name, edge) in enumerate(zip(POLICIES, edges, strict=False)):
+        ended = float(1 / (1 + np.exp(-loop.terminations.thresholds[option])))  # a rule may have changed it
+        threshold = edge if math.isclose(ended, edge, rel_tol=1e-6) else ended  # float32 log-odds round it
+        report[name] = {"threshold": threshold, **findings(loop, table, option, sub_goals, folder)}
+    return report
 
 
 def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict[str, Any]:

@@ -5,19 +5,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import curves, distance, hypotheses, page, rooms
-from hypogoal.evaluation.numbers import Metrics, Rows, grouped
+from hypogoal.evaluation.numbers import Metrics, Rows, grouped, plain
 from hypogoal.evaluation.page import Block, Column, Drawn, Entry, Material
 from hypogoal.evaluation.plots import PALETTE, STYLES
 from hypogoal.evaluation.provenance import domains_of
+from hypogoal.evaluation.questions import meanings
 from hypogoal.evaluation.table import Pairs, Row, compared, select
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
 Curves = Mapping[str, Mapping[str, NDArray[Any]]]  # a run's label -> the arrays of its learning curves
+TABLES = ("agents", "hypotheses", "rooms", "distance")
 LADDERS = [page.label("method", "method"), rooms.N]
 
 
@@ -57,6 +60,27 @@ def why_not(runs: Runs) -> str | None:
         if any(text != texts[0] for text in texts) and not (reason.startswith("they have") and shared(runs)):
             return f"{reason} ({'; '.join(map(': '.join, zip(runs, map(', '.join, texts), strict=True)))})"
     return None
+
+
+def comparison_of(paths: Sequence[Path], runs: Runs, rows: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
+    """What ``metrics.json`` of a comparison holds: what the runs are, how they differ, who wins."""
+    described = []
+    for (label, metrics), path in zip(runs.items(), paths, strict=True):
+        artefacts = metrics["provenance"]["artefacts"]
+        layouts = {artefact["config"]["layout_seed"] for artefact in artefacts if "layout_seed" in artefact["config"]}
+        seeds = {artefact["seed"] for artefact in artefacts}
+        about = {"artefacts": len(artefacts), "seeds": sorted(seeds), "layout_seeds": sorted(layouts)}
+        described.append({"label": label, "path": str(path), **about})
+    comparison = {
+        "runs": described,
+        "domains": domains_of(next(iter(runs.values()))),
+        "shared": shared(runs),
+        "differences": differences(runs),
+        "comparisons": plain(compare_runs(rows)),
+    }
+    for table in TABLES:
+        comparison[table] = {label: metrics[table] for label, metrics in runs.items()}
+    return comparison | {"quantities": meanings()}
 
 
 def shared(runs: Runs) -> list[str]:

@@ -1,8 +1,10 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
+from pathlib import Path
+from typing import Any
 
 from rich.console import Group
 from rich.table import Table
@@ -21,9 +23,13 @@ from hypogoal.evaluation import (
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.numbers import Metrics
+from hypogoal.evaluation.judging import Case, Work, judgements
+from hypogoal.evaluation.numbers import Metrics, plain
 from hypogoal.evaluation.page import WIDTH, Drawn, Material, Question, draw_page, listed, packaged
-from hypogoal.evaluation.provenance import domains_of, provenance_section
+from hypogoal.evaluation.provenance import domains_of, provenance, provenance_section
+from hypogoal.evaluation.run import FORMAT, most_used
+from hypogoal.evaluation.table import Row, compared
+from hypogoal.learners.episodes import LAST
 
 # In the order of the page; the numbers of one are there for those below it.
 PARTS = (
@@ -33,9 +39,66 @@ PARTS = (
 QUESTIONS: list[Question] = [part.QUESTION for part in PARTS]
 
 
+SETTINGS = {"window": LAST, "solved": curves.SOLVED}
+LADDERS = {"executions": LAST, "inside_counts": distance.INSIDE, "near": distance.NEAR}  # of runs with ladders alone
+
+
 def agents_last() -> list[Question]:
     """In the order in which lines are told: where a page begins with the agents, a terminal ends with them."""
     return [*QUESTIONS[1:], QUESTIONS[0]]
+
+
+def judge_ensembles(work: Work, cases: Sequence[tuple[int, Case]], workers: int) -> None:
+    """Show the questions every ensemble of the run on its data's held-out and unlabelled states.
+
+    Of one ensemble, the first of those with the most members, example states and attributions are kept too; of one,
+    the one with the most members whose options were learned most often, states to browse.
+    """
+    configs = [artefact.config for artefact in work.contents.ensembles]
+    work.shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
+    work.browsed = most_used(work.contents)
+    rows: list[list[Row]] = [[] for _ in configs]
+    for judgement in judgements(cases, workers, work.progress.advance):
+        for question in QUESTIONS:
+            rows[judgement.number] += question.look(work, judgement)
+        work.progress.advance()
+    for of_ensemble in rows:
+        work.rows += of_ensemble
+
+
+def answer(work: Work) -> None:
+    """Ask each question for its rows and its part of the numbers."""
+    for question in QUESTIONS:
+        work.rows += question.rows(work)
+        work.metrics |= question.view(work)
+
+
+def metrics_of(work: Work, settings: Mapping[str, Any], data: Sequence[Path], missing: Sequence[str]) -> Metrics:
+    """What ``metrics.json`` holds."""
+    contents = work.contents
+    pairs = [question.pairs for question in QUESTIONS if question.pairs]
+    return plain(
+        {
+            "format": FORMAT,
+            "run": contents.run.resolve().name,
+            "settings": {**settings, **(LADDERS if contents.ladders else {})},
+            "missing": missing,
+            **work.metrics,
+            "comparisons": {by.name: compared(work.rows, by) for by in pairs},
+            "provenance": provenance(contents, data),
+            "quantities": meanings(),
+        }
+    )
+
+
+def missing(work: Work) -> list[str]:
+    """One line for everything of section F that this run has no artefacts for.
+
+    A run with ladders is asked for what Figures 3 to 5 need, one with agents for those that Figure 6 has beside them.
+    """
+    lines = [] if work.contents.ensembles else ["no ensemble"]
+    lines += [line for question in agents_last() for line in question.missing(work)]
+    return lines
 
 
 def meanings() -> dict[str, dict[str, str]]:

@@ -44,7 +44,14 @@ DONE, RUNNING, FAILED, WAITING = "done", "running", "failed", "waiting"
 STOPPED = (0, 128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)  # no failures
 # Libraries use one thread per process, unless the user sets these.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-SLOW = ("torch._dynamo", "networkx", "h5py", "minigrid")  # imports that stages put off until they need them
+SLOW = ("torch._dynamo", "networkx", "h5py", "minigrid", "hypogoal.cli")  # imports that cells put off
+OF_STAGES = {  # imports that stages put off
+    "train-ensemble": "hypogoal.hypotheses.sub_goals",
+    "train-options": "hypogoal.meta.training",
+    "train-meta": "hypogoal.meta.training",
+    "train-baseline": "hypogoal.learners.baselines.agents",
+    "evaluate": "hypogoal.evaluation.questions",
+}
 POLL_SECONDS, REPORT_SECONDS = 0.05, 15.0
 MOST_SHOWN = 20
 
@@ -302,8 +309,8 @@ def _starter(cells: Sequence[Cell], run: Path, forked: bool | None) -> Callable[
         forked = sys.platform == "linux" and not any("cuda" in word for cell in cells for word in cell.words)
     context: Any = multiprocessing.get_context("forkserver" if forked else "spawn")
     if forked:
-        stages = {f"hypogoal.stages.{cell.stage.replace('-', '_')}" for cell in cells}
-        context.set_forkserver_preload([*SLOW, "hypogoal.cli", *sorted(stages)])
+        modules = {OF_STAGES[cell.stage] for cell in cells if cell.stage in OF_STAGES}
+        context.set_forkserver_preload([*SLOW, *sorted(modules)])
 
     def start(cell: Cell, cores: int) -> Any:
         own = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores), **environment()}

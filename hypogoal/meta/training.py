@@ -272,6 +272,14 @@ def check_fit(
             raise UserError(fault, trained.path, f"Give --set {key}={before[key]}, or leave it out.")
 
 
+def inherited(trained: Artefact | None, fixed: Sequence[str]) -> dict[str, Any]:
+    """The settings of trained options that hold where they are continued; of many layouts, any may be played."""
+    if trained is None:
+        return {}
+    anywhere = bool(trained.config["layouts"])
+    return {name: trained.config[name] for name in fixed if name != "layout_seed" or not anywhere}
+
+
 def options_of(ensemble_config: Mapping[str, Any], config: PlayConfig) -> int:
     """How many options an ensemble's sub-goals have: one for each member, or for each truth."""
     return len(ensemble_config["sub_goals"]) * (1 if config.termination == ORACLE else ensemble_config["members"])

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
-from hypogoal.data import Collected, States, write_dataset
+from hypogoal.data import Collected, Dataset, States, open_dataset, write_dataset
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.observations import Observations
 
@@ -109,3 +111,23 @@ class Visited(Resumable):
         self._kept = {digest: (picture, origin) for digest, picture, origin in rows}
         self._worst = [-digest for digest in self._kept]
         heapq.heapify(self._worst)
+
+
+def unlabelled_file(path: Path, dataset: Dataset) -> Path:
+    """Spec B7: the file of unlabelled states: ``path``, or the file of an artefact with visited states.
+
+    No such file, or one of another domain or shape than ``dataset``, is a ``UserError``.
+    """
+    file = path / VISITED if path.is_dir() else path
+    if path.is_dir() and VISITED not in open_artefact(path, "options", "meta").manifest.files:
+        raise UserError("no visited states", path, "Make it with --set save_visited=N.")
+    source = open_dataset(file)
+    for name, value, expected in (
+        ("the domain", source.domain, dataset.domain),
+        ("observations of shape", source.observation_shape, dataset.observation_shape),
+        ("observations of type", source.observation_dtype, dataset.observation_dtype),
+    ):
+        if value != expected:
+            do = "Give unlabelled states that fit the data."
+            raise UserError(f"{name} {value}, the data have {expected}", file, do)
+    return file

@@ -1,55 +1,265 @@
-"""Stages with settings, by name: what commands and the functions of :mod:`hypogoal.api` share."""
+"""The stages, one file each. A stage is one function: from it come a command and a Python function of the same name.
 
-from collections.abc import Mapping
-from importlib import import_module
+``@stage(...)`` makes of ``train_meta(call, ensemble, *, options=None)`` the command ``hypogoal train-meta ENSEMBLE
+--options PATH --out OUT`` and the function ``hypogoal.train_meta(ensemble, out, options=...)``, with the same
+arguments, settings and checks. What takes time to import is imported when it is called, so that ``--help`` is quick.
+"""
+
+import functools
+import inspect
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from inspect import Parameter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Option
 
 from hypogoal.core import own_code
-from hypogoal.settings import configuration
+from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.terminal import say
 
-PLACE = "layout_seed"  # options of many layouts may be played in any
+if TYPE_CHECKING:
+    from hypogoal.core.training import Training
+    from hypogoal.made import Made
+
+Place = str | os.PathLike[str]
+WIDTH = 100  # of tables
+STAGES: dict[str, "Stage"] = {}  # by command, those that were imported
+
+Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
+Preset = Annotated[str | None, Option("--preset", help="demo, paper, or your .toml file.")]
+SET = "Change a setting; see 'hypogoal config'. Repeatable."
+Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET)]
+Seed = Annotated[int, Option("--seed", help="Seed of all randomness.")]
+Device = Annotated[str, Option("--device", help="Where to train: auto (the CPU), cpu or cuda.")]
+Force = Annotated[bool, Option("--force", metavar="", help="Replace what is at --out.")]
+RESUME = "Continue an unfinished output; keep a complete one."
+Resume = Annotated[bool, Option("--resume", metavar="", help=RESUME)]
+Quiet = Annotated[bool, Option("--quiet", "-q", metavar="", help="Show no progress.")]
+BOARD = "Also write the log for TensorBoard into this folder (pip install 'hypogoal\\[tensorboard]')."
+Tensorboard = Annotated[Path | None, Option("--tensorboard", metavar="DIR", help=BOARD)]
 
 
-def make(
-    stage: str, source: str | Path, out: Path, settings: Mapping[str, Any], preset: str | None = None, **rest: Any
-) -> Any:
-    """Run ``stage`` with the user's ``settings`` on its ``source``; returns what the stage returns.
+@dataclass(frozen=True)
+class Call:
+    """One call of a stage: where it writes, and how it was asked for."""
 
-    The source is a domain's name, which the user typed, or a data file or ensemble, which names its domain.
-    ``module:object`` may be loaded if it is among the settings, not if it is in a preset.
+    stage: str
+    out: Path
+    preset: str | None = None
+    typed: Mapping[str, Any] = field(default_factory=dict)  # settings: options and --set, or arguments in Python
+    seed: int = 0
+    device: str = "auto"
+    force: bool = False
+    resume: bool = False
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise UserError("a seed is 0 or more", f"seed {self.seed}", "Give another one.")
+
+    def settings(self, domain: str, inherited: Mapping[str, Any] | None = None) -> Any:
+        """The stage's settings: defaults, the domain's, the preset's, those of continued options, the typed ones."""
+        from hypogoal.settings import configuration
+
+        return configuration(self.stage, domain, self.preset, (), self.typed, inherited=inherited)
+
+    def training(
+        self,
+        kind: str,
+        config: Mapping[str, Any],
+        inputs: Sequence[Path],
+        steps: int,
+        tensorboard: Path | None = None,
+    ) -> "AbstractContextManager[Training]":
+        """The draft of an artefact in training, see :func:`hypogoal.core.training.training`."""
+        from hypogoal.core.training import training
+
+        return training(
+            self.stage,
+            self.out,
+            steps=steps,
+            quiet=self.quiet,
+            tensorboard=tensorboard,
+            kind=kind,
+            config=config,
+            inputs=inputs,
+            seed=self.seed,
+            force=self.force,
+            resume=self.resume,
+        )
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a stage says at its end."""
+
+    lines: Sequence[str] = ()
+    then: Sequence[object] = ()  # the words of the next command
+    path: Path | None = None  # where to look, if not where the stage says by default
+
+
+def stage(
+    example: str,
+    *,
+    often: Sequence[str] = (),
+    leaves_out: Sequence[str] = (),
+    into: str = "",
+    page: str = "",
+) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
+    """Make a function a stage. It gets a :class:`Call`, then what it works on, then inputs of its own by name.
+
+    Args:
+        example: a command, with which ``--help`` ends.
+        often: the settings changed most, options of the command.
+        leaves_out: options of all stages that this one has not.
+        into: what it writes by default, a name within what it works on.
+        page: the file of its output to look at, if not the output itself.
     """
-    from hypogoal.domains.base import load_domain
 
-    own_code.allow([source, *settings.values()])
-    domain = source if isinstance(source, str) else domain_of(source, stage)
-    inherited = inherited_of(stage, rest["options"]) if rest.get("options") else {}
-    config = configuration(stage, domain, preset, (), settings, inherited=inherited)
-    first: Any = source
-    if stage == "collect":
-        first, rest["name"] = load_domain(domain), domain
-    return named(stage)(first, config, out, **rest)
+    def register(function: Callable[..., Done]) -> Callable[..., "Made"]:
+        it = Stage(function, example, often, leaves_out, into, page)
+        STAGES[it.name] = it
 
+        @functools.wraps(function)
+        def made(source: Any, out: Place | None = None, **arguments: Any) -> "Made":
+            return it.made(source, out, arguments)
 
-def inherited_of(stage: str, options: Path) -> dict[str, Any]:
-    """The settings of trained options that hold for a stage which continues them, unless others are given."""
-    from hypogoal.core.artefacts import open_artefact
+        made.__signature__ = it.signature  # type: ignore[attr-defined]
+        return made
 
-    trained = open_artefact(options, "options").config
-    fixed = import_module(named(stage).__module__).FIXED
-    return {name: trained[name] for name in fixed if name != PLACE or not trained["layouts"]}
+    return register
 
 
-def named(stage: str) -> Any:
-    """The function of a stage, imported when needed."""
-    name = stage.replace("-", "_")
-    return getattr(import_module(f"hypogoal.stages.{name}"), name)
+class Stage:
+    """A function that ``@stage`` decorates."""
+
+    def __init__(
+        self,
+        function: Callable[..., Done],
+        example: str,
+        often: Sequence[str],
+        leaves_out: Sequence[str],
+        into: str,
+        page: str,
+    ):
+        self.function, self.example, self.often, self.into, self.page = function, example, often, into, page
+        self.name = function.__name__.replace("_", "-")
+        _, self.source, *self.inputs = inspect.signature(function).parameters.values()
+        self.out, *shared = inspect.signature(_shared).parameters.values()
+        self.shared = [_keyword(option) for option in shared if option.name not in leaves_out]
+        if into:
+            by_default: Any = Option("--out", help=f"Default: {self.source.name.upper()}/{into}.")
+            self.out = self.out.replace(default=None, annotation=Annotated[Path | None, by_default])
+
+    @property
+    def signature(self) -> inspect.Signature:
+        """Of the Python function: settings are further arguments."""
+        keywords = [*self.inputs, *(option for option in self.shared if option.name != "set_")]
+        settings = Parameter("settings", Parameter.VAR_KEYWORD)
+        return inspect.Signature([self.source, self.out.replace(default=None), *keywords, settings])
+
+    def made(self, source: Any, out: Place | None, arguments: Mapping[str, Any]) -> "Made":
+        """Run it from Python; ``arguments`` that are no options are settings."""
+        from hypogoal.core.processes import own_settings
+        from hypogoal.made import Made
+
+        own_code.allow([source, *arguments.values()])
+        values: dict[str, Any] = {}
+        typed = dict(arguments)
+        for parameter in (*self.inputs, *self.shared):
+            if parameter.name in typed:
+                values[parameter.name] = _as_path(parameter, typed.pop(parameter.name))
+        with own_settings():
+            call, _ = self.run(_as_path(self.source, source), out, values, typed)
+        return Made(call.out)
+
+    def command(self) -> Any:
+        """The command of the command line."""
+        from hypogoal.core.config import parse_assignments
+
+        def called(**values: Any) -> None:
+            source, out = values.pop(self.source.name), values.pop("out")
+            chosen = {name: values.pop(name) for name in self.often}
+            typed = {name: value for name, value in chosen.items() if value is not None}
+            typed |= parse_assignments(values.pop("set_", None) or ())
+            call, done = self.run(source, out, values, typed)
+            if not call.quiet:
+                for line in done.lines:
+                    say(line)
+                if done.then:
+                    say(f"next: {own_code.command(*done.then)}")
+            say(done.path or call.out / self.page)
+
+        parameters = [*map(_keyword, (self.source, *self.inputs, self.out, *self.shared))]
+        called.__signature__ = inspect.Signature([*parameters, *_options(self.name, self.often)])  # type: ignore[attr-defined]
+        called.__doc__ = inspect.cleandoc(self.function.__doc__ or "").partition("\n\n")[0]
+        alone = typer.Typer(add_completion=False)
+        alone.command(self.name, epilog=f"Example:\n\n[bold]hypogoal {self.example}[/bold]")(called)
+        return typer.main.get_command(alone)
+
+    def run(
+        self, source: Any, out: Place | None, values: dict[str, Any], typed: Mapping[str, Any]
+    ) -> tuple[Call, Done]:
+        """Call the function with the ``values`` of options. What is complete already, with ``resume``, is kept."""
+        inputs = {each.name: values.pop(each.name) for each in self.inputs if each.name in values}
+        call = Call(self.name, Path(out) if out else Path(source, self.into), typed=typed, **values)
+        try:
+            return call, self.function(call, source, **inputs)
+        except Complete as complete:
+            say(complete, err=True)
+            return call, Done()
 
 
-def domain_of(source: Path, stage: str) -> str:
-    """The domain of a stage's source, a data file or an ensemble."""
-    from hypogoal.core.artefacts import open_artefact
-    from hypogoal.data import open_dataset
+def _shared(
+    out: Out,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """The options of all stages."""
 
-    data = stage == "train-ensemble"
-    return open_dataset(source).domain if data else str(open_artefact(source, "ensemble").config["domain"])
+
+def _keyword(parameter: Parameter) -> Parameter:
+    return parameter.replace(kind=Parameter.KEYWORD_ONLY)
+
+
+def _options(stage: str, often: Sequence[str]) -> list[Parameter]:
+    """Options that are short for ``--set``. Values stay text, read as those of ``--set``."""
+    if not often:
+        return []
+    from hypogoal.core.config import describe
+    from hypogoal.settings import CONFIGS
+
+    rows = {row["name"]: row for row in describe(CONFIGS[stage])}
+    panel = f"Settings, with doorkey's defaults (all: hypogoal config {stage})"
+    options = []
+    for name in often:
+        row = rows[name]
+        choices = f" ({row['allowed']})" if "|" in row["allowed"] else ""
+        text = f"{row['meaning'][0].upper()}{row['meaning'][1:]}{choices}. [dim]\\[default: {row['default']}][/dim]"
+        option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
+        options.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option]))
+    return options
+
+
+def _as_path(parameter: Parameter, value: Any) -> Any:
+    """What Python gives for a path: a text, a path or what a stage made; or several."""
+    if value is None or "Path" not in str(parameter.annotation):
+        return value
+    return [*map(Path, value)] if isinstance(value, list | tuple) else Path(value)
+
+
+def outcome_of(numbers: Mapping[str, Any]) -> list[str]:
+    """The results of training as a line. NaN (no episode has ended) is left out: the number of episodes says it too."""
+    texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in numbers.items()}
+    told = ", ".join(f"{name} {text}" for name, text in texts.items() if text != "nan")
+    return [told] if told else []

@@ -1,54 +1,86 @@
 """Spec A1, B3: collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
+from typer import Argument
 
 from hypogoal.core.artefacts import DATA, create
 from hypogoal.core.config import as_dict
+from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
-from hypogoal.data import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
-from hypogoal.domains.base import BUILT_IN, Domain
-from hypogoal.options.config import OptionConfig
+from hypogoal.stages import Call, Done, stage
+
+DOMAINS = "doorkey, montezuma, rooms, or module:object."
 
 
-def collect(
-    domain: Domain,
-    config: Any,
-    out: Path,
-    *,
-    name: str | None = None,
-    seed: int = 0,
-    force: bool = False,
-    resume: bool = False,
-    quiet: bool = False,
-) -> dict[str, Any]:
-    """Collect ``domain``'s states into the HDF5 file ``out``, with an instance of its ``config_class``.
+@stage("collect doorkey --out data/doorkey.h5", leaves_out=["device"])
+def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
+    """Collect labelled, unlabelled and held-out states.
 
-    ``name``, by default the domain's own, is the one by which later stages find it. ``resume``: continue an unfinished
-    output, for domains that can. Returns numbers of states and positives per split and sub-goal.
+    ``domain`` is a name, or in Python a ``Domain``, which later stages find by its own name, in this process only.
+    ``out`` is an HDF5 file. ``resume`` continues an unfinished one, of domains that can.
     """
-    require_names(domain.sub_goals)  # before play, not when the file is written
-    name, settings = name or domain.name, as_dict(config)
-    about = settings | {"domain": name}
-    with create(out, kind=DATA, config=about, seed=seed, force=force, resume=resume) as draft:
-        if domain.doubt:
-            say(f"hypogoal: {domain.doubt}", err=True)
-        kept = {"kept": draft.checkpoints} if domain.resumes else {}
-        with Progress(f"collect {name}", total=1, quiet=quiet) as progress:
-            collected = domain.collect(config, seed, progress, **kept)
-        write_dataset(draft.files / out.name, collected, domain=name, config=settings, seed=seed)
+    from hypogoal.data import open_dataset, require_names, write_dataset
+    from hypogoal.domains.base import BUILT_IN, load_domain
+    from hypogoal.look import count_lines
+
+    name = _name_of(domain)
+    played = load_domain(name)
+    require_names(played.sub_goals)  # before play, not when the file is written
+    config = call.settings(name)
+    settings = as_dict(config)
+    with create(
+        call.out,
+        kind=DATA,
+        config=settings | {"domain": name},
+        seed=call.seed,
+        force=call.force,
+        resume=call.resume,
+    ) as draft:
+        if played.doubt:
+            say(f"hypogoal: {played.doubt}", err=True)
+        kept = {"kept": draft.checkpoints} if played.resumes else {}
+        with Progress(f"collect {name}", total=1, quiet=call.quiet) as progress:
+            collected = played.collect(config, call.seed, progress, **kept)
+        write_dataset(draft.files / call.out.name, collected, domain=name, config=settings, seed=call.seed)
     if name not in BUILT_IN:
-        warnings = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
-        for line in warnings + hard_to_judge(collected.heldout.labels, collected.sub_goals):
+        for line in _doubts(played, collected, call.quiet):
             say(f"hypogoal: {line}", err=True)
-        if "step" in collected.labelled.origins and "option_timeout" not in domain.defaults.get("train-options", {}):
-            soonest = (collected.labelled.origins["step"][held].min() for held in collected.labelled.labels.T)
-            apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
-            if 2 * apart > OptionConfig.option_timeout and not quiet:
-                message = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
-                do = f"train-options --option-timeout {2 * apart} gives options time for that"
-                say(f"hypogoal: {message}: {do}", err=True)
-    return open_dataset(out).counts()
+    run = call.out.parent if call.out.name == "data.h5" else Path("runs", call.out.stem)
+    return Done(count_lines(open_dataset(call.out).counts()), ("train-ensemble", call.out, "--out", run / "ensemble"))
+
+
+def _name_of(domain: Any) -> str:
+    """The name by which later stages find a domain."""
+    from hypogoal.domains.base import BUILT_IN, REGISTERED, load_domain
+
+    if isinstance(domain, str):
+        return domain
+    if domain.name in BUILT_IN and load_domain(domain.name) is not domain:
+        raise UserError("this domain has the name of one of hypogoal's", domain.name, "Give it another name.")
+    REGISTERED[domain.name] = domain
+    return str(domain.name)
+
+
+def _doubts(domain: Any, collected: Any, quiet: bool) -> list[str]:
+    """What may be hard about the states of a domain of the user's own."""
+    import numpy as np
+
+    from hypogoal.data import GET_MORE, hard_to_judge, hard_to_learn
+    from hypogoal.options.config import OptionConfig
+
+    lines = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
+    lines += hard_to_judge(collected.heldout.labels, collected.sub_goals)
+    steps = collected.labelled.origins.get("step")
+    if quiet or steps is None or "option_timeout" in domain.defaults.get("train-options", {}):
+        return lines
+    soonest = [steps[holds].min() for holds in collected.labelled.labels.T]
+    apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
+    if 2 * apart > OptionConfig().option_timeout:
+        lines.append(
+            f"play took up to {apart} steps from one sub-goal to the next, each at its earliest: "
+            f"train-options --option-timeout {2 * apart} gives options time for that"
+        )
+    return lines

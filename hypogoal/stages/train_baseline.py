@@ -2,76 +2,81 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from typer import Argument, Option
 
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.processes import prepare
-from hypogoal.core.tensors import save_tensors
-from hypogoal.core.training import training
-from hypogoal.data import open_dataset
-from hypogoal.domains.base import load_domain, require_one_kind
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
-from hypogoal.meta.training import check_start, cut, played_world, write_layout
-from hypogoal.observations import PICTURE, standard_of
-from hypogoal.options.tables import Episodes
+from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
+
+DOMAINS = "doorkey, montezuma, rooms, or module:object."
 
 
+@stage(
+    "train-baseline doorkey --agent ppo --out runs/mine/ppo",
+    often=["agent", "steps", "layout_seed", "setting"],
+)
 def train_baseline(
-    domain: str,
-    config: BaselineConfig,
-    out: Path,
+    call: Call,
+    domain: Annotated[str, Argument(help=DOMAINS)],
     *,
-    data: Path | None = None,
-    seed: int = 0,
-    force: bool = False,
-    resume: bool = False,
-    quiet: bool = False,
-    device: str = "auto",
-    tensorboard: Path | None = None,
-) -> dict[str, Any]:
-    """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
+    data: Annotated[Path | None, Option(help="Play in the world where these states were collected.")] = None,
+    tensorboard: Tensorboard = None,
+) -> Done:
+    """Train PPO or DQN on primitive actions, to compare.
 
-    With ``data``, states of the domain, it plays in the world they are of; else in that of the domain's defaults.
-    ``tensorboard``, a folder, gets the numbers of the log.
-    Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states of
-    another domain, or an ``out`` that exists is a ``UserError``, NaN or Inf in a weight a ``NumericalError``.
+    Without ``data`` it plays in the world of the domain's defaults. ``tensorboard``, a folder, gets the numbers of the
+    log.
     """
+    from hypogoal.core.processes import prepare
+    from hypogoal.core.tensors import save_tensors
+    from hypogoal.domains.base import load_domain, require_one_kind
     from hypogoal.learners.baselines.agents import train, weights
     from hypogoal.learners.baselines.engine_env import EngineEnv
+    from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+    from hypogoal.meta.training import check_start, cut, played_world, write_layout
+    from hypogoal.observations import PICTURE, standard_of
+    from hypogoal.options.tables import Episodes
 
-    device = prepare(device)
-    inputs = [data] if data else []
+    device = prepare(call.device)
+    config = call.settings(domain)
     played = load_domain(domain)
-    lived: dict[str, Any] = {}
-    if data:
-        dataset = open_dataset(data)
-        if dataset.domain != domain:
-            fault = f"these are states of {dataset.domain!r}, not of {domain!r}"
-            raise UserError(fault, data, "Name their domain.")
-        lived = played.world(dataset.config)
-    world = played_world(played, lived, config.world)
-    begins: dict[str, str] = {}
+    dataset = _states_of(domain, data) if data else None
+    world = played_world(played, played.world(dataset.config) if dataset else {}, config.world)
+    begins = {"start": config.start} if config.start else {}
     if config.start:
         check_start(played, config.start)
-        begins = {"start": config.start}
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world, **begins)
     cut(engine, config.cap)
     require_one_kind(engine)
-    if data and engine.observation_dtype != PICTURE:
-        engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
-    settings = as_dict(config) | {"domain": domain, "domain_config": world}
-    settings |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
-    artefact: dict[str, Any] = {"kind": "baseline", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
-    with training("train-baseline", out, **how, **artefact) as work:
+    if dataset and engine.observation_dtype != PICTURE:
+        engine.standard = standard_of(engine.observation_shape, dataset.unlabelled())
+    settings = as_dict(config) | {
+        "domain": domain,
+        "domain_config": world,
+        "environments": chosen.environments,
+        "hyperparameters": as_dict(chosen),
+    }
+    with call.training("baseline", settings, [data] if data else [], config.steps, tensorboard) as work:
         env = EngineEnv(engine)
-        agent = train(env, chosen, config.steps, seed, work.log, work.progress, work.checkpoints, device)
+        agent = train(env, chosen, config.steps, call.seed, work.log, work.progress, work.checkpoints, device)
         work.progress.update(config.steps)
         Episodes.of_rows(env.episodes).write(work.folder)
         save_tensors(work.folder / "policy.safetensors", weights(agent))
-        write_layout(work.folder, engine, config.layout_seed, config.random_episodes, seed, **begins)
-    return env.episodes.counts() | env.episodes.recent()
+        write_layout(work.folder, engine, config.layout_seed, config.random_episodes, call.seed, **begins)
+    return Done(outcome_of(env.episodes.counts() | env.episodes.recent()), ("evaluate", call.out.parent))
+
+
+def _states_of(domain: str, data: Path) -> Any:
+    """A data file of states of the domain; of another one they are refused."""
+    from hypogoal.data import open_dataset
+
+    dataset = open_dataset(data)
+    if dataset.domain != domain:
+        fault = f"these are states of {dataset.domain!r}, not of {domain!r}"
+        raise UserError(fault, data, "Name their domain.")
+    return dataset

@@ -5,23 +5,12 @@ count in every curve.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from typer import Argument, Option
 
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.core.processes import prepare
-from hypogoal.core.training import training
-from hypogoal.domains.base import load_domain
-from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import (
-    assemble,
-    check_fit,
-    continue_with,
-    description,
-    start_arguments,
-    train,
-    write_trained,
-)
-from hypogoal.options.tables import Episodes
+from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
 
 FIXED = (  # as of the options trained before
     *("network", "recurrence", "embedding", "termination"),
@@ -30,51 +19,55 @@ FIXED = (  # as of the options trained before
 WORLD = ("domain_config", "cap", "max_episode_steps")  # where these differ, the agent does not count practice episodes
 
 
+@stage(
+    "train-meta runs/mine/ensemble --out runs/mine/meta",
+    often=["steps", "layout_seed", "network", "termination", "chooser"],
+)
 def train_meta(
-    ensemble: Path,
-    config: TrainMetaConfig,
-    out: Path,
+    call: Call,
+    ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
-    options: Path | None = None,
-    seed: int = 0,
-    force: bool = False,
-    resume: bool = False,
-    quiet: bool = False,
-    device: str = "auto",
-    tensorboard: Path | None = None,
-) -> dict[str, Any]:
-    """Train the meta-policy over an ensemble's options, or over these ``options``, and write the artefact ``out``.
+    options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
+    tensorboard: Tensorboard = None,
+) -> Done:
+    """Learn from the reward which options to choose.
 
-    ``tensorboard``, a folder, gets the numbers of the log.
-    Returns steps, episodes, and success and length over the last 100 episodes.
+    Options start fresh, or continue as those of an ``options`` artefact. ``tensorboard``, a folder, gets the numbers of
+    the log.
     """
-    device = prepare(device)
+    from hypogoal.core.processes import prepare
+    from hypogoal.domains.base import load_domain
+    from hypogoal.meta import training
+    from hypogoal.options.tables import Episodes
+
+    device = prepare(call.device)
     source = open_artefact(ensemble, "ensemble")
     practice = open_artefact(options, "options") if options else None
+    config = call.settings(source.config["domain"], training.inherited(practice, FIXED))
     if practice:
-        check_fit(practice, source, config, FIXED)
-    inputs = [ensemble, options] if options else [ensemble]
+        training.check_fit(practice, source, config, FIXED)
     domain = load_domain(source.config["domain"])
-    start_arguments(domain, config, 1, seed)  # refuse an impossible start before any work
-    settings = description(domain, source.config, config, **steps_spent(practice))
-    artefact: dict[str, Any] = {"kind": "meta", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    how: dict[str, Any] = {"steps": config.steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
-    with training("train-meta", out, **how, **artefact) as work:
-        loop = assemble(domain, source.path, source.config, config, seed, device)
-        recorder = loop.recorder
+    training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
+    settings = training.description(domain, source.config, config, **_steps_spent(practice))
+    inputs = [ensemble, options] if options else [ensemble]
+    with call.training("meta", settings, inputs, config.steps, tensorboard) as work:
+        loop = training.assemble(domain, source.path, source.config, config, call.seed, device)
         if practice:
-            continue_with(loop, practice)
-            recorder.start_at(practice.config.get("ended_at", practice.config["steps"]))
+            training.continue_with(loop, practice)
+            loop.recorder.start_at(practice.config.get("ended_at", practice.config["steps"]))
             if all(practice.config[key] == settings[key] for key in WORLD):
-                recorder.episodes.extend(Episodes.read(practice.path / Episodes.FILE).rows())
-        train(loop, config.steps, work.log, work.progress, work.checkpoints)
-        write_trained(work.folder, loop, domain, source.config, config, seed)
-    return recorder.episodes.counts() | recorder.episodes.recent()
+                loop.recorder.episodes.extend(Episodes.read(practice.path / Episodes.FILE).rows())
+        training.train(loop, config.steps, work.log, work.progress, work.checkpoints)
+        training.write_trained(work.folder, loop, domain, source.config, config, call.seed)
+    episodes = loop.recorder.episodes
+    return Done(outcome_of(episodes.counts() | episodes.recent()), ("evaluate", call.out.parent))
 
 
-def steps_spent(practice: Artefact | None) -> dict[str, int]:
+def _steps_spent(practice: Artefact | None) -> dict[str, Any]:
     """Steps of ``train-options``, for the manifest: as many as were asked for, and where it ended before."""
     if practice is None:
         return {"options_steps": 0}
-    ended = {"options_ended_at": practice.config["ended_at"]} if "ended_at" in practice.config else {}
-    return {"options_steps": practice.config["steps"], **ended}
+    spent = {"options_steps": practice.config["steps"]}
+    if "ended_at" in practice.config:
+        spent["options_ended_at"] = practice.config["ended_at"]
+    return spent

@@ -1,76 +1,79 @@
 """Spec A3: learn every member's option policy while options are chosen at random, for a time or until that succeeds."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from typer import Argument, Option
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.processes import prepare
-from hypogoal.core.training import training
-from hypogoal.domains.base import load_domain
-from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.meta.training import (
-    assemble,
-    check_fit,
-    continue_with,
-    description,
-    distances_of,
-    options_of,
-    start_arguments,
-    train,
-    write_trained,
+from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
+
+FIXED = ("network", "recurrence", "embedding", "termination")  # as of the options trained before
+
+
+@stage(
+    "train-options runs/mine/ensemble --out runs/mine/options",
+    often=["steps", "layout_seed", "network", "termination", "option_timeout"],
 )
-
-# As of the options trained before.
-FIXED = ("network", "recurrence", "embedding", "termination")
-
-
 def train_options(
-    ensemble: Path,
-    config: TrainOptionsConfig,
-    out: Path,
+    call: Call,
+    ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
-    options: Path | None = None,
-    seed: int = 0,
-    force: bool = False,
-    resume: bool = False,
-    quiet: bool = False,
-    device: str = "auto",
-    tensorboard: Path | None = None,
-) -> dict[str, Any]:
-    """Train the options of an ensemble artefact, or train ``options`` further, and write the artefact ``out``.
+    options: Annotated[Path | None, Option(help="Continue these options, perhaps elsewhere.")] = None,
+    tensorboard: Tensorboard = None,
+) -> Done:
+    """Learn an option (a policy) for every member.
 
-    ``tensorboard``, a folder, gets the numbers of the log.
-    Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
-    begins an episode, instead of these two the shares of ``recorder.recent``. With ``until`` also ``ended``: by what.
+    ``options``, an artefact, are trained further. ``tensorboard``, a folder, gets the numbers of the log.
     """
-    device = prepare(device)
+    from hypogoal.core.processes import prepare
+    from hypogoal.domains.base import load_domain
+    from hypogoal.meta import training
+
+    device = prepare(call.device)
     source = open_artefact(ensemble, "ensemble")
     practice = open_artefact(options, "options") if options else None
+    config = call.settings(source.config["domain"], training.inherited(practice, FIXED))
     if practice:
-        check_fit(practice, source, config, FIXED)
-    inputs = [ensemble, options] if options else [ensemble]
+        training.check_fit(practice, source, config, FIXED)
     domain = load_domain(source.config["domain"])
-    start_arguments(domain, config, 1, seed)  # refuse an impossible start before any work
-    steps = config.steps * (options_of(source.config, config) if config.steps_for == "each" else 1)
-    settings = description(domain, source.config, config, steps=steps)
-    artefact: dict[str, Any] = {"kind": "options", "config": settings, "seed": seed, "inputs": inputs, "force": force}
-    how: dict[str, Any] = {"steps": steps, "quiet": quiet, "resume": resume, "tensorboard": tensorboard}
-    with training("train-options", out, **how, **artefact) as work:
-        loop = assemble(domain, source.path, source.config, config, seed, device)
+    training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
+    count = training.options_of(source.config, config)
+    steps = config.steps * (count if config.steps_for == "each" else 1)
+    settings = training.description(domain, source.config, config, steps=steps)
+    inputs = [ensemble, options] if options else [ensemble]
+    with call.training("options", settings, inputs, steps, tensorboard) as work:
+        loop = training.assemble(domain, source.path, source.config, config, call.seed, device)
         if practice:
-            continue_with(loop, practice)
-        recorder = loop.recorder
-        solved = train(loop, steps, work.log, work.progress, work.checkpoints, config.until)
+            training.continue_with(loop, practice)
+        solved = training.train(loop, steps, work.log, work.progress, work.checkpoints, config.until)
         if domain.measures and loop.engine.position_names:
             sub_goals = source.config["sub_goals"]
-            each = options_of(source.config, config) // len(sub_goals)
-            recorder.write_executions(work.folder, distances_of(domain, sub_goals, each))
-        write_trained(work.folder, loop, domain, source.config, config, seed)
+            away = training.distances_of(domain, sub_goals, count // len(sub_goals))
+            loop.recorder.write_executions(work.folder, away)
+        training.write_trained(work.folder, loop, domain, source.config, config, call.seed)
         if config.until:
-            settings |= {"ended_at": recorder.steps, "until_reached": solved}  # for the manifest, which comes last
+            settings |= {"ended_at": loop.recorder.steps, "until_reached": solved}  # for the manifest, which comes last
+    return Done(outcome_of(_numbers(loop.recorder, config, solved)), _next(call, ensemble, config))
+
+
+def _numbers(recorder: Any, config: Any, solved: bool) -> dict[str, Any]:
+    """Steps, episodes, and success and length over the last 100 of random choice; with ``until`` what ended it.
+
+    Where each option begins an episode, instead of these two the shares of ``recorder.recent``.
+    """
     recent = recorder.recent(restarted=True) if config.restart_options else recorder.episodes.recent()
-    counts: dict[str, Any] = {**recorder.episodes.counts(), **recent}
+    numbers: dict[str, Any] = {**recorder.episodes.counts(), **recent}
     if config.until:
         goal = f"until={config.until:g}"
-        counts["ended"] = f"by {goal}" if solved else f"by the limit, {goal} not reached"
-    return counts
+        numbers["ended"] = f"by {goal}" if solved else f"by the limit, {goal} not reached"
+    return numbers
+
+
+def _next(call: Call, ensemble: Path, config: Any) -> tuple[object, ...]:
+    """Choose among the options; where each began an episode, no episodes are left to choose in."""
+    run = call.out.parent
+    if config.restart_options:
+        return "evaluate", run
+    preset = ["--preset", call.preset] if call.preset else []
+    return "train-meta", ensemble, "--options", call.out, *preset, "--out", run / "meta"

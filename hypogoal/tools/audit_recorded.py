@@ -1,49 +1,17 @@
 """Spec I6: an audit of an ensemble on its recorded data, where there is no simulator to play in."""
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hypogoal.core.artefacts import TO_FILL_IN, Artefact, create, open_artefact, versions
+from hypogoal.core.artefacts import Artefact, create, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import write_table
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
-from hypogoal.data import States, joined, open_dataset
-from hypogoal.evaluation import page, recorded
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Block
-from hypogoal.evaluation.pictures import image_png
-from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
+from hypogoal.evaluation.recorded_page import draw, findings_of, lines_of, look_at, write_next
 from hypogoal.importing.labels import COLUMNS
-from hypogoal.observations import Observations, digest, spread_rows
-
-COMPARED = 4_000  # unlabelled states, spread over the file
-SHOWN = 4  # negatives and pairs of a member on the page
-NEXT, CARDS = 100, 20  # states to label next in the table, and on the page
-REJECTED = 500  # states among which the nearest is sought that a member rejects
-
-
-@dataclass(frozen=True)
-class Look:
-    """One sub-goal's ensemble on its data."""
-
-    sub_goal: str
-    ensemble: Ensemble
-    known: States  # labelled and held out
-    known_scores: NDArray[np.float32]  # (N, K)
-    unlabelled: Observations  # (M, *obs)
-    scores: NDArray[np.float32]  # (M, K)
-
-    @property
-    def thresholds(self) -> NDArray[np.float32]:
-        """Of the members, (K,)."""
-        return self.ensemble.thresholds.cpu().numpy()
 
 
 def audit_recorded(
@@ -54,199 +22,42 @@ def audit_recorded(
     force: bool = False,
     quiet: bool = False,
     device: str = "auto",
-) -> list[dict[str, Any]]:
+) -> list[str]:
     """Audit the members of the ensemble artefact ``source`` on the data file that it was trained on; write ``out``.
 
     ``audit.json``, the page ``index.html`` and, for each sub-goal (or the one that is named), ``next/SUB_GOAL/``: the
-    unlabelled states to label next, best first, as pictures and a table to fill in (:func:`write_next`). Returns each
-    sub-goal's part of ``audit.json``. An unknown sub-goal, data that are gone or have no unlabelled states, and an
-    ``out`` that exists are a ``UserError``.
+    unlabelled states to label next, best first, as pictures and a table to fill in. Returns the findings in lines. An
+    unknown sub-goal, data that are gone or have no unlabelled states, and an ``out`` that exists are a ``UserError``.
     """
-    device, artefact = prepare(device), open_artefact(source, "ensemble")
-    goals = artefact.config["sub_goals"]
-    if sub_goal is not None and sub_goal not in goals:
-        raise UserError("unknown sub-goal", sub_goal, f"{source} has {', '.join(goals)}.")
-    goals = [sub_goal] if sub_goal is not None else goals
+    device = prepare(device)
+    artefact = open_artefact(source, "ensemble")
+    goals = _chosen(artefact, sub_goal)
     data = artefact.input("data")
-    about: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": list(goals)}, "seed": 0}
+    parts: list[dict[str, Any]] = []
+    sections: list[Block] = []
+    about: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": goals}, "seed": 0}
     with (
         create(out, **about, inputs=[source, data], force=force) as draft,
         Progress("audit", len(goals), quiet=quiet) as progress,
     ):
-        parts, sections = [], []
         for goal in goals:
             look = look_at(artefact, data, goal, device)
-            part, section = findings(look, draft.files / "next" / goal)
-            parts.append(part)
-            sections.append(section)
+            found = findings_of(look)
+            parts.append(found.numbers)
+            sections.append(found.section)
+            write_next(draft.files / "next" / goal, COLUMNS, look.unlabelled[found.rows], found.rows, found.disputed)
             progress.advance()
-        (draft.files / "audit.json").write_text(
-            json.dumps(plain({"sub_goals": parts}), indent=1) + "\n", encoding="utf-8"
-        )
-        lead = {"task": "", "verdict": lines_of(parts), "baselines": "", "films": [], "question": ""}
-        version = versions().get("hypogoal", "unknown")
-        text = page.draw_page(
-            f"hypogoal: audit of {source.name}", f"recorded data; hypogoal {version}", sections, version, lead
-        )
-        (draft.files / "index.html").write_text(text, encoding="utf-8")
-    return parts
+        text = json.dumps(plain({"sub_goals": parts}), indent=1)
+        (draft.files / "audit.json").write_text(text + "\n", encoding="utf-8")
+        page = draw(source.name, sections, lines_of(parts))
+        (draft.files / "index.html").write_text(page, encoding="utf-8")
+    return lines_of(parts)
 
 
-def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
-    """The members' predictions of all states of the data file."""
-    dataset, ensemble = open_dataset(data), read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
-    parts = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    known = joined([States(part.observations, part.labels) for part in parts])
-    unlabelled = dataset.unlabelled()
-    if not len(unlabelled):
-        raise UserError("there are no unlabelled states to audit on", data, "Import or collect some.")
-    return Look(
-        sub_goal, ensemble, known, ensemble.predict(known.observations), unlabelled, ensemble.predict(unlabelled)
-    )
-
-
-def findings(look: Look, folder: Path) -> tuple[dict[str, Any], Block]:
-    """A sub-goal's numbers and its section of the page; the states to label next go into ``folder``."""
-    rows = spread_rows(len(look.unlabelled), COMPARED)  # the states that are compared
-    states, scores = look.unlabelled[rows], look.scores[rows]
-    sketches = recorded.sketches_of(states)
-    disputed = recorded.disagreement(scores, look.thresholds)
-    proposed = recorded.to_label(disputed * recorded.density_of(sketches), sketches, NEXT)
-    members = recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist())
-    positive = scores > look.thresholds
-    disagree = (positive.any(1) & ~positive.all(1)).mean()
-    write_next(folder, states[proposed], rows[proposed], disputed[proposed])
-    numbers = {
-        "sub_goal": look.sub_goal,
-        "known": len(look.known.labels),
-        "unlabelled": len(look.unlabelled),
-        "disagreement": float(disagree),
-        "members": members,
-        "next": [int(rows[row]) for row in proposed[:CARDS]],
-    }
-    return numbers, _section(look, numbers, rows, sketches, proposed, disputed)
-
-
-def write_next(folder: Path, states: Observations, rows: NDArray[np.int64], disputed: NDArray[np.float64]) -> None:
-    """Write proposed states (N, *obs), rows of the unlabelled ones, as pictures and a table to fill in.
-
-    ``001.png``, ... are in the table's order; states without pictures have the table alone.
-    """
-    folder.mkdir(parents=True)
-    lines = []
-    for number, state in enumerate(states):
-        picture = recorded.picture_of(state)
-        name = "" if picture is None else f"{number + 1:03d}.png"
-        if picture is not None:
-            (folder / name).write_bytes(image_png(picture))
-        lines.append([name, "", int(rows[number]), digest(state).hex(), round(float(disputed[number]), 4)])
-    write_table(folder / TO_FILL_IN, COLUMNS, lines)
-
-
-def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:
-    """The findings in a few lines, for the page and the terminal."""
-    lines = []
-    for part in parts:
-        worst = max(part["members"], key=lambda row: row["false_positives"])
-        lines.append(
-            f"{part['sub_goal']}: {_describe_unlabelled(part)}; of {worst['negatives']} known failures member "
-            f"{worst['member']} predicts {worst['false_positives']} positive (highest probability "
-            f"{worst['highest_negative']:.2f})"
-        )
-    return lines
-
-
-def _describe_unlabelled(part: dict[str, Any]) -> str:
-    """How members differ on unlabelled states, and which of them hold all of these for the same."""
-    shares = [row["positive_unlabelled"] for row in part["members"]]
-    states = f"{part['unlabelled']:,} unlabelled states"
-    if len(shares) == 1:
-        return f"the classifier predicts {shares[0]:.1%} of {states} positive"
-    alike = [str(member) for member, share in enumerate(shares) if share in (0.0, 1.0)]
-    which = f" (the same prediction for all of them: member {', '.join(alike)})" if alike else ""
-    return f"members disagree in {part['disagreement']:.1%} of {states}{which}"
-
-
-def _section(
-    look: Look,
-    numbers: dict[str, Any],
-    rows: NDArray[np.int64],
-    sketches: NDArray[np.float64],
-    proposed: NDArray[np.int64],
-    disputed: NDArray[np.float64],
-) -> Block:
-    columns = [
-        page.label("member", lambda row: str(row["member"])),
-        page.number("threshold", "threshold", page.fixed, 2),
-        page.number("false positives", lambda row: f"{row['false_positives']} of {row['negatives']}"),
-        page.number("highest negative", "highest_negative", page.fixed, 2),
-        page.number("positive, unlabelled", "positive_unlabelled", page.percent),
-        page.number("alone", "positive_alone", page.percent),
-    ]
-    caption = (
-        "False positives among labelled and held-out states. Highest negative: the probability of the failure that a "
-        "policy would be drawn to first. Alone: unlabelled states that no other member predicts positive."
-    )
-    blocks: list[Block] = [page.table(columns, numbers["members"], caption=caption, heading="Members")]
-    what = "disagreement" if len(look.ensemble) > 1 else "prediction"
-    titles = [f"state {rows[row]}, {what} {disputed[row]:.2f}" for row in proposed[:CARDS]]
-    shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in proposed[:CARDS]]
-    blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
-    for member in range(len(look.ensemble)):
-        blocks += _drawn_to(look, member) + _pairs(look, member, rows, sketches)
-    paragraphs = [
-        f"{len(look.known.labels):,} labelled and held-out states. Beyond them {_describe_unlabelled(numbers)}."
-    ]
-    return page.section(page.slug(look.sub_goal), look.sub_goal, paragraphs, blocks)
-
-
-def _cards(look: Look, heading: str, states: Any) -> list[Block]:
-    """Cards of states, each a title, an observation and its scores (K,); none of states without pictures."""
-    cards = []
-    for title, state, scores, *turned in states:
-        picture = recorded.picture_of(state, *turned)
-        if picture is None:
-            return []
-        lines = [
-            {"class": "positive" if score > threshold else "negative", "text": f"member {member}: {score:.2f}"}
-            for member, (score, threshold) in enumerate(zip(scores.tolist(), look.thresholds.tolist(), strict=True))
-        ]
-        cards.append({"png": page.encoded(page.image_png(picture)), "alt": title, "title": title, "lines": lines})
-    return [{"kind": "cards", "heading": heading, "cards": cards, "small": True}] if cards else []
-
-
-def _drawn_to(look: Look, member: int) -> list[Block]:
-    """The known failures that a member scores highest, with the patch that says most of it."""
-    tempting = recorded.tempting(look.known, look.known_scores[:, member], SHOWN)
-    threshold = look.thresholds[member]
-    rejected = np.flatnonzero(look.scores[:, member] <= threshold)
-
-    def shown() -> Iterator[tuple[Any, ...]]:
-        for row in tempting:
-            state, scores = look.known.observations[row], look.known_scores[row]
-            turned = None
-            if scores[member] > threshold and len(rejected):
-                some = rejected[spread_rows(len(rejected), REJECTED)]
-                sketches = recorded.sketches_of(np.concatenate([state[None], look.unlabelled[some]]))
-                nearest = some[np.linalg.norm(sketches[1:] - sketches[0], axis=1).argmin()]
-                turned = recorded.turning_patch(state, look.unlabelled[nearest], member, look.ensemble.predict)
-            title = (
-                "a failure"
-                if turned is None
-                else f"a false positive; {turned.after:.2f} with the framed patch exchanged"
-            )
-            yield title, state, scores, turned
-
-    return _cards(look, f"Member {member}: failures that a policy would be drawn to", shown())
-
-
-def _pairs(look: Look, member: int, rows: NDArray[np.int64], sketches: NDArray[np.float64]) -> list[Block]:
-    """The nearest unlabelled states with opposite predictions of a member, side by side."""
-    positive = look.scores[rows, member] > look.thresholds[member]
-    pairs = recorded.opposite_pairs(sketches, positive, SHOWN)
-    states = [
-        (f"pair {number}, state {rows[row]}", look.unlabelled[rows[row]], look.scores[rows[row]])
-        for number, (first, second, _) in enumerate(pairs, 1)
-        for row in (first, second)
-    ]
-    return _cards(look, f"Member {member}: nearest states with opposite predictions", states)
+def _chosen(artefact: Artefact, sub_goal: str | None) -> list[str]:
+    goals: list[str] = artefact.config["sub_goals"]
+    if sub_goal is None:
+        return goals
+    if sub_goal not in goals:
+        raise UserError("unknown sub-goal", sub_goal, f"{artefact.path} has {', '.join(goals)}.")
+    return [sub_goal]

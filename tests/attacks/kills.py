@@ -295,8 +295,8 @@ def main() -> int:
     import torch
     import torch._dynamo  # which every process would load with its first optimiser
 
-    import hypogoal.stages.train_baseline
-    import hypogoal.stages.train_meta  # noqa: F401
+    import hypogoal.learners.baselines.agents
+    import hypogoal.meta.training  # noqa: F401
 
     torch.set_num_threads(1)
     folder = given.folder or Path(tempfile.mkdtemp(prefix="kills-"))

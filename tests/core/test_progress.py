@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from hypogoal.cli.common import print_outcome
 from hypogoal.core import progress
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.terminal import screen
+from hypogoal.stages import outcome_of
 
 
 def test_without_a_terminal_there_is_a_line_now_and_then(
@@ -32,8 +32,8 @@ def test_without_a_terminal_there_is_a_line_now_and_then(
     assert re.fullmatch(r"train: 5/10, (\?|0:00:0\d) left loss 0\.25", first)
     assert re.fullmatch(r"train: 6/10, (\?|0:00:0\d) left loss 0\.25", second)
     assert last == "train: 6/10, done in 0:00:00"
-    print_outcome({"steps": 5, "episodes": 0, "success": math.nan, "loss": 0.25}, quiet=False)
-    assert capsys.readouterr().out == "steps 5, episodes 0, loss 0.25\n"
+    numbers = {"steps": 5, "episodes": 0, "success": math.nan, "loss": 0.25}
+    assert outcome_of(numbers) == ["steps 5, episodes 0, loss 0.25"]
 
 
 def test_what_others_do_is_counted(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,16 +127,19 @@ ODD = GymnasiumDomain(Counting, {"odd": lambda env: env.unwrapped.count % 2 == 1
 
 def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec B6: with the sub-goal and what gets there, as 'import' tells it; nothing where there are enough of both."""
-    config = GymnasiumConfig(heldout_seeds=(4,), steps=100, max_episode_steps=100)
-    collect(ODD, config, tmp_path / "odd.h5", quiet=True)
+    collect(ODD, tmp_path / "odd.h5", heldout_seeds=(4,), steps=100, max_episode_steps=100, quiet=True)
     assert capsys.readouterr().err == ""
-    collect(DOMAIN, SMALL, tmp_path / "corridor.h5", quiet=True)
+    collect(DOMAIN, tmp_path / "corridor.h5", quiet=True, **vars(SMALL))
     told = "has 1 positive among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
     ends = "hypogoal: {} " + told + "bring a policy that gets there."
     assert capsys.readouterr().err.splitlines() == [ends.format("left-end"), ends.format("right-end")]
-    one = replace(SMALL, heldout_seeds=(4,), steps=60, max_episode_steps=2)  # the right end is three steps away
+    one = vars(SMALL) | {
+        "heldout_seeds": (4,),
+        "steps": 60,
+        "max_episode_steps": 2,
+    }
     seldom = GymnasiumDomain(CorridorEnv, {"first": lambda env: env.unwrapped.cell < 3})
-    collect(seldom, replace(one, labelled_seeds=(0,)), tmp_path / "seldom.h5", quiet=True)
+    collect(seldom, tmp_path / "seldom.h5", quiet=True, **(one | {"labelled_seeds": (0,)}))
     assert "first has 2 negatives among 5 labelled states" in capsys.readouterr().err
 
 
@@ -206,7 +208,7 @@ def test_policies_share_the_steps() -> None:
 
 def test_how_long_options_need_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec B6: where play took longer from one sub-goal to the next than options have by default."""
-    collect(GymnasiumDomain(Stairs, STEPS_UP, policy=climb), FEW, tmp_path / "data.h5")
+    collect(GymnasiumDomain(Stairs, STEPS_UP, policy=climb), tmp_path / "data.h5", **vars(FEW))
     told = " ".join(capsys.readouterr().err.split())
     assert "play took up to 6 steps from one sub-goal to the next" in told
     assert "train-options --option-timeout 12 gives options time" in told

@@ -12,7 +12,6 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain
-from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.options.tables import Episodes
 from hypogoal.stages.train_baseline import train_baseline
 
@@ -74,8 +73,8 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str,
 def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B6, F5: in training's numbers, the table of episodes, the evaluation; by reward it would be another."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    few = BaselineConfig(steps=2_048, max_episode_steps=20)
-    numbers = train_baseline("corridor_env:SWIFT", few, tmp_path / "ppo", quiet=True)
+    few = {"steps": 2_048, "max_episode_steps": 20}
+    numbers = train_baseline("corridor_env:SWIFT", tmp_path / "ppo", quiet=True, **few).metrics
     episodes = Episodes.read(tmp_path / "ppo" / "episodes.csv")
     succeeded, cut = episodes.succeeded, ~episodes.terminated
     assert (succeeded == (episodes.length <= 5))[~cut].all() and succeeded[cut].any()

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from hypogoal.evaluation import explorer
+from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.questions import QUESTIONS
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import draw_figures, report
+from hypogoal.stages.report import report
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
@@ -21,8 +22,8 @@ def test_a_figure_with_its_number_is_one_file_and_one_line(small_ladders, tmp_pa
         monkeypatch.setattr(explorer, name, count)
     QUESTIONS.append(importlib.import_module("durations").QUESTION)
     try:
-        metrics = evaluate(small_ladders, small_ladders / "evaluation", quiet=True)
-        page = report(small_ladders).read_text(encoding="utf-8")
+        metrics = evaluate(small_ladders, small_ladders / "evaluation", quiet=True).metrics
+        page = (report(small_ladders).path / "index.html").read_text(encoding="utf-8")
         drawn, _ = draw_figures(small_ladders, tmp_path / "figures")
     finally:
         del QUESTIONS[-1]

@@ -18,11 +18,12 @@ from toy_data import reseal
 from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation import judging
+from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.questions import summary_table
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import draw_figures, report
+from hypogoal.stages.report import report
 
 QUIET = {"quiet": True}
 
@@ -68,13 +69,13 @@ def test_members_are_judged_room_by_room(ladders, metrics):
 
 def test_any_number_of_processes_gives_the_same_evaluation(small_ladders, tmp_path, monkeypatch):
     """Spec G1, G5: judged in two processes: the same numbers and arrays; this run is too small for more than one."""
-    metrics = evaluate(small_ladders, tmp_path / "alone", **QUIET)
+    metrics = evaluate(small_ladders, tmp_path / "alone", **QUIET).metrics
     cases = [case for _, case in judging.cases_of(find_artefacts(small_ladders, "ensemble"))]
     assert judging.processes_for(cases, 2) == 1
     monkeypatch.setattr(judging, "SPREAD_FROM", 0)
     monkeypatch.setenv("HYPOGOAL_CORES", "2")
     assert judging.processes_for(cases, 2) == 2
-    assert evaluate(small_ladders, tmp_path / "again", **QUIET) == metrics
+    assert evaluate(small_ladders, tmp_path / "again", **QUIET).metrics == metrics
     with h5py.File(tmp_path / "again/arrays.h5") as spread, h5py.File(tmp_path / "alone/arrays.h5") as alone:
         found = []
         alone.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
@@ -273,13 +274,13 @@ def test_ensembles_alone(ladders, tmp_path):
         (tmp_path / name).parent.mkdir(parents=True)
     shutil.copy(ladders / "data/groups-1.h5", tmp_path / "data")
     shutil.copytree(ladders / "ensemble/dbat/groups-1-seed-0", tmp_path / "ensemble/dbat/groups-1-seed-0")
-    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET).metrics
     assert metrics["missing"] == [
         "no ensemble artefact of an ensemble without diversity (Figure 3)",
         "no ensemble artefact of a single CNN (Figure 3)",
         "no options artefact of a ladder (Figures 4 and 5)",
     ]
-    page = report(tmp_path).read_text(encoding="utf-8")
+    page = (report(tmp_path).path / "index.html").read_text(encoding="utf-8")
     assert page.count("<figure") == 1
     assert "no options artefact of a ladder (Figures 4 and 5)" in page
     assert "Learning curves" not in page
@@ -290,12 +291,12 @@ def test_options_without_their_ensembles_evaluation(ladders, tmp_path):
     """Spec F3: options may be made from an ensemble that is not in the run; N and method come from its manifest."""
     source = ladders / "ensemble/none/groups-2-seed-0"
     write_options(tmp_path / "options", source, "2-6", 3, executions(0, [7]) + executions(1, [5]), 2)
-    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET).metrics
     (row,) = metrics["distance"]["over_ladders"]
     assert (row["method"], row["groups"], row["best"]["mean"]) == ("no diversity, K=2", 2, 5)
     assert row["validated"]["mean"] is None
     assert metrics["missing"][0] == "no ensemble"
-    page = report(tmp_path).read_text(encoding="utf-8")
+    page = (report(tmp_path).path / "index.html").read_text(encoding="utf-8")
     assert "<li>no ensemble</li>" in page
     assert "Figure 5 of the paper: ladder 2-6, N=2, seed 3" in page
 
@@ -309,18 +310,20 @@ def test_a_table_of_executions_that_is_not_there(small_ladders):
     write_options(options, small_ladders / "ensemble/dbat/groups-2-seed-0", "1L", 0, [], 2)
     files = open_artefact(options).manifest.files
     reseal(options, files={name: digest for name, digest in files.items() if name != "executions.csv"})
-    metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET)
+    metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET).metrics
     silent = "no executions.csv in options/dbat/groups-2-ladder-1L-seed-0: its domain tells no distance"
     assert silent in metrics["missing"]
     (row,) = (row for row in metrics["distance"]["over_ladders"] if row["method"].startswith("dbat"))
     assert (row["seeds"], row["incomplete_seeds"]) == (0, [0])
-    assert "Seeds that lack a ladder are left out: dbat, K=2, N=2" in report(small_ladders).read_text()
+    page = (report(small_ladders).path / "index.html").read_text(encoding="utf-8")
+    assert "Seeds that lack a ladder are left out: dbat, K=2, N=2" in page
 
 
 def test_a_domain_without_pictures(small_ladders, monkeypatch):
     """Spec F4: what is missing is the pictures, not the numbers."""
     monkeypatch.setattr(LadderDomain, "pictures", False)
-    metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET)
+    metrics = evaluate(small_ladders, small_ladders / "evaluation", **QUIET).metrics
     assert metrics["distance"]["shown"] == []
     assert metrics["distance"]["over_ladders"][0]["best"]["mean"] is not None
-    assert "The domain has no pictures of its rooms" in report(small_ladders).read_text(encoding="utf-8")
+    page = (report(small_ladders).path / "index.html").read_text(encoding="utf-8")
+    assert "The domain has no pictures of its rooms" in page

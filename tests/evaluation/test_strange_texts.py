@@ -27,12 +27,13 @@ from toy_data import fill, reseal
 from hypogoal.core.artefacts import MANIFEST, create, sha256_of
 from hypogoal.core.files import write_table
 from hypogoal.data import Collected, States, create_hdf5, fixed, write_dataset
+from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
 from hypogoal.evaluation.run import fitting, read_evaluation
 from hypogoal.options.tables import Choices, Episodes
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import draw_figures, report
+from hypogoal.stages.report import report
 from hypogoal.tools.compare import compare
 
 FOLDERS = ('"><img src=x onerror=alert(1)>', "'-alert(1)-'", "a&b<b>")  # file systems take such names
@@ -308,7 +309,7 @@ def test_ids_and_files_are_named_by_no_stranger(changed):
     (shown,) = metrics["distance"]["shown"]
     metrics["distance"]["shown"] = [{**shown, "ladder": name, "groups": name} for name in names]
     write_metrics(changed, metrics)
-    page = report(changed).read_text(encoding="utf-8")
+    page = (report(changed).path / "index.html").read_text(encoding="utf-8")
     assert "<img src=x" not in page and "<script>document" not in page
     ids = re.findall(r'<figure id="([^"]*)"', page)
     assert len(ids) == len(set(ids)) == len(names) + 5 and all(re.fullmatch(r"[\w-]+", one) for one in ids)

@@ -11,7 +11,7 @@ from test_training import toy
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
+from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.stages.train_ensemble import train_ensemble
 
@@ -75,10 +75,10 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
 
 def test_a_broken_stage_ends_with_the_same_log(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G1: what was logged after the last checkpoint is logged once."""
-    config = TrainEnsembleConfig(steps=32, members=2, workers=1, sub_goals=("open-red-door",))
+    few = {"steps": 32, "members": 2, "workers": 1, "sub_goals": ("open-red-door",)}
 
     def train(name: str, *, resume: bool = False) -> None:
-        train_ensemble(tiny_run / "data.h5", config, tmp_path / name, seed=3, resume=resume, quiet=True)
+        train_ensemble(tiny_run / "data.h5", tmp_path / name, seed=3, resume=resume, quiet=True, **few)
 
     train("unbroken")
     for last in (22, 8):

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_baseline import train_baseline
@@ -89,8 +87,8 @@ def rows_of(folder: Path) -> list[dict[str, int]]:
 
 
 def train(ensemble: Path, out: Path, seed: int = 0, **changes):
-    config = TrainOptionsConfig(**(BEGIN | {"termination": "oracle", "option_timeout": 8, "steps": 400} | changes))
-    return train_options(ensemble, config, out, seed=seed, quiet=True)
+    settings = BEGIN | {"termination": "oracle", "option_timeout": 8, "steps": 400} | changes
+    return train_options(ensemble, out, seed=seed, quiet=True, **settings)
 
 
 def test_options_from_a_named_start(corridor: Path, tmp_path: Path) -> None:
@@ -144,7 +142,7 @@ def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
 
     ensemble = ensemble_of(tmp_path / "ensemble", doorkey, 1, "doorkey")
     with pytest.raises(UserError, match="doorkey has no named starts"):
-        train_options(ensemble, TrainOptionsConfig(steps=10, start="1L"), tmp_path / "options", quiet=True)
+        train_options(ensemble, tmp_path / "options", steps=10, start="1L", quiet=True)
 
 
 def test_the_papers_number_of_steps_is_told() -> None:
@@ -174,10 +172,10 @@ def test_options_on_a_ladder(tmp_path: Path) -> None:
 @pytest.mark.atari
 def test_a_baseline_begins_where_it_is_told(tmp_path: Path) -> None:
     """Spec E7, I4: in a new game, in room 1 from step 0 on; an unknown start leaves nothing behind."""
-    config = BaselineConfig(agent="ppo", setting="paper", steps=200, start="game", max_episode_steps=50)
-    train_baseline("montezuma", config, tmp_path / "ppo", quiet=True)
+    few = {"agent": "ppo", "setting": "paper", "steps": 200, "start": "game", "max_episode_steps": 50, "quiet": True}
+    train_baseline("montezuma", tmp_path / "ppo", **few)
     layout = json.loads((tmp_path / "ppo" / "layout.json").read_text())
     assert (layout["start"], layout["rooms"]) == ("game", {"1": 0})
     with pytest.raises(UserError, match="unknown start: nowhere"):
-        train_baseline("montezuma", replace(config, start="nowhere"), tmp_path / "none", quiet=True)
+        train_baseline("montezuma", tmp_path / "none", **(few | {"start": "nowhere"}))
     assert not (tmp_path / "none").exists()

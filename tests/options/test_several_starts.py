@@ -14,7 +14,6 @@ from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.montezuma import DOMAIN
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.stages.train_options import train_options
 
 SHAPE = DOMAIN.observation_shape
@@ -43,7 +42,7 @@ def ensemble_in(folder: Path, seed: int = 0) -> Path:
 
 def train(ensemble: Path, out: Path, options: Path | None = None, **changes: object) -> dict[str, object]:
     settings = DOMAIN.defaults["train-options"] | QUICK | {"steps": 200, "start": "1L"} | changes
-    return train_options(ensemble, TrainOptionsConfig(**settings), out, options=options, quiet=True)
+    return train_options(ensemble, out, options=options, quiet=True, **settings).metrics
 
 
 @pytest.mark.atari

@@ -7,11 +7,10 @@ from command_line import refuses, run
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.data import open_dataset
+from hypogoal.data import joined_unlabelled, open_dataset
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.options.visited import Visited
-from hypogoal.stages.train_ensemble import joined_unlabelled
 
 
 def walk(visited: Visited, engine: Corridor, steps: int, seed: int = 0) -> None:

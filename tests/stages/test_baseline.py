@@ -18,7 +18,7 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig, DQNSettings, PPOSettings
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings, PPOSettings
 from hypogoal.meta.training import cut
 from hypogoal.stages.train_baseline import train_baseline
 
@@ -161,15 +161,14 @@ def test_the_paper_setting_is_the_papers():
 
 def test_the_artefact_says_what_happened(tmp_path):
     """Spec A7, A8: episodes, layout, hyperparameters, weights without pickle; the same seed gives the same run."""
-    config = BaselineConfig(agent="dqn", steps=2_560, max_episode_steps=40, random_episodes=20)
-    numbers = train_baseline("doorkey", config, tmp_path / "a", seed=4, quiet=True)
-    train_baseline("doorkey", config, tmp_path / "b", seed=4, quiet=True)
+    few = {"agent": "dqn", "steps": 2_560, "max_episode_steps": 40, "random_episodes": 20, "seed": 4, "quiet": True}
+    train_baseline("doorkey", tmp_path / "a", **few)
+    train_baseline("doorkey", tmp_path / "b", **few)
     artefact = open_artefact(tmp_path / "a", "baseline")
     assert artefact.config["hyperparameters"]["epsilon_from"] == "first-goal"
     assert artefact.config["environments"] == 16
-    assert numbers["steps"] == 2_560
     rows = list(csv.DictReader((tmp_path / "a" / "episodes.csv").read_text().splitlines()))
-    assert len(rows) == numbers["episodes"] == 64
+    assert len(rows) == 64
     facts = json.loads((tmp_path / "a" / "layout.json").read_text())
     assert facts["shortest_path"] >= 9
     assert facts["random_episodes"] == 20
@@ -191,8 +190,8 @@ def test_global_randomness_is_given_back():
 
 def test_it_plays_in_the_agents_world(tmp_path):
     """A wrong key ends the episode, and so does 1.5 times the shortest path, as for agents with options."""
-    config = BaselineConfig(steps=1_280, layout_seed=70105, world=("wrong_key=ends",), cap=1.5, random_episodes=0)
-    train_baseline("doorkey", config, tmp_path / "a", quiet=True)
+    few = {"steps": 1_280, "layout_seed": 70105, "world": ("wrong_key=ends",), "cap": 1.5, "random_episodes": 0}
+    train_baseline("doorkey", tmp_path / "a", quiet=True, **few)
     assert open_artefact(tmp_path / "a", "baseline").config["domain_config"] == {"wrong_key": "ends"}
     shortest = json.loads((tmp_path / "a" / "layout.json").read_text())["shortest_path"]
     rows = list(csv.DictReader((tmp_path / "a" / "episodes.csv").read_text().splitlines()))
@@ -200,7 +199,7 @@ def test_it_plays_in_the_agents_world(tmp_path):
     assert max(lengths) == math.ceil(1.5 * shortest)
     assert min(lengths) < shortest  # a wrong key
     with pytest.raises(UserError, match="no such setting"):
-        train_baseline("doorkey", BaselineConfig(world=("labelled_seed=3",)), tmp_path / "b", quiet=True)
+        train_baseline("doorkey", tmp_path / "b", world=("labelled_seed=3",), quiet=True)
 
 
 def test_a_cap_that_is_a_whole_number_of_steps_is_that_many():

@@ -20,15 +20,14 @@ from toy_data import reseal
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation import hypotheses
+from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.questions import summary_table
+from hypogoal.evaluation.questions import missing, summary_table
 from hypogoal.evaluation.run import find, read_evaluation
 from hypogoal.experiments.sweep import Cell, begin
-from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.look import outcome
-from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.stages.evaluate import evaluate, missing
-from hypogoal.stages.report import draw_figures, report
+from hypogoal.stages.evaluate import evaluate
+from hypogoal.stages.report import report
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_meta import train_meta
 
@@ -72,11 +71,11 @@ def test_agents_are_grouped_and_counted_whole(tiny_run, metrics):
 
 def test_an_agent_without_a_whole_episode_is_said_to_be_one(tiny_run, tmp_path):
     """Spec F5: there is no success to speak of, neither 0 nor a dash."""
-    unfinished = TrainMetaConfig(steps=512, max_episode_steps=100, random_episodes=2)
-    train_meta(tiny_run / "ensemble", unfinished, tmp_path / "meta", **QUIET)
-    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    unfinished = {"steps": 512, "max_episode_steps": 100, "random_episodes": 2}
+    train_meta(tiny_run / "ensemble", tmp_path / "meta", **unfinished, **QUIET)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET).metrics
     assert metrics["agents"][0]["success"]["mean"] is None
-    page = report(tmp_path).read_text(encoding="utf-8")
+    page = (report(tmp_path).path / "index.html").read_text(encoding="utf-8")
     assert "No episode of an agent has ended yet" in page
     assert "reached the goal in" not in page
 
@@ -85,7 +84,7 @@ def test_what_was_made_since_is_said(tiny_copy):
     """Spec A5, F7: a report of an evaluation that does not know all that is there says what, and what to do."""
     assert not [line for line in read_evaluation(tiny_copy).metrics["missing"] if "since" in line]
     reseal(shutil.copytree(tiny_copy / "ppo", tiny_copy / "later"), seed=1)
-    page = report(tiny_copy, force=True).read_text(encoding="utf-8")
+    page = (report(tiny_copy, force=True).path / "index.html").read_text(encoding="utf-8")
     assert "later: made since this evaluation" in page
 
 
@@ -206,22 +205,22 @@ def test_what_is_missing_is_named(tiny_run, metrics, tmp_path):
     """Spec F: no silent absence, in the metrics, on the page and in an evaluation of a run with a baseline only."""
     assert metrics["missing"] == [], "what nobody asked for is not missed"
     shutil.copytree(tiny_run / "ppo", tmp_path / "only" / "ppo")
-    alone = evaluate(tmp_path / "only", tmp_path / "only" / "evaluation", **QUIET)
+    alone = evaluate(tmp_path / "only", tmp_path / "only" / "evaluation", **QUIET).metrics
     assert json.loads((tmp_path / "only" / "evaluation" / "metrics.json").read_text(encoding="utf-8")) == alone
     assert alone["missing"][0] == "no ensemble"
     assert alone["ensembles"] == alone["selection"] == []
-    text = report(tmp_path / "only").read_text(encoding="utf-8")
+    text = (report(tmp_path / "only").path / "index.html").read_text(encoding="utf-8")
     assert "<li>no ensemble</li>" in text
 
 
 def test_an_ensemble_alone_can_be_evaluated(tiny_run, tmp_path):
     """Spec F1, F7: hypotheses without agents."""
-    config = TrainEnsembleConfig(steps=2, members=1, workers=1, sub_goals=("open-red-door",))
-    train_ensemble(tiny_run / "data.h5", config, tmp_path / "ensemble", **QUIET)
-    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    few = {"steps": 2, "members": 1, "workers": 1, "sub_goals": ("open-red-door",)}
+    train_ensemble(tiny_run / "data.h5", tmp_path / "ensemble", **few, **QUIET)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET).metrics
     assert [row["name"] for row in metrics["hypotheses"]] == ["single CNN"]
     assert metrics["hypotheses"][0]["disagreement_heldout"]["mean"] is None
-    assert "<li>no agents</li>" in report(tmp_path).read_text(encoding="utf-8")
+    assert "<li>no agents</li>" in (report(tmp_path).path / "index.html").read_text(encoding="utf-8")
 
 
 def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypatch):
@@ -342,9 +341,9 @@ def test_a_run_whose_agent_cannot_play_has_a_page_without_a_film(tiny_copy, page
     """Spec E1, F7: where nobody asked for one, a line says why there is none; where somebody did, it is an error."""
     (kept,) = (path for path in (tiny_copy / "report" / "videos").iterdir() if path.suffix == ".gif")
     assert kept.name == "meta-episode-0.gif"
-    assert "image/gif" not in report(tiny_copy, videos=0, force=True).read_text(encoding="utf-8")
+    assert "image/gif" not in (report(tiny_copy, videos=0, force=True).path / "index.html").read_text(encoding="utf-8")
     (tiny_copy / "meta" / "options.safetensors").unlink()
-    text = report(tiny_copy, force=True).read_text(encoding="utf-8")
+    text = (report(tiny_copy, force=True).path / "index.html").read_text(encoding="utf-8")
     assert "no film of an episode: " in text and "image/gif" not in text
     with pytest.raises(UserError, match=r"options\.safetensors"):
         report(tiny_copy, videos=1, force=True)
@@ -352,7 +351,7 @@ def test_a_run_whose_agent_cannot_play_has_a_page_without_a_film(tiny_copy, page
 
 def test_the_report_is_the_same_each_time(tiny_copy, page):
     """Spec G1, F7: nothing in it depends on when or where it is made."""
-    assert report(tiny_copy, force=True).read_text(encoding="utf-8") == page
+    assert (report(tiny_copy, force=True).path / "index.html").read_text(encoding="utf-8") == page
 
 
 def test_the_papers_figures_as_files(tiny_run, metrics, tmp_path):

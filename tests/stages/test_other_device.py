@@ -12,52 +12,52 @@ from far_device import FAR, far_device
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.stages import train_baseline, train_ensemble, train_meta, train_options
+from hypogoal.stages.train_baseline import train_baseline
+from hypogoal.stages.train_ensemble import train_ensemble
+from hypogoal.stages.train_meta import train_meta
+from hypogoal.stages.train_options import train_options
 
+PREPARE = "hypogoal.core.processes.prepare"
 QUIET = {"quiet": True, "seed": 3}
 SHORT: dict[str, Any] = {
     "steps": 192, "max_episode_steps": 30, "option_timeout": 7, "random_episodes": 1, "warm_up": 32, "replay": 200,
 }  # fmt: skip
 
 
-def ensemble(data: Path, out: Path) -> None:
-    config = train_ensemble.TrainEnsembleConfig(steps=3, members=2, workers=1, sub_goals=("open-red-door",))
-    train_ensemble.train_ensemble(data, config, out, device="cuda" if out.name == "far" else "cpu", **QUIET)
+def ensemble(made: Path, out: Path) -> None:
+    few = {"steps": 3, "members": 2, "workers": 1, "sub_goals": ("open-red-door",)}
+    train_ensemble(made / "data.h5", out, device="cuda" if out.name == "far" else "cpu", **few, **QUIET)
 
 
 def options(made: Path, out: Path) -> None:
-    config = train_options.TrainOptionsConfig(**SHORT)
-    train_options.train_options(made / "ensemble", config, out, device=out.name, **QUIET)
+    train_options(made / "ensemble", out, device=out.name, **SHORT, **QUIET)
 
 
 def meta(made: Path, out: Path) -> None:
-    config = train_meta.TrainMetaConfig(**SHORT, decisions=32, meta_batch=16)
-    train_meta.train_meta(made / "ensemble", config, out, device=out.name, **QUIET)
+    train_meta(made / "ensemble", out, device=out.name, **SHORT, decisions=32, meta_batch=16, **QUIET)
 
 
 def baseline(agent: str, made: Path, out: Path) -> None:
-    config = train_baseline.BaselineConfig(
-        agent=agent, setting="tuned", steps=1_200, max_episode_steps=30, random_episodes=1
-    )
-    train_baseline.train_baseline("doorkey", config, out, device=out.name, **QUIET)
+    few = {"agent": agent, "steps": 1_200, "max_episode_steps": 30, "random_episodes": 1}
+    train_baseline("doorkey", out, device=out.name, **few, **QUIET)
 
 
-CASES: dict[str, tuple[Any, Callable[[Path, Path], None]]] = {
-    "train-ensemble": (train_ensemble, lambda made, out: ensemble(made / "data.h5", out)),
-    "train-options": (train_options, options),
-    "train-meta": (train_meta, meta),
-    "train-baseline, ppo": (train_baseline, partial(baseline, "ppo")),
-    "train-baseline, dqn": (train_baseline, partial(baseline, "dqn")),
+CASES: dict[str, Callable[[Path, Path], None]] = {
+    "train-ensemble": ensemble,
+    "train-options": options,
+    "train-meta": meta,
+    "train-baseline, ppo": partial(baseline, "ppo"),
+    "train-baseline, dqn": partial(baseline, "dqn"),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_files(case: str, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G5: whole artefacts with the same tensors; learners' bytes are compared elsewhere."""
-    module, train = CASES[case]
+    train = CASES[case]
     train(tiny_run, tmp_path / "cpu")
     with far_device(monkeypatch):
-        monkeypatch.setattr(module, "prepare", lambda device="auto": FAR)
+        monkeypatch.setattr(PREPARE, lambda device="auto": FAR)
         train(tiny_run, tmp_path / "far")
     near, far = (open_artefact(tmp_path / name) for name in ("cpu", "far"))
     assert near.manifest.files.keys() == far.manifest.files.keys()
@@ -85,7 +85,7 @@ def test_on_a_gpu(case: str, tiny_run: Path, tmp_path: Path) -> None:
     """Spec G5: the real thing, where there is one."""
     if not torch.cuda.is_available():
         pytest.skip("no GPU")
-    CASES[case][1](tiny_run, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
-    CASES[case][1](tiny_run, tmp_path / "cpu")
+    CASES[case](tiny_run, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
+    CASES[case](tiny_run, tmp_path / "cpu")
     near, far = (open_artefact(path) for path in sorted(tmp_path.iterdir()))
     assert near.manifest.files.keys() == far.manifest.files.keys()

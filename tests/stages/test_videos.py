@@ -12,10 +12,10 @@ from PIL import Image
 from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.evaluation.films import agents_of, play_films
 from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
-from hypogoal.stages.report import agents_of, play_films
 
 CAP, TIMEOUT, MEMBERS = 64, 10, 2
 

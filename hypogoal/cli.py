@@ -1,0 +1,539 @@
+"""The command line: each command parses, calls one function and prints; its last line is the path of what it made.
+
+Spec A1-A8. The stages' commands come from the stages, see :mod:`hypogoal.stages`. Heavy imports are inside commands, so
+that ``hypogoal --help`` is quick.
+"""
+
+import functools
+import itertools
+import json
+import os
+import shlex
+import shutil
+import signal
+import sys
+import tempfile
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Context, Option
+from typer.core import TyperGroup
+
+from hypogoal import stages
+from hypogoal.core import own_code, processes
+from hypogoal.core.errors import UserError, printable
+from hypogoal.core.terminal import say
+from hypogoal.stages import WIDTH, Device, Force, Out, Preset, Quiet, Seed, Set
+
+MAKE, LOOK, OWN = "Make", "Look", "Own data and code"  # groups of commands
+STAGES = {  # in their order; a command is loaded when it is called
+    "collect": "Collect labelled, unlabelled and held-out states.",
+    "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
+    "train-options": "Learn an option (a policy) for every member.",
+    "train-meta": "Learn from the reward which options to choose.",
+    "train-baseline": "Train PPO or DQN on primitive actions, to compare.",
+    "evaluate": "Compute every number of a run: accuracy, curves, choices.",
+    "report": "Draw the report of an evaluated run: one HTML file.",
+    "audit": "How often, and where, do policies fool a success classifier?",
+}
+DOMAINS = "doorkey, montezuma, rooms, or module:object."
+EXPERIMENTS = (
+    "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
+    "module:function."
+)
+LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
+
+
+class Commands(TyperGroup):
+    """The commands; those of stages are made when they are called, since their settings take time to load."""
+
+    def resolve_command(self, context: Any, words: list[str]) -> Any:
+        if words[0] in STAGES:
+            self.add_command(stage_command(words[0]))
+        return super().resolve_command(context, words)
+
+
+app = typer.Typer(
+    cls=Commands,
+    help="Transferable sub-goals by hypothesising which features generalise.\n\nStart here: "
+    "[bold]hypogoal run rooms --preset demo[/bold], two minutes from nothing to a report.",
+    epilog="Each command's --help ends with an example. Settings: hypogoal config.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
+Json = Annotated[bool, Option("--json", metavar="", help="Machine-readable output.")]
+
+
+def command(panel: str, example: str, name: str | None = None) -> Any:
+    """Make a function a command of a group; its ``--help`` ends with an example."""
+    return app.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
+
+
+def _in_lists() -> None:
+    """Stands for a stage where commands are listed."""
+
+
+def stage_command(name: str) -> Any:
+    """The command of a stage, whose module is loaded."""
+    folder = "tools" if name == "audit" else "stages"
+    import_module(f"hypogoal.{folder}.{name.replace('-', '_')}")
+    return stages.STAGES[name].command()
+
+
+def list_stage(name: str, panel: str) -> None:
+    """List a stage among the commands."""
+    app.command(name, help=STAGES[name], rich_help_panel=panel)(_in_lists)
+
+
+for _name in STAGES:
+    if _name != "audit":
+        list_stage(_name, MAKE)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from hypogoal import __version__
+
+        say(f"hypogoal {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, Option("--version", metavar="", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+    debug: Annotated[bool, Option("--debug", metavar="", help="Show the traceback of an error.")] = False,
+    trust: Annotated[
+        bool, Option("--trust", metavar="", help="Load code of your own that files name (module:object).")
+    ] = False,
+) -> None:
+    """Options before a command; ``main`` takes them anywhere."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for hypogoal's."""
+    if arguments is None:
+        signal.signal(signal.SIGTERM, processes.stop)  # a cancelled job, too, leaves nothing half-written
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in the background
+            signal.signal(signal.SIGINT, processes.stop)
+    words = [*(sys.argv[1:] if arguments is None else arguments)]
+    own_code.allow(words)
+    try:
+        return _called([word for word in words if word not in ("--debug", own_code.TRUST)])
+    except BrokenPipeError:  # whoever read what was printed, such as head, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its exit
+        return 1
+    except KeyboardInterrupt as stop:
+        if arguments is None:
+            for number in processes.SIGNALS:  # all is cleaned up: a further signal may end the process at once
+                signal.signal(number, signal.SIG_DFL)
+        notes = notes_of(stop) or ["nothing was half-written"]
+        number = stop.args[0] if stop.args else signal.SIGINT
+        return _fail("; ".join(["stopped", *notes]), 128 + number)
+    except (Exception, SystemExit) as error:
+        if "--debug" in words or (isinstance(error, SystemExit) and not own_code.place_of(error)):
+            raise
+        line, code = own_code.message(error)
+        return _fail("; ".join([line.rstrip(".") if notes_of(error) else line, *notes_of(error)]), code)
+
+
+@functools.cache
+def _commands() -> Any:
+    """Typer's commands, built once per process: building takes longer than many commands."""
+    return typer.main.get_command(app)
+
+
+def commands() -> dict[str, Any]:
+    """Every command by name, those of stages loaded."""
+    group = _commands()
+    for name in STAGES:
+        group.add_command(stage_command(name))
+    return dict(group.commands)
+
+
+def _called(words: list[str]) -> int:
+    """Run a command; Ctrl-C and errors pass, but for those of the words themselves."""
+    if "_HYPOGOAL_COMPLETE" in os.environ:  # the shell asks for completions
+        _commands()(args=words, prog_name="hypogoal")
+    try:
+        with _commands().make_context("hypogoal", words) as context:
+            _commands().invoke(context)
+    except Exception as error:
+        if not hasattr(error, "exit_code"):
+            raise
+        message = error.format_message() if hasattr(error, "format_message") else ""
+        return _fail(f"{message.rstrip('.')}. {_advice(error)}", 2) if message else int(error.exit_code)
+    return 0
+
+
+def _advice(error: Any) -> str:
+    """What to do about words that a command does not take; settings are often mistaken for options."""
+    stage = getattr(getattr(error, "ctx", None), "info_name", "") or ""
+    if hasattr(error, "possibilities") and stage in STAGES:
+        return f"Settings are given as --set KEY=VALUE; 'hypogoal config {stage}' lists them."
+    return f"See 'hypogoal {stage} --help'." if stage not in ("", "hypogoal") else "See 'hypogoal --help'."
+
+
+def notes_of(error: BaseException) -> list[str]:
+    """The notes that were added to an error, each once."""
+    return list(dict.fromkeys(getattr(error, "__notes__", [])))
+
+
+def _fail(message: str, code: int) -> int:
+    say(f"hypogoal: {printable(message)}", err=True)
+    return code
+
+
+def echo(value: Any, as_json: bool, text: Iterable[str]) -> None:
+    """Print a value for programs, or its text for people."""
+    if as_json:
+        say(json.dumps(value, indent=1))
+        return
+    for line in text:
+        say(line)
+
+
+@command(MAKE, "run doorkey --preset demo --out runs/demo")
+def run(
+    experiment: Annotated[str, Argument(help=EXPERIMENTS)],
+    out: Annotated[Path | None, Option(help="What to write. Default: runs/EXPERIMENT.")] = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Annotated[str | None, Option(help="The run seeds, instead of the experiment's: 3, or 0-9.")] = None,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Annotated[
+        bool, Option("--resume", metavar="", help="Keep what is complete, continue with the rest.")
+    ] = False,
+    from_: Annotated[
+        str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it.")
+    ] = None,
+    only: Annotated[str | None, Option(metavar="STAGE", help="Make this stage again and run no other.")] = None,
+    engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
+    sbatch: Annotated[str, Option(help="Options for sbatch, as typed: '--time=4:00:00 --mem=8G'.")] = "",
+    quiet: Quiet = False,
+    dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands; run none.")] = False,
+) -> None:
+    """Run all cells of an experiment: from nothing to a report.
+
+    --set takes settings of the experiment, and STAGE.KEY=VALUE.
+    """
+    from hypogoal.core.processes import prepare
+    from hypogoal.experiments import run as experiments
+    from hypogoal.look import describe, outcome
+
+    out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
+    if engine not in ("local", "slurm"):
+        raise UserError("unknown engine", engine, "Choose local or slurm.")
+    cells, workers = experiments.plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
+    if dry_run:
+        for cell in experiments.in_part(cells, from_, only):
+            say(shlex.join(["hypogoal", *cell.command(out)]))
+        return
+    if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
+        prepare(device)
+    experiments.run(
+        cells,
+        out,
+        workers=workers,
+        sbatch=shlex.split(sbatch) if engine == "slurm" else None,
+        resume=resume,
+        force=force,
+        from_=from_,
+        only=only,
+        say=(lambda text: None) if quiet else (lambda text: say(text, err=True)),
+    )
+    if engine == "slurm" or only or not (out / "report").is_dir():
+        say(out)
+        return
+    for line in outcome(describe(out / "evaluation")):
+        say(line)
+    say(out / "report" / "index.html")
+
+
+@app.command(
+    hidden=True, rich_help_panel=MAKE, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)
+def sweep(context: Context) -> None:
+    """What is ``run`` now."""
+    raise UserError("'sweep' is 'run' now", None, "Type 'hypogoal run' in its place, see 'hypogoal run --help'.")
+
+
+@command(LOOK, "show runs/mine")
+def show(
+    path: Made,
+    as_json: Json = False,
+    pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
+) -> None:
+    """Describe a file or folder: kind, result, settings, inputs."""
+    from hypogoal.look import describe, lines, outcome
+
+    details = describe(path)
+    echo(details, as_json, [] if as_json else [*outcome(details), *lines(details)])
+    if pictures is not None:
+        from hypogoal.evaluation.pictures import write_contact_sheets
+
+        for sheet in write_contact_sheets(path, pictures):
+            say(sheet, err=as_json)
+
+
+@command(LOOK, "verify runs/mine")
+def verify(path: Made, as_json: Json = False) -> None:
+    """Check for missing or changed files; exit code 2 if there are any.
+
+    Reads every file, and those inputs that lie within PATH. What is still being made is named, not checked.
+    """
+    from hypogoal.experiments.sweep import in_the_making
+    from hypogoal.look import faults, parts_of
+
+    found, notes = faults(path), in_the_making(path)
+    state = "whole so far" if notes else "whole"
+    verdict = f"{path}: {state if parts_of(path) else 'nothing is complete yet'}"
+    echo({"path": str(path), "faults": found, "notes": notes}, as_json, [*(found or [verdict]), *notes])
+    if found:
+        raise typer.Exit(2)
+
+
+@command(LOOK, "status runs/mine")
+def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
+    """Say what is stale or unfinished, why, and which commands renew it."""
+    from hypogoal.experiments.sweep import in_the_making
+    from hypogoal.look import stale, stale_lines
+
+    rows = stale(path)
+    echo(rows, as_json, [*in_the_making(path), *stale_lines(rows)])
+
+
+@command(LOOK, "config train-ensemble --domain montezuma")
+def config(
+    stage: Annotated[str | None, Argument(help="For example train-meta; without it, the list of stages.")] = None,
+    domain: Annotated[str, Option(help=f"Settings for: {DOMAINS}")] = "doorkey",
+    preset: Preset = None,
+    write: Annotated[Path | None, Option(help="Write them as a preset to edit: a new .toml file for --preset.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List every setting of a stage: default, unit, meaning, source."""
+    from hypogoal.core.files import replace_text
+    from hypogoal.experiments.run import config_class_of
+    from hypogoal.settings import CONFIGS, TABLES, described, preset_text
+
+    if stage is None:
+        helps = STAGES | {"run": "Run all cells of an experiment."}
+        echo(list(TABLES), as_json, [f"{name:15}{helps[name]}" for name in TABLES])
+        return
+    rows = described(CONFIGS.get(stage) or config_class_of(stage, domain), stage, domain, preset)
+    if write is None:
+        echo(rows, as_json, _setting_lines(rows))
+        return
+    if write.exists() or write.suffix != ".toml":
+        raise UserError("a preset needs a new .toml file", write, "Choose another name.")
+    replace_text(write, preset_text(stage, rows))
+    say(write)
+
+
+def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
+    """Settings under the parts that they belong to; a range such as 0-9 or a command stays in one piece."""
+    width = min(shutil.get_terminal_size().columns, WIDTH)
+    wrapped = textwrap.TextWrapper(width, " " * 6, " " * 6, break_on_hyphens=False, break_long_words=False)
+    for part, settings in itertools.groupby(rows, lambda row: row["part"]):
+        yield f"{part.replace('`', '')}:"
+        for row in settings:
+            default = row["default"]
+            if isinstance(default, tuple | list):
+                default = ",".join(map(str, default))
+            head = f"  {row['name']} = {default} {row['unit']}".rstrip()
+            allowed = f"   ({row['allowed']})" if row["allowed"] else ""
+            if len(head + allowed) <= width:
+                yield head + allowed
+            else:
+                yield head
+                yield " " * 6 + allowed.strip()
+            yield from wrapped.wrap(row["meaning"] + (f" [{row['source']}]" if row["source"] else ""))
+
+
+@command(LOOK, "compare runs/mine runs/other --out runs/both")
+def compare(
+    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Evaluated; each is compared with the first.")],
+    out: Annotated[Path | None, Option(help="Where to write a page; else who wins is printed.")] = None,
+    force: Force = False,
+) -> None:
+    """Put evaluated runs side by side: what differs, who wins."""
+    from hypogoal.look import describe, outcome
+    from hypogoal.tools.compare import compare as compared
+
+    with tempfile.TemporaryDirectory() as folder:
+        place = out or Path(folder, "comparison")
+        page = compared(runs, place, force=force)
+        for line in outcome(describe(place)):
+            say(line)
+    if out is not None:
+        say(page)
+
+
+@command(OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
+def import_(
+    source: Annotated[Path, Argument(help="Arrays, pictures, or episodes (Minari, LeRobot, robomimic, films).")],
+    out: Out,
+    sub_goal: Annotated[
+        list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        Option(
+            metavar="NAME=RULE",
+            help="Episodes: a column, last:N frames, FILE.csv or MODULE:FUNCTION; data file: FILE.csv.",
+        ),
+    ] = None,
+    key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
+    every: Annotated[int, Option(min=1, help="Episodes: take every N-th frame.")] = 1,
+    heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
+    resize: Annotated[
+        list[str] | None, Option(metavar="[KEY=]N", help="Most pixels on the longer side of pictures, or of a key's.")
+    ] = None,
+    group: Annotated[str, Option(help="Arrays: which one says what states belong together; held out whole.")] = "",
+    stack: Annotated[bool, Option("--stack", metavar="", help="Axes of frames and colours become channels.")] = False,
+    domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
+    seed: Seed = 0,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a data file of your arrays, pictures or recorded episodes."""
+    from hypogoal.data import open_dataset
+    from hypogoal.importing.data_file import import_data
+    from hypogoal.look import count_lines
+
+    sides = _sides(resize or ())
+    said = import_data(
+        source,
+        out,
+        sub_goals=sub_goal or (),
+        labels=_labels(label or ()),
+        keys=key or (),
+        share=heldout,
+        sides=sides,
+        every=every,
+        stack=stack,
+        group=group,
+        domain=domain,
+        seed=seed,
+        force=force,
+    )
+    for line in said:
+        say(f"hypogoal: {line}", err=True)
+    if not quiet:
+        dataset = open_dataset(out)
+        for line in (*_reading(dataset, resized=bool(sides)), *count_lines(dataset.counts())):
+            say(line)
+        run_folder = out.parent if out.name == "data.h5" else Path("runs", out.stem)
+        say(f"next: {own_code.command('train-ensemble', out, '--out', run_folder / 'ensemble')}")
+    say(out)
+
+
+def _labels(texts: Iterable[str]) -> dict[str, str]:
+    """The rules of ``--label NAME=RULE`` by name."""
+    labels = {}
+    for text in texts:
+        name, _, rule = text.partition("=")
+        if not (name and rule):
+            raise UserError("--label needs NAME=RULE", text, "For example --label won=next.success.")
+        labels[name] = rule
+    return labels
+
+
+def _sides(texts: Iterable[str]) -> dict[str, int]:
+    """The pixels of ``--resize [KEY=]N`` by key; without a key they are those of all pictures."""
+    sides = {}
+    for text in texts:
+        key, _, pixels = text.rpartition("=")
+        if not pixels.isdecimal():
+            raise UserError("--resize needs a number of pixels", text, "Give --resize 128 or KEY=128.")
+        sides[key] = int(pixels)
+    return sides
+
+
+def _reading(dataset: Any, resized: bool) -> Iterable[str]:
+    """How states were read, as pictures or numbers; of large pictures, how to import them smaller."""
+    from hypogoal.observations import PICTURE, fields_of
+
+    for key, (dtype, shape) in fields_of(dataset.observation_shape, dataset.observation_dtype).items():
+        sizes = " x ".join(map(str, shape))
+        kind = "pictures" if dtype == PICTURE else "numbers"
+        yield f"{key or 'states'}: taken for {kind}, {sizes} {dtype}"
+        if dtype == PICTURE and max(shape[:2]) > LARGE and not resized:
+            yield f"pictures of {sizes} need much memory and time; add --resize {LARGE} --force"
+
+
+@command(OWN, "export data/doorkey.h5 --out states.npz")
+def export(
+    source: Annotated[Path, Argument(help="A data file, or the folder of a meta or an ensemble artefact.")],
+    out: Annotated[Path, Option(help="The .npz file, or the folder; a Minari dataset's is NAME-v0.")],
+    episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
+    seed: Annotated[int, Option(min=0, help="Seed of the agent's choices.")] = 0,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write states, an agent's episodes or an ensemble for other software.
+
+    States as NumPy arrays, episodes as a Minari dataset. 'import' reads both.
+    Ensembles as a folder that torch and safetensors load without hypogoal.
+    """
+    from hypogoal.tools.export import export as written
+
+    line = written(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
+    if line and not quiet:
+        say(line)
+    say(out)
+
+
+@command(OWN, "check mine:DOMAIN")
+def check(
+    domain: Annotated[str | None, Argument(help=DOMAINS)] = None,
+    diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
+    network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    layout_seed: Annotated[int, Option(min=0, help="The layout to play.")] = 0,
+) -> None:
+    """Check that your domain, objective or network keeps its contract.
+
+    Exit code 2 if not. It collects a few states of the domain twice; --set
+    changes how, as for 'collect'.
+    """
+    from hypogoal.check import check_domain, check_network, check_objective
+    from hypogoal.diversity import load_objective
+    from hypogoal.domains.base import load_domain
+    from hypogoal.settings import configuration
+
+    if domain is None and diversity is None and network is None:
+        raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
+    verdicts: list[Any] = []
+    observations: tuple[Any, ...] = ()
+    if domain is not None:
+        loaded = load_domain(domain)
+        settings = configuration("collect", domain, None, set_)
+        verdicts.append(check_domain(loaded, settings, layout_seed=layout_seed, seed=seed))
+        observations = tuple(loaded.observation_shape), loaded.observation_dtype
+    if diversity is not None:
+        verdicts.append(check_objective(load_objective(diversity)))
+    if network is not None:
+        verdicts.append(check_network(network, *observations))
+    broken = False
+    for verdict in itertools.chain(*verdicts):
+        broken |= not verdict.ok
+        for line in verdict.lines:
+            say(line)
+    if broken:
+        raise typer.Exit(2)
+
+
+list_stage("audit", OWN)
+
+if __name__ == "__main__":
+    sys.exit(main())

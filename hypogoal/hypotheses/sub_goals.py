@@ -1,0 +1,132 @@
+"""The ensemble of one sub-goal: checked, trained with a log, written, and judged for a first time (Spec A2)."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hypogoal.core.artefacts import Draft
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import json_lines, read_end
+from hypogoal.core.processes import prepare
+from hypogoal.core.progress import MetricsLog
+from hypogoal.core.seeding import seed_for
+from hypogoal.data import Dataset, joined_unlabelled, open_dataset
+from hypogoal.diversity import load_objective
+from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
+from hypogoal.hypotheses.networks import load_network, names_in, network_for
+from hypogoal.hypotheses.scores import best_mean_worst, member_scores
+from hypogoal.hypotheses.teacher import load_teacher
+from hypogoal.hypotheses.thresholds import threshold_rule
+from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.views import StateOrigins, own_view
+
+LOOKED_AT = 100  # held-out states of each class, cheap beside training
+
+
+def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
+    """The settings with the network that fits the data, and the sub-goals; what cannot be trained is refused."""
+    load_objective(config.diversity)
+    threshold_rule(config.threshold)
+    if config.teacher:
+        load_teacher(config.teacher)
+    if config.view != FULL:
+        own_view(config.view, config.view_settings, dataset.observation_shape)
+    config = replace(config, network=network_for(config.network, dataset.observation_dtype))
+    for name in names_in(config.network):
+        load_network(name)
+    sub_goals = config.sub_goals or dataset.sub_goals
+    if len({*sub_goals}) < len(sub_goals):
+        raise UserError("a sub-goal is named twice", ", ".join(sub_goals), "Name each once.")
+    for sub_goal in sub_goals:
+        if sub_goal not in dataset.sub_goals:
+            raise UserError("unknown sub-goal", sub_goal, f"{dataset.path} has {', '.join(dataset.sub_goals)}.")
+    return config, sub_goals
+
+
+def train_sub_goal(
+    draft: Draft,
+    data: Path,
+    others: Sequence[Path],
+    sub_goal: str,
+    config: TrainEnsembleConfig,
+    seed: int,
+    device: str,
+    tensorboard: Path | None,
+) -> dict[str, float]:
+    """Train a sub-goal's ensemble, in a process of its own, and write it; returns its :func:`heldout_accuracy`.
+
+    ``others`` are the files of unlabelled states, if not ``data``.
+    """
+    prepare()
+    checkpoints = draft.checkpoints(sub_goal)
+    dataset = open_dataset(data)
+    labelled = dataset.labelled(sub_goal)
+    unlabelled, origins = joined_unlabelled(others or [data])
+    log = MetricsLog(log_of(draft, sub_goal), tensorboard)
+    if not checkpoints.saved:
+        log.restore(0)
+    with contextlib.closing(log):
+        ensemble = fit(
+            labelled.observations,
+            labelled.labels,
+            unlabelled,
+            config,
+            seed_for(seed, "ensemble", sub_goal),
+            LossLog(sub_goal, log),
+            origins=StateOrigins(labelled.origins, origins),
+            device=device,
+            checkpoints=checkpoints,
+        )
+    write_ensemble(draft.files, sub_goal, ensemble)
+    return heldout_accuracy(ensemble, dataset, sub_goal)
+
+
+def log_of(draft: Draft, sub_goal: str) -> Path:
+    """The log of one sub-goal's training, beside its checkpoint."""
+    return draft.checkpoint / f"{sub_goal}.jsonl"
+
+
+def steps_in(logs: Iterable[Path]) -> int:
+    """How many steps of all sub-goals are in the logs that their processes are writing."""
+    steps = 0
+    for log in logs:
+        last = next(iter(json_lines(reversed(read_end(log)))), {})
+        steps += last.get("step", 0)
+    return steps
+
+
+class LossLog(Watcher):
+    """Logs the losses of a sub-goal's ensemble."""
+
+    def __init__(self, sub_goal: str, log: MetricsLog):
+        super().__init__()
+        self.sub_goal, self.log = sub_goal, log
+
+    def report(self, step: int, losses: dict[str, float]) -> None:
+        """Write a line."""
+        self.log.write(sub_goal=self.sub_goal, step=step, **losses)
+
+    def snapshot(self) -> dict[str, Any]:
+        """How long the log is."""
+        return {"log": self.log.snapshot()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Cut the log to what it was."""
+        self.log.restore(snapshot["log"])
+
+
+def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dict[str, float]:
+    """Best, mean and worst member's balanced accuracy on some held-out states; NaN without states of both classes."""
+    try:
+        states = dataset.some_heldout(sub_goal, LOOKED_AT)
+        predictions = ensemble.predictions(states.observations)
+    except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
+        return best_mean_worst(np.full(len(ensemble), np.nan))
+    return best_mean_worst(member_scores(predictions, states.labels)["balanced_accuracy"])
