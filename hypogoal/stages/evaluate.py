@@ -27,8 +27,8 @@ def evaluate(
     ``numbers.csv`` and ``arrays.h5``.
     """
     from hypogoal.core.files import write_table
-    from hypogoal.core.hdf5 import create_hdf5
     from hypogoal.core.processes import cores, prepare
+    from hypogoal.data import create_hdf5
     from hypogoal.evaluation import questions
     from hypogoal.evaluation.curves import group_runs, read_run
     from hypogoal.evaluation.judging import Work, cases_of, processes_for
