@@ -33,13 +33,14 @@ def open_file(path: Path, subject: str, do: str) -> BufferedReader:
 
 def read_text(path: Path, subject: str, do: str) -> str:
     """The text of a file in UTF-8, with or without a byte order mark, with line feeds as line ends."""
-    with open_file(path, subject, do) as file:
-        data = file.read()
     try:
-        text = data.decode("utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"{subject} missing", path, do) from None
     except UnicodeDecodeError:
         raise UserError(f"{subject} not text in UTF-8", path, do) from None
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    except OSError as error:
+        raise UserError(f"{subject} not readable ({error.strerror})", path, do) from None
 
 
 def read_end(path: Path) -> list[str]:
@@ -122,16 +123,11 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]
     replace_text(path, text.getvalue())
 
 
-def path_part(name: object) -> TypeGuard[str]:
-    """Whether a name can be part of a path: no separators or control characters, no dot or space first."""
-    if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
-        return False
-    return name.isprintable() and name.strip() == name and not name.startswith(".") and not set(name) & set("/\\")
-
-
 def plain_name(name: object) -> TypeGuard[str]:
     """Whether a text can name a sub-goal or the like: a file's name on every system. Any script is fine."""
-    return path_part(name) and not name.endswith(".") and not set(name) & set(NO_FILE_NAME)
+    if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
+        return False
+    return name.isprintable() and name.strip(" .") == name and not set(name) & set(f"{NO_FILE_NAME}/\\")
 
 
 def plain_names(names: object) -> bool:
@@ -139,12 +135,6 @@ def plain_names(names: object) -> bool:
     if not (isinstance(names, list | tuple) and names and all(map(plain_name, names))):
         return False
     return len({name.casefold() for name in names}) == len(names)
-
-
-def inside(folder: Path, name: str) -> Path | None:
-    """The path of ``name`` (``a/b.csv``) in ``folder``; None if it leads out."""
-    parts = name.split("/")
-    return folder.joinpath(*parts) if all(map(path_part, parts)) else None
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:
