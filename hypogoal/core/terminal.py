@@ -20,11 +20,6 @@ def say(text: object, *, err: bool = False) -> None:
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
 
-def draw(table: Any, width: int) -> None:
-    """Print a table on standard output, as wide as the terminal, or ``width`` if there is none."""
-    screen(width=None if sys.stdout.isatty() else width).print(table)
-
-
 def drawn(table: Any, width: int) -> str:
     """A table as plain text, the same on every machine."""
     console = screen(width=width, record=True, file=io.StringIO())
