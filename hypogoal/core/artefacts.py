@@ -23,6 +23,7 @@ from pydantic import BaseModel, ValidationError
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.files import read_json, replace_text, sync, visible
+from hypogoal.core.processes import peak_memory
 
 FORMAT = 3
 READ = (2, FORMAT)  # 2, of 0.23 and 0.24, ended with a digest of itself
@@ -85,28 +86,22 @@ class Settings(dict[str, Any]):
 
 
 class Artefact:
-    """A complete artefact: its folder and its manifest, which is read and checked; its files are not."""
+    """A complete artefact: its folder and its manifest, which is read and checked; its files are not.
+
+    Attributes:
+        kind: ensemble, options, meta, baseline, evaluation, report, comparison, audit, recorded-audit, hub, episodes.
+        config: the resolved configuration that made it.
+        seed: the seed that made it.
+    """
 
     def __init__(self, path: Path):
         self.path = path
         if not (path / MANIFEST).is_file():
             raise UserError(f"no artefact here (no {MANIFEST})", path, "Give the folder that a stage wrote.")
         self.manifest = _read_manifest(path / MANIFEST, AGAIN)
-
-    @property
-    def kind(self) -> str:
-        """ensemble, options, meta, baseline, evaluation, report, comparison, audit, recorded-audit, hub, episodes."""
-        return self.manifest.kind
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The resolved configuration that made it."""
-        return Settings(self.manifest.config)
-
-    @property
-    def seed(self) -> int:
-        """The seed that made it."""
-        return self.manifest.seed
+        self.kind = self.manifest.kind
+        self.config = Settings(self.manifest.config)
+        self.seed = self.manifest.seed
 
     def input(self, kind: str) -> Path:
         """The input of a kind; a ``UserError`` if there is none, or it is missing or was changed."""
@@ -212,16 +207,6 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(metadata.PackageNotFoundError):
             installed[name] = metadata.version(name)
     return installed
-
-
-def peak_memory() -> int:
-    """The most bytes of memory that this process or one of its children has held; 0 where the system does not say."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0
-    kilobytes = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return 1024 * max(kilobytes)
 
 
 class Draft:
@@ -361,23 +346,21 @@ def _input(path: Path, out: Path) -> Input:
 
 def _begun(draft: Draft, wanted: Manifest, out: Path, *, force: bool, resume: bool) -> Manifest | None:
     """How the draft to continue was begun; None: begin anew. May I write here? If not, a ``UserError``."""
-    is_free = not out.exists() or (out.is_dir() and not any(out.iterdir()))
-    if not is_free and kind_of(out) != wanted.kind:
-        what = f"of kind {kind_of(out)!r}" if kind_of(out) else "not made by hypogoal"
-        raise UserError(f"what is there is {what}, and would be replaced by one of kind {wanted.kind!r}", out, AWAY)
+    there = kind_of(out)
+    if there not in (None, wanted.kind):
+        what = f"of kind {there!r}" if there else "not made by hypogoal"
+        raise UserError(f"what is there is {what}, this is of kind {wanted.kind!r}", out, AWAY)
     if draft.is_resumable and resume:
         begun = _read_manifest(draft.begun, ANEW)
         _refuse_other(begun, wanted, "the unfinished output was begun", out)
         return begun
     if draft.is_resumable and not force:
         raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
-    if is_free:
-        return None
-    if resume:
+    if there and resume:
         made = _made(out).model_copy(update={"versions": {}})  # nothing is continued
         _refuse_other(made, wanted, "the complete output was made", out)
         raise Complete(out)
-    if not force:
+    if there and not force:
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
     return None
 
@@ -414,17 +397,20 @@ def _made(out: Path) -> Manifest:
         raise UserError(f"the data file is damaged ({error})", out, ANEW) from None
 
 
-def kind_of(out: Path) -> str:
-    """The kind of an existing output, whole or damaged; empty if it is none of hypogoal's."""
-    if out.is_file():
-        with out.open("rb") as file:
-            front = file.read(FRONT)
-        fitting = [kind for kind, (begin, part) in SIGNATURES.items() if front.startswith(begin) and part in front]
-        return fitting[0] if fitting else ""
-    with contextlib.suppress(UserError):
-        content = read_json(out / MANIFEST, "the manifest is", AGAIN)
-        if isinstance(content, dict) and "format" in content:
-            return str(content.get("kind", ""))
+def kind_of(out: Path) -> str | None:
+    """The kind of an output, whole or damaged; empty if it is none of hypogoal's, None if nothing is there."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return None
+    if out.is_dir():
+        with contextlib.suppress(UserError, TypeError, KeyError):
+            content = read_json(out / MANIFEST, "the manifest is", AGAIN)
+            return str(content["kind"]) if "format" in content else ""
+        return ""
+    with out.open("rb") as file:
+        front = file.read(FRONT)
+    for kind, (begin, part) in SIGNATURES.items():
+        if front.startswith(begin) and part in front:
+            return kind
     return ""
 
 

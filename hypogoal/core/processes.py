@@ -133,6 +133,16 @@ def _terminate(processes: Iterable[BaseProcess]) -> None:
         left = [process for process in left if process.is_alive()]
 
 
+def peak_memory() -> int:
+    """The most bytes of memory that this process or one of its children has held; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    kilobytes = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return 1024 * max(kilobytes)
+
+
 def check_device(device: str) -> None:
     """Refuse (``UserError``) an unknown device; whether this machine has it is not checked."""
     if device not in DEVICES:

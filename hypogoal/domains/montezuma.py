@@ -99,8 +99,7 @@ class _Task(NamedTuple):
     def load(self) -> RoomStates | None:
         """The states gathered before, if any."""
         saved = self.kept.load()
-        with self.kept.restoring():
-            return RoomStates(**saved) if saved else None
+        return RoomStates(**saved) if saved else None
 
 
 def chosen(config: MontezumaConfig) -> list[SubGoal]:

@@ -84,12 +84,12 @@ def thresholds_of(artefact: Artefact) -> NDArray[np.float64]:
     NaN where options end at true sub-goals.
     """
     from hypogoal.core.tensors import load_tensors  # with PyTorch, which a report needs not
-    from hypogoal.options.termination import THRESHOLDS, thresholds_in
+    from hypogoal.options.termination import thresholds_in
 
     options = len(artefact.config["sub_goals"]) * artefact.config["members"]
     if not takes(artefact):
         return np.full(options, np.nan)
-    saved = load_tensors(artefact.path / "options.safetensors", THRESHOLDS)
+    saved = load_tensors(artefact.path / "options.safetensors")
     return 1 / (1 + np.exp(-thresholds_in(saved, options).astype(np.float64)))
 
 

@@ -26,12 +26,12 @@ from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
-from hypogoal.core.tensors import KEPT
 from hypogoal.hypotheses.load import ByKey
 from hypogoal.observations import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
+KEPT = {f"torch.{name}" for name in ("float32", "float64", "int64", "int32", "uint8", "bool")}  # types of weights
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network

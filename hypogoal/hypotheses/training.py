@@ -106,12 +106,9 @@ def fit(
 
     taught: Tensor | None = None
     if saved is not None:
-        with checkpoints.restoring():
-            if not 0 <= saved["round"] <= len(rounds) or (saved["round"] == len(rounds) and saved["part"]):
-                raise ValueError("no such round")
-            ensemble.load_state_dict(saved["ensemble"])
-            watcher.restore(saved["watcher"])
-            taught = saved["taught"]
+        ensemble.load_state_dict(saved["ensemble"])
+        watcher.restore(saved["watcher"])
+        taught = saved["taught"]
     elif config.teacher:
         drawn = seed_for(seed, "proposals")
         taught = taught_by(config.teacher, observations, labels, unlabelled, config.members, drawn)
@@ -133,8 +130,7 @@ def fit(
             before = number * config.steps
             part = Round(networks, members, states, config, seed_for(seed, "batches", number), before, taught)
             if saved and number == first:
-                with checkpoints.restoring():
-                    part.restore(saved["part"])
+                part.restore(saved["part"])
             for step in part.steps(watcher.report):
                 watcher.look(step, ensemble)
                 checkpoints.offer(partial(state, number, part))

@@ -13,7 +13,7 @@ from hypogoal.core.arrays import Columns, tensor
 from hypogoal.core.checkpoints import State
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
-from hypogoal.core.tensors import AGAIN, check_fit
+from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
 from hypogoal.meta.config import MetaConfig
@@ -177,8 +177,7 @@ class MetaPolicy(Chooser):
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
-        check_fit(self.state(), state, FILE, AGAIN)
-        self.policy.load_state_dict(state)
+        load_into(self.policy, state, FILE)
 
     def snapshot(self) -> State:
         """As of :class:`Resumable`, and the decisions, in one array for each column."""

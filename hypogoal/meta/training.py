@@ -226,12 +226,11 @@ def train(
         return {"loop": loop.snapshot(), "log": log.snapshot(), "logged": logged, "numbers": numbers}
 
     saved = checkpoints.load()
-    with checkpoints.restoring():
-        log.restore(saved["log"] if saved else 0)
-        if saved:
-            loop.restore(saved["loop"])
-            logged, numbers = saved["logged"], saved["numbers"]
-            progress.resume(recorder.steps - begin)
+    log.restore(saved["log"] if saved else 0)
+    if saved:
+        loop.restore(saved["loop"])
+        logged, numbers = saved["logged"], saved["numbers"]
+        progress.resume(recorder.steps - begin)
     solved = recorder.episodes.solved(until)
     with checkpoints:
         while recorder.steps < end and not solved:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.arrays import tensor
+from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
+from hypogoal.core.tensors import below, load_fitting, load_into
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow
@@ -214,8 +214,7 @@ class LightLearner(Learner):
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         weights = below("online.", weights)
-        check_fit(self.online.state_dict(), weights, "options.safetensors", AGAIN)
-        self.online.load_state_dict(weights)
+        load_into(self.online, weights, "options.safetensors")
         self.target.load_state_dict(weights)
 
 

@@ -20,7 +20,7 @@ from hypogoal.core.arrays import Columns
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
+from hypogoal.core.tensors import below, load_fitting, load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
@@ -205,8 +205,7 @@ class RecurrentLearner(Learner):
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):
             of_option = below(f"{option}.", weights)
-            check_fit(member.online.state_dict(), of_option, f"option {option} of options.safetensors", AGAIN)
-            member.online.load_state_dict(of_option)
+            load_into(member.online, of_option, f"option {option} of options.safetensors")
             member.target.load_state_dict(of_option)
 
 

@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from hypogoal.core.arrays import tensor
+from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
-from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded

@@ -158,7 +158,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drop", help="MODULE:CLASS.NAME, a name to leave out of snapshots")
     given = parser.parse_args()
-    for name in ("torch._dynamo", "hypogoal.stages.train_baseline", "hypogoal.stages.train_meta"):
+    for name in ("torch._dynamo", "hypogoal.learners.baselines.agents", "hypogoal.meta.training"):
         import_module(name)  # what every process would load
     root = Path(tempfile.mkdtemp(prefix="kills-"))
     whole = root / "whole"

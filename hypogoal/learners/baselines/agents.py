@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from hypogoal.core.checkpoints import Checkpoints, optimiser_snapshot, restore_optimiser
+from hypogoal.core.checkpoints import Checkpoints, restored, snapshot_of
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for
@@ -181,11 +181,10 @@ def train(
             agent.exploration_schedule = lambda _: epsilon(agent.chosen, env.episodes.steps, watch.first_goal)
             agent.exploration_rate = 1.0
         saved = checkpoints.load()
-        with checkpoints.restoring():
-            if saved is not None:
-                watch.restore(agent, saved)
-            if log:
-                log.restore(saved["log"] if saved else 0)
+        if saved is not None:
+            watch.restore(agent, saved)
+        if log:
+            log.restore(saved["log"] if saved else 0)
         with checkpoints:
             agent.learn(
                 steps - agent.num_timesteps,
@@ -219,7 +218,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
     fresh = np.zeros(shape, env.observation_space.dtype), np.ones(env.num_envs, np.bool_)
     return {
         "policy": agent.policy.state_dict(),
-        "optimiser": optimiser_snapshot(agent.policy.optimizer),
+        "optimiser": snapshot_of(agent.policy.optimizer),
         "counts": {name: getattr(agent, name) for name in COUNTS},
         "logged": _logged(agent, prefix="train/"),
         "last_observations": fresh[0] if agent._last_obs is None else agent._last_obs,
@@ -236,7 +235,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
 def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, Any]) -> None:
     """Continue from an ``agent_snapshot`` of such an agent."""
     agent.policy.load_state_dict(snapshot["policy"])
-    restore_optimiser(agent.policy.optimizer, snapshot["optimiser"])
+    restored(agent.policy.optimizer, snapshot["optimiser"])
     for name, value in snapshot["counts"].items():
         setattr(agent, name, value)
     agent.logger.name_to_value.update(snapshot["logged"])
