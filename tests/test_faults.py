@@ -175,6 +175,6 @@ def test_folders_that_may_not_be_written(tmp_path: Path) -> None:
     tmp_path.chmod(0o555)
     try:
         run("verify", path)
-        refuses("no permission to write", "collect", "doorkey", "--out", tmp_path / "new.h5")
+        refuses("Permission denied", "collect", "doorkey", "--out", tmp_path / "new.h5")
     finally:
         tmp_path.chmod(0o755)

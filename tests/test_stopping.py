@@ -92,21 +92,6 @@ def test_workers_save_when_their_stage_is_stopped(tmp_path: Path) -> None:
     assert all(state and state["part"]["watch"]["done"] > 0 for state in saved)
 
 
-STOPPED_AT_ONCE = """
-import os, signal, sys
-import hypogoal.cli
-
-hypogoal.cli._commands = lambda: lambda **_: os.kill(os.getpid(), signal.SIGTERM)
-sys.exit(hypogoal.cli.main())
-"""
-
-
-def test_stopped_before_a_command_is_reached() -> None:
-    done = subprocess.run([sys.executable, "-c", STOPPED_AT_ONCE], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 128 + signal.SIGTERM
-    assert done.stderr == "hypogoal: stopped; nothing was half-written\n"
-
-
 SLEEPERS = """
 import functools, os, pathlib, sys, time
 from hypogoal.core.processes import in_processes

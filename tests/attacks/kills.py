@@ -50,8 +50,6 @@ COMMANDS = {
     " --out run/meta",
     "run/ppo": "train-baseline doorkey --set agent=ppo --set steps=2560 --set max_episode_steps=60"
     " --set random_episodes=5 --out run/ppo",
-    "run/dqn": "train-baseline doorkey --set agent=dqn --set steps=1600 --set max_episode_steps=60"
-    " --set random_episodes=5 --out run/dqn",
     "run/evaluation": "evaluate run",
     "run/report": "report run",
     "own.npz": "export run/data.h5 --out own.npz",
@@ -59,7 +57,7 @@ COMMANDS = {
     "sweep": "run toy.toml --out sweep",
 }
 WITHOUT_RESUME = ("own.npz", "own.h5")
-SAVING = ("run/ensemble", "run/options", "run/meta", "run/ppo", "run/dqn", "sweep")  # with checkpoints
+SAVING = ("run/ensemble", "run/options", "run/meta", "run/ppo", "sweep")  # with checkpoints
 
 
 def begin(command: str, folder: Path, pace: str) -> int:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import refuses, run
 
 from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, Draft, create, find_artefacts, open_artefact
 from hypogoal.core.errors import Complete, NumericalError, UserError
@@ -332,13 +331,6 @@ def test_no_room_leaves_nothing(tmp_path: Path) -> None:
     assert 10 < full < 38
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_no_permission_to_write_is_one_line(tmp_path: Path) -> None:
-    place = tmp_path / "shut"
-    place.mkdir(mode=0o500)
-    refuses("Permission denied", "train-baseline", "doorkey", "--out", place / "ppo")
-
-
 HOLD = """
 import sys, signal
 from pathlib import Path
@@ -382,9 +374,3 @@ def test_a_kill_between_two_renames_loses_nothing(tmp_path: Path) -> None:
     with pytest.raises(Complete):
         finish(out, seed=8, resume=True)
     assert open_artefact(out).seed == 8 and os.listdir(tmp_path) == ["meta"]
-
-
-def test_a_path_with_spaces_and_umlauts(tmp_path: Path) -> None:
-    out = tmp_path / "Daten für später" / "ein ö.h5"
-    assert run("collect", "rooms", "--out", out, "--set", "labelled=20", "-q").path == out
-    assert os.listdir(out.parent) == [out.name]
