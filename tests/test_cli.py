@@ -112,7 +112,7 @@ def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
     refuses(f"{made_with} seed=0, not 3", *resumed(tiny_run, "ensemble", "--seed", "3"))
     refuses(f"{made_with} other inputs", *resumed(tiny_run, "ensemble", "--unlabelled", str(data)))
     refuses("no such file", "train-ensemble", tiny_run / "none.h5", "--out", ensemble, "--resume")
-    refuses("not of kind 'meta': it is of kind", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
+    refuses("not of kind 'meta' but of kind", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
     refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", meta, "--resume")
     refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
 
@@ -137,7 +137,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     folder = tmp_path_factory.mktemp("mistakes")
     (folder / "cut.h5").write_bytes((tiny_run / "data.h5").read_bytes()[:5000])
     shutil.copytree(tiny_run / "ensemble", folder / "newer")
-    reseal(folder / "newer", format=3)
+    reseal(folder / "newer", format=4)
     own = {name: folder / name for name in ("newer", "none", "out")}
     made = {"made": tiny_run, "data": tiny_run / "data.h5", "ensemble": tiny_run / "ensemble"}
     return {**made, **own, "cut": folder / "cut.h5"}
@@ -148,7 +148,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     [
         ("train-ensemble {none}.h5 --out {out}", "no such file"),
         ("train-ensemble {ensemble} --out {out}", "is a directory"),
-        ("train-meta {data} --out {out}", "not an artefact"),
+        ("train-meta {data} --out {out}", "no artefact here"),
         ("train-meta {made}/options --out {out}", "'options' artefact, but ensemble is needed"),
         ("train-meta {ensemble} --options {ensemble} --out {out}", "but options is needed"),
         ("train-ensemble {data} --out {ensemble}", "exists already"),
@@ -157,7 +157,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("train-meta {ensemble} --out {ensemble} --force", "would replace an input"),
         ("export {data} --out {data} --force", "as .npz"),
         ("collect doorkey --out {ensemble} --force", "not of kind 'data'"),
-        ("evaluate {ensemble} --out {ensemble} --force", "not of kind 'evaluation'"),
+        ("evaluate {ensemble} --out {ensemble} --force", "would replace an input"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
         ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
         ("train-ensemble {data} --out {out} --seed 9007199254740992", "--seed"),
@@ -178,7 +178,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("train-ensemble {data} --out {out} --diversity magic", "magic"),
         ("train-ensemble {cut} --out {out}", "the data file cannot be read"),
         ("show {cut}", "the data file cannot be read"),
-        ("train-meta {newer} --out {out}", "newer"),
+        ("train-meta {newer} --out {out}", "reads formats 2 and 3, this is 4"),
         ("train-meta {ensemble} --out {out} --device tpu", "unknown device"),
         ("train-meta {ensemble} --options {made}/options --out {out} --layout-seed 3", "layout_seed"),
         ("evaluate {none}", "no such run: "),

@@ -348,8 +348,8 @@ def _begun(draft: Draft, wanted: Manifest, out: Path, *, force: bool, resume: bo
     """How the draft to continue was begun; None: begin anew. May I write here? If not, a ``UserError``."""
     there = kind_of(out)
     if there not in (None, wanted.kind):
-        what = f"of kind {there!r}" if there else "not made by hypogoal"
-        raise UserError(f"what is there is {what}, this is of kind {wanted.kind!r}", out, AWAY)
+        what = f"of kind {there!r}" if there else "none of hypogoal's"
+        raise UserError(f"what is there is not of kind {wanted.kind!r} but {what}", out, AWAY)
     if draft.is_resumable and resume:
         begun = _read_manifest(draft.begun, ANEW)
         _refuse_other(begun, wanted, "the unfinished output was begun", out)

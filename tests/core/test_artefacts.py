@@ -243,7 +243,7 @@ def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path, monkeypatch
     names = [("ensemble", "meta"), ("ensemble", DATA), ("unreadable", "meta"), ("mine", "meta")]
     names += [("foreign.h5", DATA), ("foreign.h5", "meta"), ("other.h5", DATA)]
     for name, kind in names:
-        with pytest.raises(UserError, match="what is there is"):
+        with pytest.raises(UserError, match="what is there is not of kind"):
             finish(tmp_path / name, kind=kind, force=True)
     for out, path in (("ensemble", "link"), ("link", "ensemble"), (".", "ensemble")):
         with pytest.raises(UserError, match="would replace an input"):
