@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import FileLock, Timeout, lock_descriptor
 from pydantic import BaseModel, ValidationError
 
 from hypogoal.core.checkpoints import Checkpoints
@@ -236,13 +236,11 @@ class Draft:
     @property
     def is_locked(self) -> bool:
         """Whether a process works on it."""
-        if not self.lock.is_file():
-            return False
         try:
-            with FileLock(self.lock, timeout=0):
-                return False
-        except Timeout:
-            return True
+            with self.lock.open("r+b") as file:
+                return not lock_descriptor(file.fileno(), blocking=False)
+        except OSError:
+            return False
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
