@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
 from hypogoal.evaluation.curves import LEARNED
+from hypogoal.evaluation.run import find_artefacts
 from studies.cells import difference, interval, table
 
 ENSEMBLES = {

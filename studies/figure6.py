@@ -18,11 +18,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import Artefact, find_artefacts
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.choosing import UNIFORM
 from hypogoal.evaluation.curves import Run, read_run, run_numbers
 from hypogoal.evaluation.frozen import ENVIRONMENTS, play
+from hypogoal.evaluation.run import find_artefacts
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser

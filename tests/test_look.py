@@ -12,9 +12,10 @@ import pytest
 from command_line import fails, refuses, run
 from toy_data import files_of
 
-from hypogoal.core.artefacts import create, find_artefacts, open_artefact
+from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected, States, write_dataset
+from hypogoal.evaluation.run import find_artefacts
 from hypogoal.look import describe, faults, lines, outcome, stale
 
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")

@@ -9,10 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import fails, run, settings
+from command_line import fails
 
 from hypogoal.core.artefacts import Draft
-from hypogoal.core.checkpoints import Checkpoints
 
 ROOT = Path(__file__).resolve().parents[1]
 WAIT_SECONDS = 300.0
@@ -72,24 +71,6 @@ def test_ctrl_c_and_sigterm_save_and_say_how_to_continue(tmp_path: Path) -> None
         assert Draft(out).is_resumable and not out.exists()
     assert "an unfinished output exists" in fails(*words).err
     assert "begun with seed=0, not 1" in fails(*words, "--resume", "--seed", "1").err
-
-
-@pytest.mark.slow
-def test_workers_save_when_their_stage_is_stopped(tmp_path: Path) -> None:
-    """SIGTERM reaches the processes that train a sub-goal each, and each of them saves."""
-    data, out = tmp_path / "data.h5", tmp_path / "ensemble"
-    run("collect", "doorkey", "--out", data, *settings("heldout_layouts=1", "unlabelled_seeds=1"), "-q")
-    long = settings("steps=1000000", "workers=2", "sub_goals=open-red-door,go-to-goal")
-    command = [sys.executable, "-m", "hypogoal", "train-ensemble", str(data), "--out", str(out), *long]
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
-        logs = [Draft(out).checkpoint / f"{name}.jsonl" for name in ("open-red-door", "go-to-goal")]
-        wait_for(lambda: all(log.exists() and log.stat().st_size for log in logs), process)
-        process.terminate()
-        _, told = process.communicate()
-    assert process.returncode == 128 + signal.SIGTERM
-    assert told.count("hypogoal: stopped; the last checkpoint is kept") == 1 and "Traceback" not in told
-    saved = [Checkpoints(log.with_suffix(".safetensors")).load() for log in logs]
-    assert all(state and state["part"]["watch"]["done"] > 0 for state in saved)
 
 
 SLEEPERS = """

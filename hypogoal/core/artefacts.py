@@ -22,7 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import Complete, UserError
-from hypogoal.core.files import read_json, replace_text, sync, visible
+from hypogoal.core.files import read_json, replace_text, sync
 from hypogoal.core.processes import peak_memory
 
 FORMAT = 3
@@ -34,7 +34,6 @@ DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .np
 # How a file of a kind begins, and what its first bytes have, even if the rest is cut off.
 SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations.npy")}
 FRONT = 1 << 16  # bytes of a file that are looked at for its kind
-DEPTH = 3  # levels of folders below a run that are searched for artefacts
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers", "quiet")  # settings that change no result
 AGAIN = "Make the artefact again."
@@ -171,15 +170,6 @@ def open_artefact(path: Path, *kinds: str) -> Artefact:
     for name, fault in artefact.file_faults().items():
         raise UserError(f"the artefact is damaged ({name}: {fault})", path, AGAIN)
     return artefact
-
-
-def find_artefacts(run: Path, kind: str) -> list[Artefact]:
-    """All artefacts of a kind below ``run`` and ``run`` itself, sorted by path."""
-    if not run.is_dir():
-        raise UserError("no such run", run, "Give the folder of a run.")
-    folders = [path.parent for path in visible(run, MANIFEST)]
-    near = [folder for folder in folders if len(folder.relative_to(run).parts) <= DEPTH]
-    return [artefact for artefact in map(Artefact, near) if artefact.kind == kind]
 
 
 def sha256_of(path: Path) -> str:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from hypogoal.core.artefacts import Artefact, find_artefacts
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.errors import UserError
+from hypogoal.evaluation.run import find_artefacts
 from hypogoal.observations import PICTURE
 
 if TYPE_CHECKING:

@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import AGAIN, Artefact, find_artefacts, open_artefact, sha256_of
+from hypogoal.core.artefacts import AGAIN, MANIFEST, Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, read_json
+from hypogoal.core.files import plain_name, read_json, visible
 from hypogoal.core.own_code import command
 from hypogoal.data import reading
 from hypogoal.evaluation.table import EVALUATE_AGAIN
 from hypogoal.options.tables import MAX_INTEGER
 
 FORMAT = 4  # of ``metrics.json``
+DEPTH = 3  # levels of folders below a run that are searched for artefacts
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,15 @@ class Contents:
     def name(self, artefact: Artefact) -> str:
         """Its path within the run."""
         return artefact.path.relative_to(self.run).as_posix()
+
+
+def find_artefacts(run: Path, kind: str) -> list[Artefact]:
+    """All artefacts of a kind below ``run`` and ``run`` itself, sorted by path."""
+    if not run.is_dir():
+        raise UserError("no such run", run, "Give the folder of a run.")
+    folders = [path.parent for path in visible(run, MANIFEST)]
+    near = [folder for folder in folders if len(folder.relative_to(run).parts) <= DEPTH]
+    return [artefact for artefact in map(Artefact, near) if artefact.kind == kind]
 
 
 def find(run: Path) -> Contents:

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -13,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from toy_data import reseal
 
-from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, Draft, create, find_artefacts, open_artefact
+from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, Draft, create, open_artefact
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.data import create_hdf5
+from hypogoal.evaluation.run import find_artefacts
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "world": {"rooms": 2}}, "seed": 7}
 
@@ -42,12 +43,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def rewrite(artefact: Path, **changes: Any) -> None:
-    """Change keys of a manifest."""
-    path = artefact / MANIFEST
-    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8-sig")) | changes))
-
-
 def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
     source, out = tmp_path / "ensemble", tmp_path / "meta"
     finish(source, kind="ensemble")
@@ -69,9 +64,9 @@ def test_white_space_and_took_are_no_change(tmp_path: Path) -> None:
     for text in (json.dumps(manifest), json.dumps(manifest, indent=4).replace("\n", "\r\n")):
         (source / MANIFEST).write_bytes(b"\xef\xbb\xbf" + text.encode())
         assert Artefact(out).faults() == []
-    rewrite(source, took={"seconds": 9.9})
+    reseal(source, took={"seconds": 9.9})
     assert Artefact(out).faults() == []
-    rewrite(source, seed=8)
+    reseal(source, seed=8)
     assert Artefact(out).faults() == [f"its input {source} (ensemble) is changed since it was written"]
 
 
@@ -100,7 +95,7 @@ def test_an_artefact_of_format_2_is_read(tmp_path: Path) -> None:
 )
 def test_manifests_that_are_refused(tmp_path: Path, change: dict[str, Any], words: str) -> None:
     finish(tmp_path / "meta")
-    rewrite(tmp_path / "meta", **change)
+    reseal(tmp_path / "meta", **change)
     with pytest.raises(UserError, match=words):
         Artefact(tmp_path / "meta")
 
@@ -147,7 +142,7 @@ def test_a_moved_run_finds_its_inputs(tmp_path: Path) -> None:
     moved = Artefact(tmp_path / "far" / "kopiert ü" / "meta")
     assert moved.input("ensemble") == moved.path.parent / "ensemble"
     assert Artefact(moved.input("ensemble")).input(DATA) == data
-    rewrite(moved.path.parent / "ensemble", seed=8)
+    reseal(moved.path.parent / "ensemble", seed=8)
     with pytest.raises(UserError, match="changed since"):
         moved.input("ensemble")
 
@@ -163,7 +158,7 @@ def test_resume_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert finish(out, resume=True) == 1 and os.listdir(tmp_path) == ["meta"]
     manifest = open_artefact(out).manifest
     assert manifest.files.keys() == {"half.csv", "whole.csv"} and manifest.command == ["hypogoal", "train-meta"]
-    rewrite(out, versions={"torch": "0.1"}, config=ABOUT["config"] | {"gone": 1, "workers": 4})
+    reseal(out, versions={"torch": "0.1"}, config=ABOUT["config"] | {"gone": 1, "workers": 4})
     with pytest.raises(Complete):
         finish(out, resume=True)
     assert finish(tmp_path / "other", resume=True) == 0
@@ -251,7 +246,7 @@ def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path, monkeypatch
     assert contents(tmp_path) == before
     (tmp_path / "empty").mkdir()
     finish(tmp_path / "empty")
-    rewrite(tmp_path / "empty", seed="damaged")
+    reseal(tmp_path / "empty", seed="damaged")
     finish(tmp_path / "empty", force=True)
     assert open_artefact(tmp_path / "empty").seed == 7
 
@@ -306,29 +301,6 @@ def test_what_stops_a_stage_says_how_to_continue(tmp_path: Path) -> None:
         with pytest.raises(type(error)) as caught:
             stop(tmp_path / "early", type(error)(*error.args), checkpoint=False)
         assert not hasattr(caught.value, "__notes__")
-
-
-def test_no_room_leaves_nothing(tmp_path: Path) -> None:
-    """At whichever write the disk is full, the first included; what stood there stands."""
-    finish(tmp_path / "old")
-    before = contents(tmp_path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    full = 0
-    for limit in range(0, 1600, 80):
-        for name in ("new", "old"):
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-            try:
-                with create(tmp_path / name, **ABOUT, force=True) as draft:
-                    (draft.files / "whole.csv").write_text("y" * 300)
-            except OSError:
-                full += 1
-                assert contents(tmp_path) == before
-            else:
-                shutil.rmtree(tmp_path / "new", ignore_errors=True)
-                before = contents(tmp_path)
-            finally:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert 10 < full < 38
 
 
 HOLD = """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hypogoal.core.checkpoints import PACE, Checkpoints, restored, snapshot_of
+from hypogoal.core.checkpoints import Checkpoints, restored, snapshot_of
 from hypogoal.core.errors import UserError
 
 
@@ -126,12 +126,3 @@ def test_signals_wait_for_a_whole_state(tmp_path: Path) -> None:
             work(checkpoints, number)
         assert caught.value.args == (number,) and checkpoints.load() == {"steps": 3}
         assert signal.getsignal(number) == before
-
-
-def test_the_pace_is_set_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For the kill harness: at every step."""
-    monkeypatch.setenv(PACE, "0")
-    checkpoints = Checkpoints(tmp_path / "stage.safetensors")
-    for step in range(3):
-        checkpoints.offer(lambda step=step: {"step": step})  # type: ignore[misc]
-        assert checkpoints.load() == {"step": step}

@@ -15,11 +15,12 @@ from openings import agrees
 from rich.console import Console
 from toy_data import reseal
 
-from hypogoal.core.artefacts import find_artefacts, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation import judging
 from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.questions import summary_table
+from hypogoal.evaluation.run import find_artefacts
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
 from hypogoal.stages.evaluate import evaluate

@@ -28,9 +28,10 @@ from toy_data import reseal
 import hypogoal
 from hypogoal.cli import main
 from hypogoal.core import own_code
-from hypogoal.core.artefacts import find_artefacts, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
+from hypogoal.evaluation.run import find_artefacts
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import RewardedEnv
 from hypogoal.meta.episodes import agent_of
