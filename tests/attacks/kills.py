@@ -93,13 +93,17 @@ def is_resumable(out: Path) -> bool:
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """All files by their place, hidden ones too; manifests without ``took``; logs of cells say when they ran."""
+    """All files by their place, hidden ones too; manifests without ``took`` and this folder's own place.
+
+    Logs of cells are left out: they say when they ran.
+    """
     found: dict[str, object] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_file() and not name.startswith("sweep/logs"):
-            is_manifest = path.name == "manifest.json"
-            found[name] = {**json.loads(path.read_bytes()), "took": 0} if is_manifest else path.read_bytes()
+            found[name] = path.read_bytes()
+            if path.name == "manifest.json":
+                found[name] = {**json.loads(path.read_text().replace(str(folder), "")), "took": 0}
     return found
 
 
