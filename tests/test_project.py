@@ -22,7 +22,7 @@ from packaging.utils import NormalizedName, canonicalize_name
 from packaging.version import Version
 
 import hypogoal
-from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.artefacts import create
 from hypogoal.core.seeding import torch_generator
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
@@ -303,9 +303,9 @@ def test_formats_are_readable_without_hypogoal(
     data, ensemble = Path("data/doorkey.h5"), Path("runs/demo/ensemble")
     write_dataset(data, collected, domain="doorkey", config={}, seed=0)
     config = {"sub_goals": list(goals)}
-    with create_artefact(ensemble, kind="ensemble", config=config, seed=0, inputs=[data]) as folder:
+    with create(ensemble, kind="ensemble", config=config, seed=0, inputs=[data]) as draft:
         member = Ensemble("doorkey", (64, 64, 3), 1, torch_generator(0, "weights")).eval()
-        write_ensemble(folder, "open-red-door", member)
+        write_ensemble(draft.files, "open-red-door", member)
 
     snippets = code_of("docs/formats.md")
     assert len(snippets) == 4

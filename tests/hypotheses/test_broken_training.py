@@ -73,7 +73,11 @@ def test_a_broken_stage_ends_with_the_same_log(tiny_run: Path, tmp_path: Path, m
     train("unbroken")
     for last in (22, 8):
         with monkeypatch.context() as patch:
-            patch.setattr(Draft, "checkpoints", lambda draft, name, last=last: Breaking(draft.checkpoint / name, last))
+
+            def breaking(draft: Draft, name: str = "stage", last: int = last) -> Breaking:
+                return Breaking(draft.checkpoint / f"{name}.safetensors", last)
+
+            patch.setattr(Draft, "checkpoints", breaking)
             with pytest.raises(Broken):
                 train("out", resume=last == 8)
     train("out", resume=True)
