@@ -95,9 +95,8 @@ BROKEN = [
     (domain_of(images=lambda self, ids, out=None: np.zeros((len(ids), 64, 64, 3), np.float32)), "steps", "float32"),
     (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "observations", "does not fill out"),
     (domain_of(images=lambda self, ids, out=None: 1 // 0), "steps", "ZeroDivisionError"),
-    (stepping(rewards=lambda values: values.astype(np.float64)), "steps", "float64"),
+    (stepping(rewards=lambda values: values.astype(np.float64)), "steps", "rewards: float64 (3,) instead of float32"),
     (stepping(rewards=lambda values: values * np.nan), "steps", "finite"),
-    (stepping(terminated=lambda values: values.astype(np.int64)), "steps", "terminated: int64 (3,) instead of bool"),
     (stepping(succeeded=lambda _: [False] * 3), "steps", "succeeded"),
     (domain_of(step=never_ending), "steps", "went on after max_steps"),
     (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "steps", "(3, 1)"),
@@ -261,16 +260,12 @@ def test_each_broken_law_of_a_network_is_named(
 
 
 def squeezed(channels: int) -> nn.Module:
-    return convolution(nn.Sigmoid())
+    return convolution(nn.Sigmoid(), nn.Conv2d(4, 4, 1).requires_grad_(False))
 
 
-def frozen(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
-    return [nn.Conv2d(channels, 4, 8, 8).requires_grad_(False), nn.ReLU()], (8,)
-
-
-@pytest.mark.parametrize("name", [*NETWORKS, "test_check:squeezed", "test_check:frozen"])
+@pytest.mark.parametrize("name", [*NETWORKS, "test_check:squeezed"])
 def test_networks_that_keep_the_contract_pass(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec C5, F2: ours and own ones, some with frozen weights, and how they are explained."""
+    """Spec C5, F2: ours and own ones, with weights that stay as they are, and how they are explained."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     found = [*check_network(name)]
     require(found)
