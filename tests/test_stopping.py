@@ -36,8 +36,8 @@ def test_killed_commands_end_with_the_same_bytes() -> None:
     ("output", "name"),
     [
         ("run/ensemble", "hypogoal.hypotheses.training:Round.optimiser"),
-        ("run/options", "hypogoal.options.light:LightLearner.due"),
-        ("run/options", "hypogoal.domains.base:Engine.now"),
+        ("run/options", "hypogoal.options.light:LightLearner.optimiser"),
+        ("run/meta", "hypogoal.meta.ppo:MetaPolicy.rng"),
     ],
 )
 def test_a_name_that_is_dropped_from_a_snapshot_is_found(output: str, name: str) -> None:

@@ -8,8 +8,8 @@ arguments, settings and checks. What takes time to import is imported when it is
 import functools
 import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from inspect import Parameter
 from pathlib import Path
@@ -23,7 +23,8 @@ from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.terminal import say
 
 if TYPE_CHECKING:
-    from hypogoal.core.training import Training
+    from hypogoal.core.artefacts import Draft
+    from hypogoal.core.progress import MetricsLog, Progress
     from hypogoal.made import Made
 
 Place = str | os.PathLike[str]
@@ -68,6 +69,7 @@ class Call:
 
         return configuration(self.stage, domain, self.preset, (), self.typed, inherited=inherited)
 
+    @contextmanager
     def training(
         self,
         kind: str,
@@ -75,23 +77,27 @@ class Call:
         inputs: Sequence[Path],
         steps: int,
         tensorboard: Path | None = None,
-    ) -> "AbstractContextManager[Training]":
-        """The draft of an artefact in training, see :func:`hypogoal.core.training.training`."""
-        from hypogoal.core.training import training
+    ) -> "Iterator[Training]":
+        """The draft of an artefact in training, see :func:`hypogoal.core.artefacts.create`."""
+        from hypogoal.core.artefacts import LOG, create
+        from hypogoal.core.progress import MetricsLog, Progress
 
-        return training(
-            self.stage,
-            self.out,
-            steps=steps,
-            quiet=self.quiet,
-            tensorboard=tensorboard,
-            kind=kind,
-            config=config,
-            inputs=inputs,
-            seed=self.seed,
-            force=self.force,
-            resume=self.resume,
-        )
+        about: dict[str, Any] = {"kind": kind, "config": config, "seed": self.seed, "inputs": inputs}
+        with (
+            create(self.out, **about, force=self.force, resume=self.resume) as draft,
+            closing(MetricsLog(draft.files / LOG, tensorboard)) as log,
+            Progress(self.stage, steps, quiet=self.quiet) as progress,
+        ):
+            yield Training(draft, log, progress)
+
+
+@dataclass(frozen=True)
+class Training:
+    """An artefact in training: its draft, its log, its progress bar."""
+
+    draft: "Draft"
+    log: "MetricsLog"
+    progress: "Progress"
 
 
 @dataclass(frozen=True)

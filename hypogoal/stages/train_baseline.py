@@ -63,11 +63,11 @@ def train_baseline(
     }
     with call.training("baseline", settings, [data] if data else [], config.steps, tensorboard) as work:
         env = EngineEnv(engine)
-        agent = train(env, chosen, config.steps, call.seed, work.log, work.progress, work.checkpoints, device)
+        agent = train(env, chosen, config.steps, call.seed, work.log, work.progress, work.draft.checkpoints(), device)
         work.progress.update(config.steps)
-        Episodes.of_rows(env.episodes).write(work.folder)
-        save_tensors(work.folder / "policy.safetensors", weights(agent))
-        write_layout(work.folder, engine, config.layout_seed, config.random_episodes, call.seed, **begins)
+        Episodes.of_rows(env.episodes).write(work.draft.files)
+        save_tensors(work.draft.files / "policy.safetensors", weights(agent))
+        write_layout(work.draft.files, engine, config.layout_seed, config.random_episodes, call.seed, **begins)
     return Done(outcome_of(env.episodes.counts() | env.episodes.recent()), ("evaluate", call.out.parent))
 
 

@@ -53,7 +53,7 @@ def train_ensemble(
         with work.progress.following(partial(steps_in, logs)):
             in_processes(jobs, min(allowed(config.workers), len(jobs)), accuracies.__setitem__)
         texts = [log.read_text(encoding="utf-8") for log in logs]
-        (work.folder / LOG).write_text("".join(texts), encoding="utf-8")
+        (work.draft.files / LOG).write_text("".join(texts), encoding="utf-8")
     return Done(_outcome(accuracies, call.out), _next(call.out, dataset.domain))
 
 

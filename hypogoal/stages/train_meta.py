@@ -57,8 +57,8 @@ def train_meta(
             loop.recorder.start_at(practice.config.get("ended_at", practice.config["steps"]))
             if all(practice.config[key] == settings[key] for key in WORLD):
                 loop.recorder.episodes.extend(Episodes.read(practice.path / Episodes.FILE).rows())
-        training.train(loop, config.steps, work.log, work.progress, work.checkpoints)
-        training.write_trained(work.folder, loop, domain, source.config, config, call.seed)
+        training.train(loop, config.steps, work.log, work.progress, work.draft.checkpoints())
+        training.write_trained(work.draft.files, loop, domain, source.config, config, call.seed)
     episodes = loop.recorder.episodes
     return Done(outcome_of(episodes.counts() | episodes.recent()), ("evaluate", call.out.parent))
 

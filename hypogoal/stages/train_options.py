@@ -46,12 +46,12 @@ def train_options(
         loop = training.assemble(domain, source.path, source.config, config, call.seed, device)
         if practice:
             training.continue_with(loop, practice)
-        solved = training.train(loop, steps, work.log, work.progress, work.checkpoints, config.until)
+        solved = training.train(loop, steps, work.log, work.progress, work.draft.checkpoints(), config.until)
         if domain.measures and loop.engine.position_names:
             sub_goals = source.config["sub_goals"]
             away = training.distances_of(domain, sub_goals, count // len(sub_goals))
-            loop.recorder.write_executions(work.folder, away)
-        training.write_trained(work.folder, loop, domain, source.config, config, call.seed)
+            loop.recorder.write_executions(work.draft.files, away)
+        training.write_trained(work.draft.files, loop, domain, source.config, config, call.seed)
         if config.until:
             settings |= {"ended_at": loop.recorder.steps, "until_reached": solved}  # for the manifest, which comes last
     return Done(outcome_of(_numbers(loop.recorder, config, solved)), _next(call, ensemble, config))

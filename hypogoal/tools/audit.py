@@ -64,11 +64,11 @@ def audit(
     ends = terminations_of(target.classify, np.array(edges), config.termination)
     with call.training("audit", settings, target.inputs, steps, None) as work:
         loop = training.assemble(world, Path(), ensemble_config, config, call.seed, device, ends, target.standard)
-        training.train(loop, steps, work.log, work.progress, work.checkpoints)
-        training.write_trained(work.folder, loop, world, ensemble_config, config, call.seed)
-        report = report_of(loop, edges, world.sub_goals, work.folder)
+        training.train(loop, steps, work.log, work.progress, work.draft.checkpoints())
+        training.write_trained(work.draft.files, loop, world, ensemble_config, config, call.seed)
+        report = report_of(loop, edges, world.sub_goals, work.draft.files)
         report["random_play"] = random_play(loop, column, rng_for(call.seed, "random-play"))
-        (work.folder / "audit.json").write_text(json.dumps(plain(report), indent=1) + "\n", encoding="utf-8")
+        (work.draft.files / "audit.json").write_text(json.dumps(plain(report), indent=1) + "\n", encoding="utf-8")
     return Done([*lines_of(report)])
 
 
