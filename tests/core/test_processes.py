@@ -1,6 +1,5 @@
 """Work in other processes: how many there may be, how they end, and what they leave of the caller's settings."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -26,19 +25,6 @@ def test_no_stage_uses_more_processes_than_it_was_allotted(monkeypatch: pytest.M
     assert allowed(4096) == 4096 and allowed(0) == cores()
     monkeypatch.setenv(CORES, "2")
     assert allowed(4096) == 2 and allowed(1) == 1 and allowed(0) == cores() <= 2
-
-
-def whoami(number: int) -> tuple[int, int, str | None]:
-    return number, os.getpid(), multiprocessing.get_start_method(allow_none=True)
-
-
-def test_processes_are_spawned() -> None:
-    """Whatever the system's default is: they are started anew, and tasks go to them by name."""
-    results: dict[int, tuple[int, int, str | None]] = {}
-    in_processes([partial(whoami, number) for number in range(3)], 2, results.__setitem__)
-    assert [results[number][0] for number in range(3)] == [0, 1, 2]
-    assert os.getpid() not in {row[1] for row in results.values()}
-    assert {row[2] for row in results.values()} == {"spawn"}
 
 
 def die() -> None:
@@ -85,25 +71,26 @@ except Exception as error:
     print(error)
 """
 POOL = """
-import multiprocessing
+import multiprocessing, os
 from functools import partial
 from hypogoal.core.processes import in_processes
 
-def work(number):
-    in_processes([partial(abs, -number), partial(abs, -2)], 2, print)
+def work():
+    results = {}
+    in_processes([partial(multiprocessing.get_start_method, True), os.getpid], 2, results.__setitem__)
+    print(results[0], results[1] == os.getpid(), flush=True)
 
 if __name__ == "__main__":
+    work()
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        pool.apply(work, (1,))
+        pool.apply(work)
 """
+UNGUARDED = "could not start. In a script call hypogoal below 'if __name__ == \"__main__\":'"
 
 
-@pytest.mark.parametrize(
-    ("code", "said"),
-    [(NO_GUARD, "could not start. In a script call hypogoal below 'if __name__ == \"__main__\":'"), (POOL, "0 1\n1 2")],
-)
+@pytest.mark.parametrize(("code", "said"), [(NO_GUARD, UNGUARDED), (POOL, "spawn False\nspawn True")])
 def test_scripts_without_a_guard_and_pools(tmp_path: Path, code: str, said: str) -> None:
-    """The first is told in a line; processes of a pool may have none of their own, so there tasks are done in turn."""
+    """The first is told in a line. Processes are spawned; those of a pool may have none: tasks come in turn."""
     (tmp_path / "script.py").write_text(code)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     command = [sys.executable, tmp_path / "script.py"]
