@@ -10,7 +10,6 @@ import json
 import os
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
-from io import BufferedReader
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -19,16 +18,6 @@ from hypogoal.core.errors import UserError
 MAX_NAME_BYTES = 200  # of a file's name
 MOST_INTEGER = (1 << 53) - 1  # many readers of JSON treat numbers as 64-bit floats
 NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
-
-
-def open_file(path: Path, subject: str, do: str) -> BufferedReader:
-    """A file opened for reading bytes."""
-    try:
-        return path.open("rb")
-    except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"{subject} missing", path, do) from None
-    except (OSError, ValueError) as error:
-        raise UserError(f"{subject} not readable ({getattr(error, 'strerror', error)})", path, do) from None
 
 
 def read_text(path: Path, subject: str, do: str) -> str:
@@ -84,23 +73,18 @@ def replace_text(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write, renamed to ``path`` when the block ends; removed if it raises.
+    """A file to write, renamed to ``path`` when the block ends and it is on the disk; removed if the block raises.
 
     If the process is killed it is left over; the next writer of ``path`` overwrites it.
     """
     fresh = path.with_name(f".{path.name}.new")
     try:
         yield fresh
-        replace_file(fresh, path)
+        sync(fresh)
+        fresh.replace(path)
+        sync(path.parent)
     finally:
         fresh.unlink(missing_ok=True)
-
-
-def replace_file(fresh: Path, path: Path) -> None:
-    """Rename a file once it is on the disk: after a power failure ``path`` is the old file or the new one."""
-    sync(fresh)
-    fresh.replace(path)
-    sync(path.parent)
 
 
 def sync(path: Path) -> None:
