@@ -71,7 +71,11 @@ class States:
 
 @dataclass(frozen=True)
 class Collected:
-    """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any."""
+    """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any.
+
+    ``channels`` says of each key's pictures, "" of those without, how many frames of how many colours their channels
+    are; it is empty if nobody said so.
+    """
 
     observation_shape: Shape
     sub_goals: tuple[str, ...]
@@ -79,6 +83,7 @@ class Collected:
     unlabelled: States
     heldout: States
     features: tuple[str, ...] = ()
+    channels: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # frames and colours of stacks, by key
 
 
 class Unmet(UserError):
@@ -204,6 +209,8 @@ def write_dataset(path: Path, collected: Collected, *, domain: str, config: Mapp
         "versions": json.dumps(versions()),
         "complete": False,
     }
+    if collected.channels:
+        attributes["channels"] = json.dumps(dict(collected.channels))
     with create_hdf5(path) as file:
         for name, value in attributes.items():
             file.attrs[name] = fixed(value) if isinstance(value, str) else value
@@ -266,6 +273,7 @@ class Dataset:
     sub_goals: tuple[str, ...]
     observation_shape: Shape
     observation_dtype: DType
+    channels: Mapping[str, list[int]] = field(default_factory=dict)  # see :class:`Collected`
 
     @property
     def observation_bytes(self) -> int:
@@ -397,6 +405,7 @@ def open_dataset(path: Path) -> Dataset:
             sub_goals=tuple(json.loads(found["sub_goals"])),
             observation_shape=tuple(json.loads(found["observation_shape"])),
             observation_dtype=type_of(found["observation_dtype"]),
+            channels=json.loads(found.get("channels", "{}")),
         )
     require_names(dataset.sub_goals)
     return dataset

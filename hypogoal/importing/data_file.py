@@ -15,9 +15,9 @@ from hypogoal.importing.arrays import read_arrays
 from hypogoal.importing.assemble import assemble
 from hypogoal.importing.episodes import recorded_parts
 from hypogoal.importing.labels import rule_of, with_labels
-from hypogoal.importing.pictures import read_pictures
+from hypogoal.importing.pictures import TWO, read_pictures
 from hypogoal.importing.recordings import reader_of
-from hypogoal.importing.taken import side_of
+from hypogoal.importing.taken import Taking
 
 
 def import_data(
@@ -47,49 +47,54 @@ def import_data(
         labels: of episodes, what labels each sub-goal: :func:`hypogoal.importing.labels.rule_of`.
         keys: parts of the episodes' observations, all by default.
         share: of the labelled states, held out where none are given.
-        sides: most pixels on the longer side of pictures, by key; "" is of all others.
+        sides: see :class:`Taking`.
         every: take each n-th frame of episodes, and the last.
-        stack: axes of frames and colours become channels.
+        stack: see :class:`Taking`.
         group: the array by which labelled states belong together.
         domain: the environment, for later stages.
 
     Raises:
         UserError: if something cannot be read, or not be used, or ``out`` exists.
     """
-    rules, sides = labels or {}, sides or {}
+    rules, taking = labels or {}, Taking(sides or {}, stack)
     if not source.exists():
         raise UserError("no such file or folder", source, "Give one that there is.")
     inputs = [source] if source.is_file() else []
     with create(out, kind=DATA, config={"domain": domain}, seed=seed, inputs=inputs, force=force) as draft:
         file = draft.files / out.name
         if inputs and kind_of(source) == DATA:
-            if sub_goals or keys or sides or every > 1 or stack or group or domain != IMPORTED:
+            if sub_goals or keys or every > 1 or group or taking != Taking() or domain != IMPORTED:
                 do = "Give --label NAME=TABLE.csv and --out alone."
                 raise UserError("a data file is taken as it is", source, do)
             return _label(source, file, rules, seed)
-        said: list[str] = []
         left: Counter[str] = Counter()
-        of_pictures = any((source / kind).is_dir() for kind in ("positive", "negative"))
-        read = None if of_pictures else reader_of(source)
-        if read is None and (rules or keys or every > 1):
+        of_pictures = any((source / kind).is_dir() for kind in TWO)
+        reader = None if of_pictures else reader_of(source)
+        if reader is None and (rules or keys or every > 1):
             raise UserError("this is no recording", source, "--label, --key and --every are for episodes.")
-        if group and (read is not None or of_pictures):
+        if group and (reader or of_pictures):
             do = "Episodes, and folders within positive/ and negative/, are groups already."
             raise UserError("--group is for arrays", source, do)
-        if read is not None:
+        said: list[str] = []
+        if reader:
             by_goal = {goal: rule_of(rule) for goal, rule in rules.items()}
-            shown: dict[str, Any] = {"keys": keys, "every": every, "sides": sides, "stack": stack, "seed": seed}
-            parts, said = recorded_parts(source, read(source, keys, left), by_goal, **shown)
+            recordings = reader(source, keys, left)
+            parts, said = recorded_parts(source, recordings, by_goal, taking, keys=keys, every=every, seed=seed)
         elif of_pictures:
-            parts, left = read_pictures(source, side=side_of(sides, "", True), stack=stack)
+            parts = read_pictures(source, taking, left)
             sub_goals = sub_goals or (source.resolve().name,)
         else:
             parts = read_arrays(source, group)
         if left:
             said.append(f"not read: {', '.join(f'{count} {suffix}' for suffix, count in sorted(left.items()))}")
-        collected, more = assemble(parts, sub_goals, share=share, seed=seed, sides=sides, stack=stack)
+        collected, more = assemble(parts, sub_goals, taking, share=share, seed=seed)
+        given = {
+            "labels": dict(rules),
+            "resize": dict(taking.sides),
+            "every": every if every > 1 else 0,
+            "group": group,
+        }
         config: dict[str, Any] = {"source": source.name}
-        given = {"labels": dict(rules), "resize": dict(sides), "every": every if every > 1 else 0, "group": group}
         config |= {name: value for name, value in given.items() if value}
         write_dataset(file, collected, domain=domain, config=config, seed=seed)
         return said + more

@@ -7,32 +7,31 @@ once, here.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.data import Integers
 from hypogoal.importing.files import reading
-from hypogoal.importing.parts import Given, Parts
-from hypogoal.importing.taken import side_of, stacked, taken_one
+from hypogoal.importing.parts import Array, Given, Parts
+from hypogoal.importing.taken import Taking, channels_of, stacked
 
 SPLIT = np.array([0.4, 0.4, 0.2])  # shares of episodes that are labelled, unlabelled and held out
 AGAIN = "Record or download it again."
+NO_RULE = "Give --label NAME=COLUMN, NAME=last:N, NAME=TABLE.csv or NAME=module:function."
 
-Rows: TypeAlias = NDArray[np.int64]
 Mark: TypeAlias = Callable[[int, Any], bool]  # of a frame, from its number and what is seen: does the sub-goal hold?
 
 
 @dataclass(frozen=True)
 class Recording:
-    """T frames.
+    """An episode of T frames.
 
     Attributes:
         observations: by key, a function from rising numbers of frames to what is seen in these, one after another.
@@ -43,8 +42,8 @@ class Recording:
 
     name: str
     length: int
-    observations: Mapping[str, Callable[[Rows], Iterable[Any]]]
-    columns: Mapping[str, NDArray[Any]]
+    observations: Mapping[str, Callable[[Integers], Iterable[Any]]]
+    columns: Mapping[str, Array]
     texts: Sequence[str] = ()
     held_out: bool = False
 
@@ -56,106 +55,82 @@ class Rule(NamedTuple):
     listed: Mapping[str, str] = {}  # where the table names each
 
 
-def episode_of(name: str, observations: Any, columns: Mapping[str, Any], *, held_out: bool = False) -> Recording:
+def recording_of(name: str, observations: Any, columns: Mapping[str, Any], *, held_out: bool = False) -> Recording:
     """An episode whose observations are arrays (T, ...) in nested dictionaries, HDF5 groups or tuples."""
-    found = _leaves(observations)
-    arrays = {key: values for key, values in found.items() if _kind(values) in "iufb"}
+    found = _leaves(observations, "")
+    arrays = {key: part for key, part in found.items() if getattr(part, "dtype", np.dtype(object)).kind in "iufb"}
     lengths = {len(values) for values in arrays.values()}
     if len(lengths) > 1:
         raise ValueError(f"the observations of {name} have different lengths, {sorted(lengths)}")
     rows = {key: partial(_rows, values) for key, values in arrays.items()}
-    texts = sorted(found.keys() - arrays.keys())
-    return Recording(name, max(lengths, default=0), rows, columns, texts, held_out)
+    return Recording(name, max(lengths, default=0), rows, columns, sorted(found.keys() - arrays.keys()), held_out)
 
 
-def _leaves(values: Any, place: str = "") -> dict[str, Any]:
+def _leaves(values: Any, place: str) -> dict[str, Any]:
     """The arrays by key: ``robot/position``; of an observation that is not nested by ""."""
-    if isinstance(values, tuple):
-        values = dict(enumerate(values))
-    if not hasattr(values, "items"):
+    parts = dict(enumerate(values)) if isinstance(values, tuple) else values
+    if not hasattr(parts, "items"):
         return {place: values}
     found = {}
-    for key, part in values.items():
+    for key, part in parts.items():
         found.update(_leaves(part, f"{place}/{key}" if place else str(key)))
     return found
 
 
-def _kind(values: Any) -> str:
-    return str(getattr(getattr(values, "dtype", None), "kind", "O"))
-
-
-def _rows(values: Any, rows: Rows) -> Iterable[Any]:
+def _rows(values: Any, rows: Integers) -> Iterable[Any]:
     return np.asarray(values)[rows]
 
 
-def kept(length: int, every: int) -> Rows:
+def kept(length: int, every: int) -> Integers:
     """Every n-th frame of an episode, and always its last."""
     return np.arange((length - 1) % every, length, every)
 
 
-@dataclass
-class _Taken:
-    """What is taken of an episode: frames by key, their names, and labels (T, G)."""
-
-    listed: bool
-    held_out: bool
-    frames: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
-    names: list[str] = field(default_factory=list)
-    labels: list[list[bool]] = field(default_factory=list)
-
-
 def recorded_parts(
     source: Path,
-    episodes: Iterable[Recording],
+    recordings: Iterable[Recording],
     rules: Mapping[str, Rule],
+    taking: Taking,
     *,
     keys: Sequence[str] = (),
     every: int = 1,
-    sides: Mapping[str, int] | None = None,
-    stack: bool = False,
     seed: int = 0,
 ) -> tuple[Parts, list[str]]:
     """The frames of a recording, whole episodes labelled, unlabelled or held out; and lines on what is not read.
 
     ``rules`` say for each sub-goal which frames are positive; an episode that some rule does not list is unlabelled.
-    Held out are the episodes of which the recording says so, else some drawn by ``seed``. ``sides``, ``stack``: see
-    :func:`taken_one`.
+    Held out are the episodes of which the recording says so, else some drawn by ``seed``.
     """
     if not rules:
-        do = "Give --label NAME=COLUMN, NAME=last:N, NAME=TABLE.csv or NAME=module:function."
-        raise UserError("nothing says where the sub-goal holds", source, do)
-    taken: dict[str, _Taken] = {}
+        raise UserError("nothing says where the sub-goal holds", source, NO_RULE)
+    taken = _Taken(taking)
     texts: set[str] = set()
-    empty: list[str] = []
-    fields: list[str] = []
-    for episode in episodes:
-        where = f"{source}, {episode.name}"
-        if episode.name in taken:
-            raise UserError("two episodes have one name", where, "Rename one.")
-        if not episode.length:
-            empty.append(episode.name)
+    empty = 0
+    for recording in recordings:
+        if not recording.length:
+            empty += 1
             continue
-        chosen = _chosen(episode, keys, where)
-        if chosen != (fields or chosen):
+        where = f"{source}, {recording.name}"
+        chosen = _chosen(recording, keys, where)
+        if taken.frames and chosen != [*taken.frames]:
             raise UserError("episodes have different observations", where, "Choose some by --key.")
-        fields = chosen
-        texts.update(() if keys else episode.texts)
-        frames = _frames(episode, chosen, kept(episode.length, every), source)
-        marks = [rule.marks(episode) for rule in rules.values()]
-        taken[episode.name] = _take(episode, frames, marks, sides or {}, stack)
+        texts.update(() if keys else recording.texts)
+        frames = _frames(recording, chosen, kept(recording.length, every), source)
+        taken.add(recording, frames, [rule.marks(recording) for rule in rules.values()])
     for rule in rules.values():
-        _require_listed(rule, [*taken])
-    all_taken = [*taken.values()]
-    parts = split_episodes([one.listed for one in all_taken], [one.held_out for one in all_taken], seed, source)
-    labelled, unlabelled, heldout = [_given([all_taken[at] for at in part], fields) for part in parts]
+        for name in rule.listed.keys() - taken.episodes.keys():
+            known = f"There are {', '.join([*taken.episodes][:3])} ..."
+            raise UserError(f"a label is of an unknown episode, {name!r}", rule.listed[name], known)
     said = [f"not read: {', '.join(sorted(texts))}, neither pictures nor numbers"] if texts else []
-    said += [f"not read: {len(empty)} of {len(empty) + len(taken)} episodes, without frames"] if empty else []
-    return Parts(labelled, unlabelled, heldout, tuple(rules)), said
+    if empty:
+        said.append(f"not read: {empty} of {empty + len(taken.episodes)} episodes, without frames")
+    sets = [taken.given(part) for part in split_episodes(taken.listed, taken.held_out, seed, source)]
+    return Parts(*sets, tuple(rules), channels=taken.channels), said
 
 
-def _chosen(episode: Recording, keys: Sequence[str], where: str) -> list[str]:
+def _chosen(recording: Recording, keys: Sequence[str], where: str) -> list[str]:
     """The keys to read, all if none are given; an unknown one is a ``UserError``."""
-    known = sorted(episode.observations)
+    known = sorted(recording.observations)
     for key in keys:
         if key not in known:
             raise UserError(f"no observation {key!r}", where, meant(key, known) or f"It has {', '.join(known)}.")
@@ -164,73 +139,78 @@ def _chosen(episode: Recording, keys: Sequence[str], where: str) -> list[str]:
     return sorted(set(keys)) or known
 
 
-def _frames(episode: Recording, keys: Sequence[str], rows: Rows, source: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The frames of an episode with their numbers, by key, as read."""
+def _frames(recording: Recording, keys: Sequence[str], rows: Integers, source: Path) -> Iterator[tuple[int, Any]]:
+    """The numbers of frames, and what is seen in each, by key, as read."""
     with reading(source, AGAIN):
-        values = [episode.observations[key](rows) for key in keys]
+        values = [recording.observations[key](rows) for key in keys]
         for row, *seen in zip(rows.tolist(), *values, strict=True):
             yield row, dict(zip(keys, seen, strict=True))
 
 
-def _take(
-    episode: Recording,
-    frames: Iterable[tuple[int, dict[str, Any]]],
-    marks: Sequence[Mark | None],
-    sides: Mapping[str, int],
-    stack: bool,
-) -> _Taken:
-    """Label frames as they are read, then make them pictures or numbers."""
-    known = [mark for mark in marks if mark is not None]
-    taken = _Taken(len(known) == len(marks), episode.held_out)
-    for row, frame in frames:
-        name = f"{episode.name}, frame {row}"
-        if taken.listed:
+class _Taken:
+    """The frames of all episodes, one after another.
+
+    Attributes:
+        episodes: where the frames of each begin and end.
+        frames: by key, as pictures or numbers.
+    """
+
+    def __init__(self, taking: Taking):
+        self.taking = taking
+        self.episodes: dict[str, Integers] = {}
+        self.listed: list[bool] = []
+        self.held_out: list[bool] = []
+        self.names: list[str] = []
+        self.labels: list[list[bool]] = []
+        self.frames: dict[str, list[Array]] = {}
+        self.channels: dict[str, tuple[int, int]] = {}
+
+    def add(self, recording: Recording, frames: Iterable[tuple[int, Any]], marks: Sequence[Mark | None]) -> None:
+        """Label an episode's frames as they are read, then make them pictures or numbers."""
+        if recording.name in self.episodes:
+            raise UserError("two episodes have one name", recording.name, "Rename one.")
+        first = len(self.names)
+        listed = None not in marks
+        for row, frame in frames:
+            name = f"{recording.name}, frame {row}"
             seen = frame if len(frame) > 1 else next(iter(frame.values()))
-            taken.labels.append([mark(row, seen) for mark in known])
-        for key, value in frame.items():
-            state = taken_one(value, f"{name}: {key or 'it'}", side_of(sides, key, True), stack)
-            taken.frames.setdefault(key, []).append(state)
-        taken.names.append(name)
-    return taken
+            self.names.append(name)
+            self.labels.append([bool(listed and mark and mark(row, seen)) for mark in marks])
+            for key, value in frame.items():
+                self.channels.update(channels_of(value, key))
+                self.frames.setdefault(key, []).append(self.taking.one(value, key, f"{name}: {key or 'it'}"))
+        self.episodes[recording.name] = np.arange(first, len(self.names))
+        self.listed.append(listed)
+        self.held_out.append(recording.held_out)
 
-
-def _given(episodes: Sequence[_Taken], keys: Sequence[str]) -> Given:
-    """The frames of some episodes, one after another."""
-    names = [*chain.from_iterable(one.names for one in episodes)]
-    labels = [*chain.from_iterable(one.labels for one in episodes)]
-    states = {}
-    for key in keys:
-        frames = [*chain.from_iterable(one.frames[key] for one in episodes)]
-        states[key] = stacked(frames, names)
-    return Given(states if len(keys) > 1 else states[keys[0]], names, np.array(labels, dtype=np.bool_))
-
-
-def _require_listed(rule: Rule, names: Sequence[str]) -> None:
-    """Refuse (``UserError``) a table that lists an episode which there is not."""
-    for name, where in rule.listed.items():
-        if name not in names:
-            known = f"They are {names[0]} to {names[-1]}." if names else "There are none."
-            raise UserError(f"a label is of an unknown episode, {name!r}", where, known)
+    def given(self, episodes: Integers) -> Given:
+        """The frames of some episodes."""
+        spans = [*self.episodes.values()]
+        rows = np.concatenate([spans[episode] for episode in episodes])
+        names = [self.names[row] for row in rows]
+        states = {}
+        for key, frames in self.frames.items():
+            states[key if len(self.frames) > 1 else ""] = stacked([frames[row] for row in rows], names)
+        return Given(states, names, np.array(self.labels)[rows])
 
 
 def split_episodes(
     listed: Sequence[bool], held_out: Sequence[bool], seed: int, where: object
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Integers, Integers, Integers]:
     """The episodes that are labelled, unlabelled and held out: ``SPLIT`` of those ``listed``, the others unlabelled.
 
     Those that the recording holds out are, and no others then.
     """
     known, fixed = np.array(listed, np.bool_), np.array(held_out, np.bool_)
-    others, given = np.flatnonzero(~known), np.flatnonzero(known & fixed)
-    free = np.flatnonzero(known & ~fixed)
+    others, given, free = (np.flatnonzero(some) for some in (~known, known & fixed, known & ~fixed))
     order = free[rng_for(seed, "minari").permutation(len(free))]
-    wanted = np.array([True, not len(others), not len(given)])
+    wanted = np.array([1, not len(others), not len(given)])
     if len(order) < wanted.sum():
-        roles = ["labelled", *["unlabelled"] * (not len(others)), *["held out"] * (not len(given))]
+        roles = [role for role, want in zip(("labelled", "unlabelled", "held out"), wanted, strict=True) if want]
         fault = f"{len(order)} episodes cannot be {', '.join(roles)}"
         raise UserError(fault, where, f"Give at least {wanted.sum()}, with labels.")
     shares = np.cumsum(SPLIT * wanted)
     ends = np.round(shares[:2] / shares[2] * len(order)).astype(int)
-    least, rest = np.cumsum(wanted)[:2], np.array([wanted[1:].sum(), wanted[2]])
-    labelled, unlabelled, heldout = np.split(order, np.clip(ends, least, len(order) - rest))
+    ends = np.clip(ends, wanted.cumsum()[:2], len(order) - wanted[::-1].cumsum()[1::-1])
+    labelled, unlabelled, heldout = np.split(order, ends)
     return labelled, np.concatenate([unlabelled, others]), np.concatenate([heldout, given])

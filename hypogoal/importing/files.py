@@ -24,24 +24,21 @@ def files_of(folder: Path, suffixes: Sequence[str], left: Counter[str]) -> list[
     for place, folders, names in os.walk(folder, followlinks=True):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in names:
-            file = Path(place, name)
-            suffix = file.suffix.lower()
-            if name.startswith("."):
-                continue
-            if suffix in suffixes:
-                taken.append(file)
-            else:
+            suffix = Path(name).suffix.lower()
+            if suffix in suffixes and not name.startswith("."):
+                taken.append(Path(place, name))
+            elif not name.startswith("."):
                 left[suffix or name] += 1
     return sorted(taken)
 
 
 def needed(module: str, extra: str) -> Any:
-    """A module of an extra of hypogoal's; a ``UserError`` where it is not installed."""
+    """A module of one of hypogoal's extras; a ``UserError`` where it is not installed."""
     try:
         return import_module(module)
     except ImportError:
-        package = module.partition(".")[0]
-        raise UserError(f"this needs {package}, which is not installed", None, f"pip install '{extra}'") from None
+        do = f"pip install 'hypogoal[{extra}]'"
+        raise UserError(f"this needs {module.partition('.')[0]}, which is not installed", None, do) from None
 
 
 @contextmanager
@@ -51,19 +48,10 @@ def reading(path: Path, do: str) -> Iterator[None]:
         yield
     except (UserError, MemoryError):
         raise
+    except FileNotFoundError as error:
+        raise UserError("no such file", error.filename or path, do) from None
     except Exception as error:  # noqa: BLE001 - libraries raise what they like
-        raise _unreadable(path, error, do) from None
-
-
-def _unreadable(path: Path, error: Exception, do: str) -> UserError:
-    """Why a file cannot be read, and a remedy that fits."""
-    if isinstance(error, FileNotFoundError):
-        return UserError("no such file", error.filename or path, do)
-    if "h5clear" in str(error):
-        return UserError("the program that wrote this has not closed it", path, f"Once it has ended: h5clear -s {path}")
-    if path.is_file():
-        with path.open("rb") as file:
-            if file.read(len(POINTER)) == POINTER:
-                return UserError("this is a pointer of Git LFS, not the file itself", path, "git lfs pull")
-    cause = f"{type(error).__name__}: {error}"[:200]
-    return UserError(f"this cannot be read ({cause})", path, do)
+        what = f"this cannot be read ({type(error).__name__}: {error})"[:200]
+        if path.is_file() and path.read_bytes().startswith(POINTER):
+            what, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
+        raise UserError(what, path, do) from None

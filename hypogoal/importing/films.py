@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.importing.episodes import AGAIN, Rows
+from hypogoal.data import Integers
+from hypogoal.importing.episodes import AGAIN
 from hypogoal.importing.files import needed, reading
+from hypogoal.importing.parts import Array
 
-EXTRA = "hypogoal[lerobot]"
+EXTRA = "lerobot"  # that brings PyAV
 SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi")
 
 
@@ -36,7 +37,7 @@ def count_frames(path: Path) -> int:
         return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
 
 
-def frames_at(path: Path, rows: Rows) -> Iterator[NDArray[np.uint8]]:
+def frames_at(path: Path, rows: Integers) -> Iterator[Array]:
     """The frames with some rising numbers, uint8 (H, W, 3)."""
     wanted = set(rows.tolist())
     number = -1
@@ -48,7 +49,7 @@ def frames_at(path: Path, rows: Rows) -> Iterator[NDArray[np.uint8]]:
         raise UserError(f"the film ends after {number + 1} frames, its index has more", path, AGAIN)
 
 
-def frames_near(path: Path, times: Sequence[float], tolerance: float) -> Iterator[NDArray[np.uint8]]:
+def frames_near(path: Path, times: Sequence[float], tolerance: float) -> Iterator[Array]:
     """The frames, uint8 (H, W, 3), at some rising times in seconds; one that is missing is a ``UserError``."""
     done = 0
     with _opened(path) as (container, stream):
@@ -64,25 +65,24 @@ def frames_near(path: Path, times: Sequence[float], tolerance: float) -> Iterato
         raise UserError(fault, path, AGAIN)
 
 
-def _upright(frame: Any, path: Path) -> NDArray[np.uint8]:
+def _upright(frame: Any, path: Path) -> Array:
     """A frame as a player shows it, uint8 (H, W, 3)."""
-    components = frame.format.components
+    [*components] = frame.format.components
     if len(components) == 1 and components[0].bits > 8:
-        raise UserError(
-            f"the film is grey, of {components[0].bits} bits, of which 8 would be left", path, "Leave it out."
-        )
+        fault = f"the film is grey, of {components[0].bits} bits, of which 8 would be left"
+        raise UserError(fault, path, "Leave it out.")
     picture = frame.to_ndarray(format="rgb24")
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":
-            right, down = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T  # each from (column, row)
-            picture = _turned(picture, right, down, path)
+            picture = _turned(picture, np.frombuffer(bytes(data), np.int32).reshape(3, 3), path)
     return picture
 
 
-def _turned(picture: NDArray[np.uint8], right: Any, down: Any, path: Path) -> NDArray[np.uint8]:
-    """A picture by the display matrix: where a pixel is shown, from its column and row, each (2,)."""
+def _turned(picture: Array, matrix: Array, path: Path) -> Array:
+    """A picture by the display matrix: a row of it says where going one column to the right, or one row down, leads."""
+    right, down = matrix[:2, :2]
     if right[1] or down[0]:
-        if right[0] or down[1]:
-            raise UserError("the film is turned by no right angle", path, "Turn it, or leave it out.")
-        picture, right, down = picture.swapaxes(0, 1), right[::-1], down[::-1]
+        picture, right, down = picture.swapaxes(0, 1), down, right
+    if right[1] or down[0]:
+        raise UserError("the film is turned by no right angle", path, "Turn it, or leave it out.")
     return picture[:: -1 if down[1] < 0 else 1, :: -1 if right[0] < 0 else 1]

@@ -9,17 +9,19 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.importing.episodes import AGAIN, Recording, Rows
+from hypogoal.data import Integers
+from hypogoal.importing.episodes import AGAIN, Recording
 from hypogoal.importing.files import needed, reading
 from hypogoal.importing.films import EXTRA, frames_near
+from hypogoal.importing.parts import Array
 from hypogoal.importing.pictures import picture_of
 
 INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
@@ -31,79 +33,72 @@ NUMBERS = ("float", "int", "uint", "bool")  # how the types of all others begin 
 
 def read_lerobot(source: Path, keys: Sequence[str], left: Counter[str]) -> Iterator[Recording]:
     """The episodes of a dataset, with ``keys`` of its features, all ``observation*`` if none are given."""
-    needed("pyarrow", EXTRA)
     with reading(source / INFO, DO):
         info = json.loads((source / INFO).read_text(encoding="utf-8-sig"))
         kinds = {key: str(feature["dtype"]) for key, feature in info["features"].items()}
         version = info["codebase_version"]
-    if version[:2] not in ("v2", "v3"):
-        raise UserError(f"the format {version} is not read", source, DO)
+        if version[:2] not in ("v2", "v3"):
+            raise UserError(f"the format {version} is not read", source, DO)
     seen = [key for key in kinds if key in keys or key.startswith("observation")]
     numbers = [key for key, kind in kinds.items() if kind.startswith(NUMBERS)]
     pictures = [key for key in keys or seen if kinds.get(key) == IMAGE]
-    table_of = lru_cache(maxsize=1)(
-        partial(_table, columns=[*numbers, *pictures])
-    )  # episodes of one file come together
+    table_of = lru_cache(maxsize=1)(partial(_table, columns=[*numbers, *pictures]))  # episodes of one come together
     for row in _listed(source, version):
         with reading(source, DO):
             places = _Places(source, info, row)
-            table = table_of(places.table())
-            own = table.filter(np.array(table[OWNER]) == places.number)
+            file = places.file("data_path", "data", "")
+            table = table_of(file)
+            own = table.filter(np.array(table[OWNER]) == row[OWNER])
             if len(own) != row["length"]:
-                fault = f"episode {places.number} has {len(own)} frames, {row['length']} are listed"
-                raise UserError(fault, places.table(), AGAIN)
-            values = {key: _numbers(own[key], info["features"][key]["shape"]) for key in numbers}
-            observations: dict[str, Any] = {}
+                fault = f"episode {row[OWNER]} has {len(own)} frames, {row['length']} are listed"
+                raise UserError(fault, file, AGAIN)
+            values = {}
+            for key in numbers:
+                values[key] = np.array(own[key].to_pylist()).reshape(len(own), *info["features"][key]["shape"])
+            read: dict[str, Any] = {key: values[key].__getitem__ for key in seen if key in values}
             for key in seen:
                 if kinds[key] == VIDEO:
-                    observations[key] = partial(_film, places, key, values[TIME])
-                elif kinds[key] == IMAGE:
-                    observations[key] = partial(_cells, places.table(), own, key)
-                elif key in numbers:
-                    observations[key] = values[key].__getitem__
-            texts = [key for key in seen if key not in observations]
-            columns = {key: column for key, column in values.items() if column.size == len(own)}
-            yield Recording(str(places.number), len(own), observations, columns, texts)
+                    read[key] = partial(places.film, key, values[TIME].ravel())
+                if kinds[key] == IMAGE:
+                    read[key] = partial(_cells, file, own, key)
+            texts = [key for key in seen if key not in read]
+            yield Recording(str(row[OWNER]), len(own), read, values, texts)
 
 
 def _listed(source: Path, version: str) -> list[dict[str, Any]]:
     """What ``meta/`` says of each episode."""
+    file = source / EPISODES.with_suffix(".jsonl")
+    rows: list[dict[str, Any]] = []
     if version.startswith("v2"):
-        file = source / EPISODES.with_suffix(".jsonl")
         with reading(file, DO):
-            lines = file.read_text(encoding="utf-8-sig").splitlines()
-            return [json.loads(line) for line in lines if line.strip()]
-    rows = []
-    for file in sorted((source / EPISODES).glob("*/*.parquet")):
-        rows += _table(file).to_pylist()
+            rows += map(json.loads, file.read_text(encoding="utf-8-sig").splitlines())
+    for table in sorted((source / EPISODES).glob("*/*.parquet")):
+        rows += _table(table).to_pylist()
     if not rows:
         raise UserError("the list of episodes is empty", source / EPISODES, DO)
     return rows
 
 
+@dataclass(frozen=True)
 class _Places:
-    """Where the parts of an episode lie; its ``row`` of the list of episodes says so in v3.0, its number in v2.1."""
+    """Where the parts of an episode lie: its ``row`` of the list says so in v3.0, its number in v2.1."""
 
-    def __init__(self, source: Path, info: Mapping[str, Any], row: Mapping[str, Any]):
-        self.source, self.info, self.row = source, info, row
-        self.number = int(row[OWNER])
-        self.old = "data/chunk_index" not in row
+    source: Path
+    info: Mapping[str, Any]
+    row: Mapping[str, Any]
 
-    def table(self) -> Path:
-        return self._file("data_path", "data", "")
-
-    def film(self, key: str) -> tuple[Path, float]:
-        """The film of a key, and the second of it at which the episode begins."""
-        file = self._file("video_path", f"videos/{key}", key)
-        return file, 0.0 if self.old else float(self.row[f"videos/{key}/from_timestamp"])
-
-    def _file(self, template: str, head: str, key: str) -> Path:
-        if self.old:
-            chunk, file = self.number // int(self.info.get("chunks_size", 1000)), self.number
-        else:
-            chunk, file = self.row[f"{head}/chunk_index"], self.row[f"{head}/file_index"]
+    def file(self, template: str, head: str, key: str) -> Path:
+        number = self.row[OWNER]
+        chunk = self.row.get(f"{head}/chunk_index", number // self.info.get("chunks_size", 1000))
+        file = self.row.get(f"{head}/file_index", number)
         values = {"chunk_index": chunk, "file_index": file, "episode_chunk": chunk, "episode_index": file}
         return self.source / self.info[template].format(video_key=key, **values)
+
+    def film(self, key: str, times: Array, rows: Integers) -> Iterable[Array]:
+        """Frames of a film, in which the episode begins at some second."""
+        begin = self.row.get(f"videos/{key}/from_timestamp", 0.0)
+        file = self.file("video_path", f"videos/{key}", key)
+        return frames_near(file, (begin + times[rows]).tolist(), 0.5 / self.info["fps"])
 
 
 def _table(file: Path, columns: Sequence[str] | None = None) -> Any:
@@ -112,21 +107,9 @@ def _table(file: Path, columns: Sequence[str] | None = None) -> Any:
         return parquet.ParquetFile(raw).read(columns=columns, use_threads=False)
 
 
-def _numbers(column: Any, shape: Sequence[int]) -> NDArray[Any]:
-    """A column of a table, (T, *shape)."""
-    return np.array(column.to_pylist()).reshape(len(column), *shape)
-
-
-def _film(places: _Places, key: str, times: NDArray[Any], rows: Rows) -> Iterable[NDArray[np.uint8]]:
-    file, begin = places.film(key)
-    return frames_near(file, (begin + times.reshape(-1)[rows]).tolist(), 0.5 / float(places.info["fps"]))
-
-
-def _cells(file: Path, table: Any, key: str, rows: Rows) -> Iterator[NDArray[np.uint8]]:
+def _cells(file: Path, table: Any, key: str, rows: Integers) -> Iterator[Array]:
     """The pictures in cells of a table, ``{bytes, path}``."""
-    for number, cell in zip(rows.tolist(), table[key].take(rows).to_pylist(), strict=True):
+    for cell in table[key].take(rows).to_pylist():
         if not cell or not cell["bytes"]:
-            raise UserError(
-                f"the table has no picture for {key}, frame {number}", file, "Write pictures into the tables."
-            )
+            raise UserError(f"the table has no picture for each frame of {key}", file, "Write them into the tables.")
         yield picture_of(cell["bytes"], file)

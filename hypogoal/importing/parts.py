@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from numpy.typing import NDArray
 
-# Pictures (N, H, W, C) or (N, H, W), or numbers (N, *shape); such arrays by key; or mixed observations (N,).
-Source: TypeAlias = NDArray[Any] | Mapping[str, NDArray[Any]]
+Array: TypeAlias = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -17,16 +16,16 @@ class Given:
     """Some states.
 
     Attributes:
-        observations: N of them.
+        observations: (N, ...) by key; by "" if there are no keys.
         names: what messages call each, (N,).
         labels: 0 or 1, (N,) or (N, G); None of unlabelled states.
         groups: which belong together, (N,): a group is held out whole or not at all. None: no groups.
     """
 
-    observations: Source
+    observations: Mapping[str, Array]
     names: Sequence[str]
-    labels: NDArray[Any] | None = None
-    groups: NDArray[Any] | None = None
+    labels: Array | None = None
+    groups: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -36,5 +35,8 @@ class Parts:
     labelled: Given
     unlabelled: Given
     heldout: Given | None = None
-    sub_goals: tuple[str, ...] = ()  # their names, if the source has them
-    features: tuple[str, ...] = ()  # names of the numbers
+    sub_goals: Sequence[str] = ()  # their names, if the source has them
+    features: Sequence[str] = ()  # names of the numbers
+    channels: Mapping[str, tuple[int, int]] = field(
+        default_factory=dict
+    )  # by key: frames and colours of each, if stacked

@@ -12,15 +12,14 @@ import io
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.importing.files import files_of, reading
-from hypogoal.importing.parts import Given, Parts
-from hypogoal.importing.taken import stacked, taken_one
+from hypogoal.importing.parts import Array, Given, Parts
+from hypogoal.importing.taken import Taking, channels_of, stacked
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -32,11 +31,13 @@ SUFFIXES = (
 )  # fmt: skip
 ARRAY = ".npy"  # a state that no format of pictures holds, such as a stack of four frames
 GREY = ("1", "L")
-COLOURED = ("P", "RGB", "RGBX", "CMYK", "YCbCr", "HSV", "LA", "PA", "RGBA", "La", "RGBa")
+COLOURED = ("P", "RGB", "RGBX", "CMYK", "YCbCr", "HSV")
+TWO = ("positive", "negative")
 DO = "Remove it, or write it again."
+PLACES = "Put some into positive/, negative/ and unlabelled/, and to judge by into heldout/positive/ etc."
 
 
-def picture_of(data: bytes, where: Path) -> NDArray[np.uint8]:
+def picture_of(data: bytes, where: Path) -> Array:
     """The picture in a file of any of ``FORMATS``, uint8 (H, W, 3), or (H, W, 1) if it is grey; ``where`` it is from.
 
     It is turned as viewers turn it; of several pictures in one file it is the first; of 16 bits a channel the upper 8
@@ -45,11 +46,8 @@ def picture_of(data: bytes, where: Path) -> NDArray[np.uint8]:
     import PIL.Image
     import PIL.ImageOps
 
-    with (
-        reading(where, DO),
-        warnings.catch_warnings(action="ignore"),
-        PIL.Image.open(io.BytesIO(data), formats=FORMATS) as opened,
-    ):
+    quiet = warnings.catch_warnings(action="ignore")
+    with reading(where, DO), quiet, PIL.Image.open(io.BytesIO(data), formats=FORMATS) as opened:
         deep = any(";16" in str(tile.args) for tile in opened.tile)  # Pillow's mode says 8 bits of most such files
         opened.load()  # in a PNG the orientation may follow the pixels
         upright: Image = opened
@@ -62,12 +60,11 @@ def picture_of(data: bytes, where: Path) -> NDArray[np.uint8]:
     return values.reshape(*values.shape[:2], -1)
 
 
-def _bytes_of(image: Image, where: Path) -> NDArray[np.uint8]:
+def _bytes_of(image: Image, where: Path) -> Array:
     """The values of an opaque picture, uint8 (H, W) or (H, W, 3)."""
     if image.has_transparency_data:
         if np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-            do = "Put it on a background, as the agent sees it."
-            raise UserError("the picture is transparent in places", where, do)
+            raise UserError("the picture is transparent in places", where, "Put it on a background.")
         return np.asarray(image.convert("RGB"))
     if image.mode.startswith("I;16"):
         return (np.asarray(image) >> 8).astype(np.uint8)
@@ -77,45 +74,35 @@ def _bytes_of(image: Image, where: Path) -> NDArray[np.uint8]:
     return np.asarray(image.convert("L" if image.mode in GREY else "RGB"))
 
 
-def read_pictures(folder: Path, *, side: int = 0, stack: bool = False) -> tuple[Parts, Counter[str]]:
-    """The pictures of one sub-goal, in the order of their names, and how many other files there are, by suffix.
+def read_pictures(folder: Path, taking: Taking, left: Counter[str]) -> Parts:
+    """The pictures of one sub-goal, in the order of their names; ``left`` counts other files by suffix."""
+    channels = {}
 
-    ``side`` and ``stack``: see :func:`taken_one`; smaller pictures may be of one size where large ones are not.
-    """
-    left: Counter[str] = Counter()
-
-    def given(kinds: tuple[str, ...]) -> Given:
-        states: list[NDArray[Any]] = []
-        files: list[Path] = []
-        counts = []
+    def given(place: str, kinds: tuple[str, ...]) -> Given:
+        names: list[str] = []
+        states: list[Array] = []
+        groups = []
         for kind in kinds:
-            some = files_of(folder / kind, (*SUFFIXES, ARRAY), left)
-            if not some:
-                do = "Put some into positive/, negative/ and unlabelled/, and to judge by into heldout/positive/ etc."
-                raise UserError("there are no pictures here", folder / kind, do)
-            states += [taken_one(_state(file), str(file), side, stack) for file in some]
-            files += some
-            counts.append(len(some))
-        names = [file.relative_to(folder).as_posix() for file in files]
-        labels = np.arange(len(files)) < counts[0] if len(kinds) == 2 else None
-        return Given(stacked(states, names), names, labels, _groups(names, kinds[0].count("/") + 1))
+            files = files_of(folder / place / kind, (*SUFFIXES, ARRAY), left)
+            if not files:
+                raise UserError("there are no pictures here", folder / place / kind, PLACES)
+            for file in files:
+                names.append(file.relative_to(folder).as_posix())
+                group = file.relative_to(folder / place / kind).parent.as_posix()
+                groups.append(names[-1] if group == "." else group)
+                values = _state(file)
+                channels.update(channels_of(values, ""))
+                states.append(taking.one(values, "", str(file)))
+        labels = [name.startswith(f"{place}/{TWO[0]}/".removeprefix("/")) for name in names]
+        observations = {"": stacked(states, names)}
+        return Given(observations, names, np.array(labels), np.array(groups) if set(groups) - set(names) else None)
 
-    parts = [given(("positive", "negative")), given(("unlabelled",))]
-    if (folder / "heldout").is_dir():
-        parts.append(given(("heldout/positive", "heldout/negative")))
-    return Parts(*parts), left
-
-
-def _groups(names: list[str], depth: int) -> NDArray[Any] | None:
-    """The folder of each picture below the first ``depth`` ones, (N,); None if all are outside of such folders.
-
-    A picture outside is a group of its own.
-    """
-    folders = ["/".join(name.split("/")[depth:-1]) for name in names]
-    return np.array([folder or name for folder, name in zip(folders, names, strict=True)]) if any(folders) else None
+    labelled, unlabelled = given("", TWO), given("", ("unlabelled",))
+    heldout = given("heldout", TWO) if (folder / "heldout").is_dir() else None
+    return Parts(labelled, unlabelled, heldout, channels=channels)
 
 
-def _state(file: Path) -> NDArray[Any]:
+def _state(file: Path) -> Array:
     """The picture in a file, or the array, as it is."""
     with reading(file, DO):
         if file.suffix.lower() == ARRAY:

@@ -23,7 +23,7 @@ from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium_engine import reader_of
 from hypogoal.importing.arrays import parts_of
 from hypogoal.importing.assemble import assemble
-from hypogoal.importing.taken import observations_of
+from hypogoal.importing.taken import Taking
 from hypogoal.observations import PICTURE
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"
@@ -68,12 +68,12 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
     """
     env, states = Constant(shape, dtype), np.ones((2, *shape), dtype)
     wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
-    of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: observations_of(states, "the states"))
+    of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: Taking().all(states, "", "the states"))
     assert bool(of_env) == bool(of_array), (of_env, of_array)
     if of_env:
         assert dtype == "uint8" or (wide and "float" not in dtype), of_env
         return "refused"
-    look, taken = reader_of(env), observations_of(states, "the states")[0]
+    look, taken = reader_of(env), Taking().all(states, "", "the states")[0]
     assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
     np.testing.assert_array_equal(look.read(env.reset()[0]), taken)
     if look.dtype == PICTURE:
@@ -99,7 +99,7 @@ def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outco
     found = outcome_of(shape, dtype)
     assert words.get(found, found) == outcome.removesuffix(", `(H, W, 1)`")
     if outcome.endswith("`(H, W, 1)`"):
-        assert observations_of(np.ones((2, *shape), dtype), "the states").shape == (2, *shape, 1)
+        assert Taking().all(np.ones((2, *shape), dtype), "", "the states").shape == (2, *shape, 1)
 
 
 def test_the_table_has_all_types_and_every_outcome() -> None:
@@ -123,8 +123,8 @@ def test_frames_and_colours_are_stacked_in_their_order() -> None:
     for axes in ((2, 0, 1, 3), (2, 3, 0, 1), (0, 1, 3, 2), (3, 0, 1, 2), (3, 2, 0, 1), (0, 1, 2, 3)):
         states = whole.transpose(0, *(axis + 1 for axis in axes))
         with pytest.raises(UserError, match=r"stacks of pictures: .*Give pictures as uint8 .* 'import --stack' puts"):
-            observations_of(states, "the states")
-        np.testing.assert_array_equal(observations_of(states, "the states", stack=True), wanted)
+            Taking().all(states, "", "the states")
+        np.testing.assert_array_equal(Taking(stack=True).all(states, "", "the states"), wanted)
 
 
 def test_a_dictionary_hides_no_picture() -> None:

@@ -17,6 +17,7 @@ from PIL import Image
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.importing.pictures import picture_of, read_pictures
+from hypogoal.importing.taken import Taking
 from tests.importing.states import SIDE, arrays, pictures, save_minari, save_pictures
 
 UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
@@ -128,7 +129,7 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     palette = io.BytesIO()
     Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
     for data, said in (
-        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size: positive/zz.png is 48 x 20 x 3"),
+        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size: positive/zz.png is (48, 20, 3)"),
         (b"no image", "this cannot be read"),
         (saved(UPRIGHT)[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
@@ -156,9 +157,9 @@ def test_folders_of_pictures_become_states(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.labelled("at-right").observations[:12], images[labels])
     assert found.counts()["heldout"]["at-right"] == {"states": 6, "positives": 3}
     grey = save_pictures(tmp_path / "grey", change=lambda image: image[..., 0])
-    assert read_pictures(grey)[0].labelled.observations.shape == (24, SIDE, SIDE, 1)
+    assert read_pictures(grey, Taking(), Counter()).labelled.observations[""].shape == (24, SIDE, SIDE, 1)
     (grey / "positive" / "01.png").write_bytes(saved(images[1]))
-    mixed = read_pictures(grey)[0].labelled.observations
+    mixed = read_pictures(grey, Taking(), Counter()).labelled.observations[""]
     np.testing.assert_array_equal(mixed[0], images[1])
     np.testing.assert_array_equal(mixed[1], images[3][..., :1].repeat(3, 2))
 
@@ -178,9 +179,10 @@ def test_what_is_not_read_is_counted_and_folders_are_groups(tmp_path: Path) -> N
     said = run("import", folder, "--out", tmp_path / "data.h5", "--heldout", "0.3", "-q").err
     assert "not read: 3 .heic\n" in said
     found = open_dataset(tmp_path / "data.h5")
-    parts, left = read_pictures(folder)
+    left: Counter[str] = Counter()
+    parts = read_pictures(folder, Taking(), left)
     assert left == Counter({".heic": 3}) and len(parts.labelled.names) == 24 and parts.labelled.groups is not None
-    rows = [state.tobytes() for state in np.asarray(parts.labelled.observations)]
+    rows = [state.tobytes() for state in parts.labelled.observations[""]]
     day = dict(zip(rows, parts.labelled.groups.tolist(), strict=True))
     held = {day[state.tobytes()] for state in found.heldout("goal").observations}
     learned = {day[state.tobytes()] for state in found.labelled("goal").observations}
@@ -228,6 +230,7 @@ def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
     found = open_dataset(tmp_path / "goal.h5")
     whole = states[[2, 5]].transpose(0, 2, 3, 1, 4).reshape(2, 16, 4, 12, 4, 12).mean((2, 4))
     assert np.abs(found.unlabelled() - whole).max() <= 1
+    assert found.channels == {"": [4, 3]}
 
 
 def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path) -> None:

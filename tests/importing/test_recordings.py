@@ -173,7 +173,7 @@ def test_a_recorder_that_was_killed_is_named(tmp_path: Path) -> None:
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.hdf5")], check=False)
     command = ["import", tmp_path / "x.hdf5", "--out", tmp_path / "d.h5", "--label", "a=rewards"]
-    refuses(f"Once it has ended: h5clear -s {tmp_path / 'x.hdf5'}", *command)
+    refuses(f"one has crashed: h5clear -s {tmp_path / 'x.hdf5'}", *command)
 
 
 def test_minari_is_labelled_by_a_function(tmp_path: Path) -> None:
