@@ -37,6 +37,7 @@ NAMED = [
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A current folder with a module that notes when it is loaded, and files that name it."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))  # not a folder of another test
     mark = "import pathlib\npathlib.Path(__file__).with_name('ran').touch()\nobj = 1\n"
     (tmp_path / "evilmod.py").write_text(mark)
     (tmp_path / "theirs.toml").write_text('[train-ensemble]\ndiversity = "evilmod:obj"\n')

@@ -30,7 +30,8 @@ def read_arrays(path: Path, group: str = "") -> Parts:
             with reading(file, DO):
                 arrays[file.relative_to(path).with_suffix("").as_posix()] = np.load(file, allow_pickle=False)
     else:
-        with reading(path, DO), np.load(path, allow_pickle=False) as stored:
+        # NumPy leaves a cut archive open.
+        with reading(path, DO), path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays.update(stored)
     return parts_of(arrays, path, group)
 
