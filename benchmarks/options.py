@@ -25,7 +25,8 @@ import torch  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from hypogoal.core.config import resolve  # noqa: E402
+from hypogoal.core.config import assigned, resolve  # noqa: E402
+from hypogoal.core.config import preset as read_preset  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey_engine import DoorKeyEngine  # noqa: E402
@@ -106,7 +107,7 @@ class PlainLearner:
 
 def config_of(*changes: str, preset: str | None = None) -> TrainOptionsConfig:
     """Settings of option learning."""
-    return resolve(TrainOptionsConfig, stage="train-options", preset=preset, assignments=changes)
+    return resolve(TrainOptionsConfig, read_preset(preset, "train-options"), assigned(changes), stage="train-options")
 
 
 def terminations(engine: DoorKeyEngine, options: int) -> Terminations:

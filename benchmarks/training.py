@@ -28,11 +28,10 @@ import torch  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
 from hypogoal.core.checkpoints import Checkpoints  # noqa: E402
-from hypogoal.core.config import resolve  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.data import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
-from hypogoal.domains.base import defaults_of  # noqa: E402
+from hypogoal.domains.base import settings_of  # noqa: E402
 from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
 from hypogoal.hypotheses.training import fit  # noqa: E402
@@ -118,13 +117,7 @@ def ours(split: States, unlabelled: np.ndarray, config: EnsembleConfig) -> float
 
 def compared(split: States, unlabelled: np.ndarray, domain: str, members: int, steps: int, repeats: int) -> Any:
     """All ways, in turn."""
-    config = resolve(
-        EnsembleConfig,
-        stage="train-ensemble",
-        assignments=[f"members={members}", f"steps={steps + 1}"],
-        domain=domain,
-        defaults=defaults_of(domain, "train-ensemble"),
-    )
+    config = settings_of("train-ensemble", domain, typed={"members": members, "steps": steps + 1})
     candidates = {
         "plain loop": lambda: plain(split, unlabelled, config, steps),
         "hypogoal": lambda: ours(split, unlabelled, config),

@@ -30,9 +30,9 @@ def command_line() -> str:
 
 def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
-    from hypogoal.domains.base import BUILT_IN
+    from hypogoal.core.config import TABLES, described
+    from hypogoal.domains.base import BUILT_IN, layers_of
     from hypogoal.experiments.run import config_class_of
-    from hypogoal.settings import TABLES, described
 
     lines = [
         "# Settings",
@@ -43,7 +43,7 @@ def settings() -> str:
     ]
     for domain in BUILT_IN:
         for stage in TABLES:
-            rows = described(config_class_of(stage, domain), stage, domain)
+            rows = described(config_class_of(stage, domain), *layers_of(stage, domain))
             lines += [f"## {stage}, {domain}", "", "| setting | default | meaning | source |", "|---|---|---|---|"]
             lines += [_row(row) for row in rows]
             lines.append("")

@@ -8,7 +8,6 @@ option that hardly ever arrives. Commands: ``one_room.toml``. Results: ``docs/re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.montezuma_emulator import observed_pixel
@@ -52,8 +51,7 @@ def median(labelled: NDArray[np.float32], labels: NDArray[np.bool_], unlabelled:
     return np.median(labelled[labels], axis=0)
 
 
-@dataclass(frozen=True)
-class AgentViewSettings:
+class AgentViewSettings(Config):
     """What ``--set view.KEY=VALUE`` can change."""
 
     jitter: int = setting(3, "the most by which a window of a training batch is moved", unit="pixels", low=0, high=20)

@@ -320,21 +320,22 @@ def config(
     as_json: Json = False,
 ) -> None:
     """List every setting of a stage: default, unit, meaning, source."""
+    from hypogoal.core.config import TABLES, as_toml, described
     from hypogoal.core.files import replace_text
+    from hypogoal.domains.base import layers_of
     from hypogoal.experiments.run import config_class_of
-    from hypogoal.settings import CONFIGS, TABLES, described, preset_text
 
     if stage is None:
         helps = STAGES | {"run": "Run all cells of an experiment."}
         echo(list(TABLES), as_json, [f"{name:15}{helps[name]}" for name in TABLES])
         return
-    rows = described(CONFIGS.get(stage) or config_class_of(stage, domain), stage, domain, preset)
+    rows = described(config_class_of(stage, domain), *layers_of(stage, domain, preset))
     if write is None:
         echo(rows, as_json, _setting_lines(rows))
         return
     if write.exists() or write.suffix != ".toml":
         raise UserError("a preset needs a new .toml file", write, "Choose another name.")
-    replace_text(write, preset_text(stage, rows))
+    replace_text(write, as_toml(stage, rows))
     say(write)
 
 
@@ -354,7 +355,7 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
                 yield head + allowed
             else:
                 yield head
-                yield " " * 6 + allowed.strip()
+                yield from wrapped.wrap(allowed.replace("|", "| "))
             yield from wrapped.wrap(row["meaning"] + (f" [{row['source']}]" if row["source"] else ""))
 
 
@@ -507,9 +508,9 @@ def check(
     changes how, as for 'collect'.
     """
     from hypogoal.check import check_domain, check_network, check_objective
+    from hypogoal.core.config import assigned
     from hypogoal.diversity import load_objective
-    from hypogoal.domains.base import load_domain
-    from hypogoal.settings import configuration
+    from hypogoal.domains.base import load_domain, settings_of
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
@@ -517,7 +518,7 @@ def check(
     observations: tuple[Any, ...] = ()
     if domain is not None:
         loaded = load_domain(domain)
-        settings = configuration("collect", domain, None, set_)
+        settings = settings_of("collect", domain, typed=assigned(set_ or ()))
         verdicts.append(check_domain(loaded, settings, layout_seed=layout_seed, seed=seed))
         observations = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:

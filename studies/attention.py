@@ -9,7 +9,6 @@ gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -122,7 +121,7 @@ def run_cell(method: str, seed: int) -> list[Row]:
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
-        dataclasses.replace(config, **OF_LADDERS[method]),
+        config.model_copy(update=OF_LADDERS[method]),
         seed_for(seed, "ensemble", CLIMB_DOWN.name),
         Watcher(look=look, look_at=LOOKS),
     )

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import parse_integers
+from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
 from hypogoal.domains.base import Domain
@@ -34,7 +34,7 @@ def parser_of(doc: str | None, seeds: str = "", *, run: str = "") -> argparse.Ar
         parser.add_argument("run", type=Path, nargs="?", help=run)
     parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
     if seeds:
-        parser.add_argument("--seeds", type=parse_integers, default=parse_integers(seeds), help="0-9 or 0,2,5")
+        parser.add_argument("--seeds", type=integers, default=integers(seeds), help="0-9 or 0,2,5")
         parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     return parser
@@ -63,7 +63,7 @@ def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, A
 
 def collect_once(domain: Domain, config: Any, path: Path) -> None:
     """Collect into ``path``: go on where a killed study stopped, keep what is complete."""
-    collect(domain, path, resume=True, quiet=True, **vars(config))
+    collect(domain, path, resume=True, quiet=True, **config.model_dump())
 
 
 def run_cells(

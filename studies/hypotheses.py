@@ -17,7 +17,6 @@ prints the tables of all cells that there are, as Markdown.
 from __future__ import annotations
 
 import csv
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -101,7 +100,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
         data.labelled.observations,
         data.labelled.labels[:, column],
         data.unlabelled.observations,
-        dataclasses.replace(EnsembleConfig(steps=looks[-1]), **METHODS[method]),
+        EnsembleConfig(steps=looks[-1]).model_copy(update=METHODS[method]),
         seed_for(seed, "ensemble", sub_goal),
         Watcher(look=look, look_at=looks),
     )

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.config import parse_integers
+from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
 from hypogoal.domains.montezuma_ladders import GROUPS
@@ -213,7 +213,7 @@ def main() -> None:
     parser.add_argument(
         "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
     )
-    parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
+    parser.add_argument("--groups", type=integers, default=(1,), help="N: 1 or 1,2")
     parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
     parser.add_argument("--ladders", default=",".join(LADDERS), help=f"of {', '.join(LADDERS)}")
     arguments = parser.parse_args()

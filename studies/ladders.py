@@ -10,7 +10,6 @@ kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws them.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import parse_integers
+from hypogoal.core.config import integers
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
@@ -115,7 +114,7 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> lis
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
-        dataclasses.replace(config, **METHODS[method]),
+        config.model_copy(update=METHODS[method]),
         seed_for(seed, "ensemble", CLIMB_DOWN.name),
         Watcher(look=look, look_at=looks),
     )
@@ -247,7 +246,7 @@ def _of_authors(groups: int, method: str) -> str:
 def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = parser_of(__doc__, "0-9")
-    parser.add_argument("--groups", type=parse_integers, default=[1], help="labelled ladder groups: 1 or 1-4")
+    parser.add_argument("--groups", type=integers, default=[1], help="labelled ladder groups: 1 or 1-4")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     arguments = parser.parse_args()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium
@@ -183,7 +182,6 @@ NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: Fa
 ALWAYS = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "somewhere": lambda env: True})
 
 
-@dataclass(frozen=True)
 class MirroredConfig(GymnasiumConfig):
     """A setting of the domain's own."""
 

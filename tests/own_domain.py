@@ -1,12 +1,11 @@
 """A domain that is not hypogoal's, as a user would bring it (Spec B6): one file behind the small interface."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from corridor import LENGTH, Corridor
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 from hypogoal.data import Collected, States
 from hypogoal.domains.base import Domain
 
@@ -17,8 +16,7 @@ class TallCorridor(Corridor):
     observation_shape = (64, 64, 3)
 
 
-@dataclass(frozen=True)
-class CorridorConfig:
+class CorridorConfig(Config):
     """What ``collect`` can be told."""
 
     copies: int = setting(8, "copies of each cell", low=1)

@@ -82,15 +82,14 @@ def test_the_site_builds_and_needs_no_network(site: Path) -> None:
 def test_the_reference_is_that_of_the_code(site: Path) -> None:
     """Every command and every setting of every stage is in the reference."""
     from hypogoal.cli import commands as made_commands
-    from hypogoal.core.config import describe
+    from hypogoal.core.config import STAGES, described
     from hypogoal.experiments.run import config_class_of
-    from hypogoal.settings import STAGES
 
     pages = {name: (site / f"reference/{name}.html").read_text(encoding="utf-8") for name in ("cli", "settings")}
     for name in made_commands():
         assert f"<code>hypogoal {name}</code>" in pages["cli"], name
     for stage in STAGES:
-        for row in describe(config_class_of(stage)):
+        for row in described(config_class_of(stage)):
             assert f"<code>{row['name']}</code>" in pages["settings"], (stage, row["name"])
 
 

@@ -5,7 +5,6 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -280,4 +279,4 @@ def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
     collect_once(DOMAIN, config, path)
     assert path.read_bytes() == states
     with pytest.raises(UserError, match="heldout_layouts"):
-        collect_once(DOMAIN, replace(config, heldout_layouts=2), path)
+        collect_once(DOMAIN, config.model_copy(update={"heldout_layouts": 2}), path)

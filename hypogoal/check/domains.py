@@ -10,12 +10,11 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from hypogoal.check.verdict import Verdict, promise, verdicts
-from hypogoal.core.config import from_values, resolve
+from hypogoal.core.config import MODELS, model_of, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, Unmet, require_classes, require_names
 from hypogoal.domains.base import Domain, Engine, Step
-from hypogoal.settings import CONFIGS
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
 STATE_NOW = "A label is a function of the state now: count, keep and draw nothing in it."
@@ -47,11 +46,11 @@ class _Played:
         domain = self.domain
         require_names(tuple(domain.sub_goals))
         self.config = self.config or resolve(domain.config_class, stage="collect")
-        models = {"collect": domain.config_class, **CONFIGS}
+        models = {"collect": domain.config_class} | {stage: model_of(stage) for stage in MODELS}
         for stage, values in domain.defaults.items():
             text = f"defaults are for {stage!r}, which is not a stage"
             promise(stage in models, text, f"The stages are {', '.join(models)}.")
-            from_values(models[stage], values, stage)
+            resolve(models[stage], values, {}, stage=stage)
         return f"defaults for {', '.join(domain.defaults) or 'no stage'}"
 
     def gymnasium(self) -> str:

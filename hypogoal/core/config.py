@@ -1,28 +1,75 @@
-"""Settings: each default in one place, with unit, meaning and source; presets and ``--set`` are resolved here.
+"""Settings: a pydantic model for each stage, whose fields have default, meaning, unit, source and limits.
 
-A stage's configuration is a frozen dataclass of :func:`setting` fields; ``hypogoal config STAGE`` and the manifests
-use them too. Precedence: ``--set`` > option > preset > the domain's default > default.
+Precedence: ``--set`` > option > preset > the domain's default > default. The settings that only one learner or chooser
+has are a part of the stage's model: a model of their own, which is there where a setting chooses it.
 """
 
 import dataclasses
 import difflib
 import inspect
-import math
-import os
+import json
 import re
-import typing
-from collections.abc import Collection, Iterable, Mapping
-from importlib import resources
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib import import_module, resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, create_model, field_validator
+from pydantic.fields import FieldInfo
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
-from hypogoal.core.own_code import command
 
-T = TypeVar("T")
-MAX_RANGE = 10_000  # integers that one range may stand for
+C = TypeVar("C", bound="Config")
 DOMAIN = "doorkey"  # its presets and defaults hold if no domain is named
+MODELS = {  # by stage; collect's are its domain's, those of run its experiment's
+    "train-ensemble": "hypogoal.hypotheses.config:TrainEnsembleConfig",
+    "train-options": "hypogoal.meta.config:TrainOptionsConfig",
+    "train-meta": "hypogoal.meta.config:TrainMetaConfig",
+    "train-baseline": "hypogoal.learners.baselines.settings:BaselineConfig",
+    "audit": "hypogoal.meta.config:AuditConfig",
+}
+STAGES = ("collect", *MODELS)
+TABLES = (*STAGES, "run")  # of presets
+OWN = "module:object"  # any name of one's own, among choices and parts
+MOST = 10_000  # integers that one range may stand for
+
+
+class Config(BaseModel):
+    """The settings of a stage or of a part of it; names that it lacks and values that it does not allow are refused.
+
+    Attributes:
+        PARTS: by setting and its value, the model of the settings that this value brings. Values of one's own, ``OWN``,
+            bring all of them.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    PARTS: ClassVar[Mapping[str, Mapping[str, type["Config"]]]] = {}
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _read(cls, value: Any, info: ValidationInfo) -> Any:
+        """What was typed, or stands in a file, so that pydantic can make it a value of the field's type."""
+        kind = cls.model_fields[str(info.field_name)].annotation
+        if get_origin(kind) is tuple:
+            kind = get_args(kind)[0]
+            value = _items(value, kind) if isinstance(value, str) else value
+        if isinstance(value, list | tuple):
+            return [_number(item, kind) for item in value]
+        return _number(value, kind)
+
+    @field_validator("*")
+    @classmethod
+    def _check(cls, value: Any, info: ValidationInfo) -> Any:
+        details = _details(cls.model_fields[str(info.field_name)])
+        for item in value if isinstance(value, tuple) else (value,):
+            choices, low, high = details.get("choices"), details.get("low"), details.get("high")
+            if choices and item not in choices and not (details["own"] and ":" in item):
+                raise ValueError("value not allowed")
+            if (low is not None and item < low) or (high is not None and item > high):
+                raise ValueError("value out of range")
+        return value
 
 
 def setting(
@@ -31,53 +78,28 @@ def setting(
     *,
     unit: str = "",
     source: str = "",
-    choices: Iterable[Any] | None = None,
-    own: bool = False,
     low: float | None = None,
     high: float | None = None,
+    choices: Iterable[Any] | None = None,
+    own: bool = False,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon."""
-    allowed = {"choices": None if choices is None else tuple(choices), "own": own, "low": low, "high": high}
-    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
+    """A field of a ``Config`` with its meaning, unit and source.
 
-
-def fixed(value: Any) -> Any:
-    """A field in place of a setting that a stage has taken from another one and does not heed: it cannot be set."""
-    return dataclasses.field(default=value, init=False)
-
-
-def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
-    """The settings that preset ``name`` changes in ``stage``, a command: its table ``[stage]``.
-
-    The name is a preset of the package (``demo``, ``paper``), of ``domain`` or, if it has none, of DoorKey, or the path
-    of the user's TOML file. An unknown preset, invalid TOML, and tables not in ``tables`` (empty: any) are a
-    ``UserError``.
+    Its value, or each item of a tuple, is ``low`` to ``high``, or among ``choices``; ``own``: or ``module:object``.
     """
-    if name is None:
-        return {}
-    every = resources.files("hypogoal") / "presets"
-    folder = every / domain if domain.replace("-", "_").isidentifier() and (every / domain).is_dir() else every / DOMAIN
-    available = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    if name.endswith(".toml"):
-        if not Path(name).exists():
-            raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(available)}.")
-        text = read_text(Path(name), "the preset is", "Give a .toml file.")
-    elif name in available:
-        text = (folder / f"{name}.toml").read_text(encoding="utf-8")
-    else:
-        raise UserError("unknown preset", name, f"Choose one of {', '.join(available)}, or give a .toml file.")
-    table = parse_toml(text, name, "the preset is", "Mend the file.")
-    for key in table:
-        if tables and key not in (*tables, stage):
-            do = f"{meant(key, tables)}A preset has tables for {', '.join(tables)}."
-            raise UserError("no such table in a preset", f"{key} in {name}", do)
-    values = table.get(stage, {})
-    if not isinstance(values, dict):
-        raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
-    return values
+    chosen_from = None if choices is None else tuple(choices)
+    details: Any = {"unit": unit, "source": source, "low": low, "high": high, "choices": chosen_from, "own": own}
+    return Field(default, description=meaning, json_schema_extra=details)
 
 
-def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
+def model_of(stage: str) -> type[Config]:
+    """The model of the settings of one of ``MODELS``."""
+    module, _, name = MODELS[stage].partition(":")
+    model: type[Config] = getattr(import_module(module), name)
+    return model
+
+
+def assigned(assignments: Iterable[str]) -> dict[str, str]:
     """``["steps=300", ...]`` -> ``{"steps": "300", ...}``."""
     values = {}
     for assignment in assignments:
@@ -88,173 +110,187 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
     return values
 
 
-def resolve(
-    config_class: type[T],
-    *,
-    stage: str,
-    preset: str | None = None,
-    options: Mapping[str, Any] | None = None,
-    assignments: Iterable[str] = (),
-    domain: str = DOMAIN,
-    defaults: Mapping[str, Any] | None = None,
-    tables: Collection[str] = (),
-) -> T:
-    """The configuration of a stage, a frozen dataclass of :func:`setting` fields.
-
-    From the preset (see :func:`load_preset`), the ``options`` of the command line that are not None, its ``--set``
-    ``assignments`` and the domain's ``defaults``, which override the class's. An unknown key, a wrong type, or a value
-    out of range is a ``UserError``.
-    """
-    values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
-    values.update({key: value for key, value in (options or {}).items() if value is not None})
-    assigned = parse_assignments(assignments)
-    config = from_values(config_class, {**values, **assigned}, stage, domain)
-    if "HYPOGOAL_CORES" not in os.environ:  # an experiment sets its cells alike, controls among them
-        refuse_idle(config, {*(key for key, value in (options or {}).items() if value is not None), *assigned})
-    return config
-
-
-def refuse_idle(config: Any, names: set[str]) -> None:
-    """Refuse (``UserError``) changed settings of these names that do nothing: ``IDLE`` of a class says beside what."""
-    defaults = type(config)()
-    for beside, idle in [item for part in type(config).__mro__ for item in vars(part).get("IDLE", {}).items()]:
-        other, _, value = beside.partition("=")
-        for name in names & set(idle) if getattr(config, other) == value else ():
-            if getattr(config, name) != getattr(defaults, name):
-                setting = f"{name}={getattr(config, name)}"
-                do = f"Leave it out, or change {other}."
-                raise UserError(f"this setting does nothing with {beside}", setting, do)
-
-
-def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, domain: str = DOMAIN) -> T:
-    """Build ``config_class`` from plain values (text, TOML or JSON), checking each; ``domain`` is for messages."""
-    every = dataclasses.fields(config_class)  # type: ignore[arg-type]
-    fields = {field.name: field for field in every if field.init}
-    constant = {field.name: field.default for field in every if not field.init}
-    kinds = typing.get_type_hints(config_class)
-    checked: dict[str, Any] = {}
-    for key, value in gathered(values).items():
-        if key in constant and value == constant[key]:
-            continue
-        if key not in fields:
-            listed = command("config", stage, *([] if domain == DOMAIN else ["--domain", domain]))
-            raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}All of them: {listed}")
-        checked[key] = _checked(fields[key], kinds[key], value, stage)
-    return config_class(**checked)
-
-
-def gathered(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values with those of a part of one's own, ``view.KEY``, in one: ``view_settings``, a list of KEY=VALUE."""
-    whole: dict[str, Any] = {}
-    for key, value in values.items():
-        part, dot, name = key.partition(".")
-        if dot:
-            whole.setdefault(f"{part}_settings", []).append(f"{name}={value}")
-        else:
-            whole[key] = value
-    return whole
-
-
-def meant(word: str, candidates: Iterable[str]) -> str:
-    """'Did you mean ...?' if a candidate is like ``word``; else empty."""
-    near = difflib.get_close_matches(word, [*candidates], n=1)
-    return f"Did you mean {near[0]!r}? " if near else ""
-
-
-def as_dict(config: Any) -> dict[str, Any]:
-    """The configuration as JSON-ready values."""
-    return {
-        field.name: list(value) if isinstance(value := getattr(config, field.name), tuple) else value
-        for field in dataclasses.fields(config)
-    }
-
-
-def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
-    """Every setting with default, meaning and so on; the last of ``instead``, (defaults, source), overrides."""
-    kinds = typing.get_type_hints(config_class)
-    rows = []
-    for field in (field for field in dataclasses.fields(config_class) if field.init):
-        kind, default, details = kinds[field.name], field.default, dict(field.metadata)
-        for values, source in instead:
-            if field.name in values:
-                default, details["source"] = values[field.name], source
-        row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
-        rows.append(row | {key: details.get(key) for key in ("unit", "meaning", "source")})
-        home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))
-        rows[-1] |= {"allowed": _allowed(details), "part": (home.__doc__ or "").partition(".")[0]}
-    return rows
-
-
-def _allowed(meta: Mapping[str, Any]) -> str:
-    if meta.get("choices"):
-        return "|".join([*map(str, meta["choices"]), *(["module:Class"] if meta["own"] else [])])
-    low, high = ("" if meta.get(bound) is None else meta[bound] for bound in ("low", "high"))
-    return "" if low == high == "" else f"{low} .. {high}".strip()
-
-
-def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -> Any:
-    shown = repr(value) if len(repr(value)) <= 200 else f"{repr(value)[:200]} ..."
-    where = f"{field.name}={shown} in {stage}"
-    try:
-        parsed = _parse(kind, value)
-    except (TypeError, ValueError, KeyError, OverflowError):
-        name = "true or false" if kind is bool else getattr(kind, "__name__", str(kind))
-        raise UserError("wrong type of value", where, f"It must be {name}.") from None
-    meta = field.metadata
-    for item in parsed if isinstance(parsed, tuple) else (parsed,):
-        if isinstance(item, float) and not math.isfinite(item):
-            raise UserError("value is not finite", where, "Give a finite number.")
-        if isinstance(item, int) and abs(item) > MOST_INTEGER:
-            raise UserError("value out of range", where, f"Integers go from -{MOST_INTEGER} to {MOST_INTEGER}.")
-        if meta.get("choices") and item not in meta["choices"] and not (meta["own"] and ":" in item):
-            raise UserError("value not allowed", where, f"Choose one of {_allowed(meta).replace('|', ', ')}.")
-        for bound, outside in (("low", lambda a, b: a < b), ("high", lambda a, b: a > b)):
-            if meta.get(bound) is not None and outside(item, meta[bound]):
-                raise UserError("value out of range", where, f"Allowed: {_allowed(meta)}.")
-    return parsed
-
-
-def parse_integers(text: str) -> list[int]:
+def integers(text: str) -> list[int]:
     """``0-3,7`` -> ``[0, 1, 2, 3, 7]``; anything else is a ``UserError``."""
     try:
-        return [int(number) for item in text.split(",") for number in _range(item)]
+        return _items(text, int)
     except ValueError:
         raise UserError("not integers", repr(text[:200]), "Write them as 0-3,7.") from None
 
 
-def _range(item: Any) -> Iterable[Any]:
-    """The integers of ``3-7``; anything else is itself."""
-    match = re.fullmatch(r"\s*(\d{1,9})-(\d{1,9})\s*", item) if isinstance(item, str) else None
-    if match is None:
-        return (item,)
-    first, last = int(match[1]), int(match[2])
-    if not first <= last < first + MAX_RANGE:
-        raise ValueError
-    return range(first, last + 1)
+def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]:
+    """The table ``[stage]`` of a preset: one of the package, for ``domain`` or else for DoorKey, or a TOML file."""
+    if name is None:
+        return {}
+    presets = Path(str(resources.files("hypogoal"))) / "presets"
+    folder = presets / (domain if (presets / domain).is_dir() else DOMAIN)
+    path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
+    if not path.exists():
+        names = ", ".join(sorted(file.stem for file in folder.iterdir()))
+        raise UserError("no such preset", name, f"Choose one of {names}, or give a .toml file.")
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"the preset cannot be read ({error})", name, "Mend the file.") from None
+    for key, table in tables.items():
+        if key not in TABLES or not isinstance(table, dict):
+            do = f"{near(key, TABLES)}A preset has tables for {', '.join(TABLES)}."
+            raise UserError("no such table in a preset", f"{key} in {name}", do)
+    return dict(tables.get(stage, {}))
 
 
-def _parse(kind: Any, value: Any) -> Any:
-    if typing.get_origin(kind) is tuple:
-        (item_kind, *_rest) = typing.get_args(kind)
-        items = value.split(",") if isinstance(value, str) else value
-        if item_kind is int:
-            items = [number for item in items for number in _range(item)]
-        return tuple(_parse(item_kind, item.strip() if isinstance(item, str) else item) for item in items if item != "")
-    if kind is bool:
-        if isinstance(value, bool):
-            return value
-        return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[str(value).lower()]
-    if isinstance(value, bool):  # an int in Python
-        raise TypeError
-    if kind is int:
-        if isinstance(value, str):
-            value = value.replace("_", "")
-        number = float(value)
-        if number != int(number):
-            raise ValueError
-        return int(value) if isinstance(value, (int, str)) and str(value).lstrip("+-").isdigit() else int(number)
-    if kind is float:
+def resolve(model: type[C], *layers: Mapping[str, Any], stage: str) -> C:
+    """The settings of ``stage``, of the model and of the parts that its settings choose; later layers win.
+
+    None stands for a value that is not given. The last layer is what the user typed: there a setting of a part that is
+    not chosen is refused; the others, a domain's defaults and a preset, may have some, without effect. What is refused
+    is a ``UserError``.
+    """
+    if dataclasses.is_dataclass(model) or not issubclass(model, Config):
+        do = f"Write 'class {model.__name__}(Config):', without @dataclass."
+        raise UserError("settings are a class derived from hypogoal.core.config.Config", model.__name__, do)
+    values: dict[str, Any] = {}
+    typed: set[str] = set()
+    for layer in layers:
+        given = {name: value for name, value in layer.items() if value is not None}
+        typed = set(given)
+        values |= given
+    chosen = _with_parts(model, values)
+    for name in [*values]:
+        if name not in typed and name not in chosen.model_fields and _choices_with(model, name):
+            del values[name]
+    try:
+        return chosen.model_validate(values)
+    except ValidationError as error:
+        raise _refusal(chosen, values, error, stage) from None
+
+
+def known(model: type[Config], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a manifest or data file that the model or a part of it has: earlier versions had others, too."""
+    names = _with_parts(model).model_fields
+    return {name: value for name, value in values.items() if name in names}
+
+
+def described(model: type[Config], *layers: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
+    """Every setting of the model, then of its parts; a layer has values that replace defaults, and their source."""
+    every = _with_parts(model)
+    defaults = every().model_dump(mode="json")
+    sources: dict[str, str] = {}
+    for values, source in layers:
+        resolved = resolve(every, values, {}, stage="").model_dump(mode="json")
+        changed = values.keys() & resolved.keys()
+        defaults |= {name: resolved[name] for name in changed}
+        sources |= dict.fromkeys(changed, source)
+    rows: dict[str, dict[str, Any]] = {}
+    for home in (*model.__mro__, *every.__mro__):
+        for name in inspect.get_annotations(home):
+            if name not in every.model_fields or name in rows:
+                continue
+            field = every.model_fields[name]
+            rows[name] = {
+                "name": name,
+                "type": getattr(field.annotation, "__name__", str(field.annotation)),
+                "default": defaults[name],
+                "unit": _details(field).get("unit", ""),
+                "meaning": field.description or "",
+                "source": sources.get(name, _details(field).get("source", "")),
+                "allowed": _allowed(field),
+                "part": (home.__doc__ or "").partition(".")[0],
+            }
+    return [*rows.values()]
+
+
+def as_toml(stage: str, rows: Iterable[Mapping[str, Any]]) -> str:
+    """Settings as :func:`described` has them, as a preset to edit."""
+    lines = [f"[{stage}]"]
+    for row in rows:
+        allowed = f" ({row['allowed']})" if row["allowed"] else ""
+        value = json.dumps(row["default"], ensure_ascii=False)
+        lines += ["", f"# {row['meaning']}{allowed}", f"{row['name']} = {value}"]
+    return "\n".join(lines) + "\n"
+
+
+def near(word: str, candidates: Iterable[str]) -> str:
+    """'Did you mean ...?' if a candidate is like ``word``; else empty."""
+    close = difflib.get_close_matches(word, [*candidates], n=1)
+    return f"Did you mean {close[0]!r}? " if close else ""
+
+
+def _items(text: str, kind: Any) -> list[Any]:
+    """The items between commas; of integers also ``3-7``."""
+    items: list[Any] = []
+    for part in filter(None, map(str.strip, text.split(","))):
+        ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", part) if kind is int else None
+        if kind is not int:
+            items.append(part)
+        elif ends is None:
+            items.append(int(part))
+        elif int(ends[1]) <= int(ends[2]) < int(ends[1]) + MOST:
+            items += range(int(ends[1]), int(ends[2]) + 1)
+        else:
+            raise ValueError(f"a range goes up, over at most {MOST} integers")
+    return items
+
+
+def _number(value: Any, kind: Any) -> Any:
+    """``3e5`` for an integer; True is no number."""
+    if kind in (int, float) and isinstance(value, bool):
+        raise ValueError("this must be a number")
+    if kind is int and isinstance(value, str) and "e" in value.lower():
         return float(value)
-    if kind is str and isinstance(value, str):
-        return value
-    raise TypeError(f"{value!r} is no {kind}")
+    return value
+
+
+def _details(field: FieldInfo) -> Mapping[str, Any]:
+    details: Any = field.json_schema_extra
+    return details or {}
+
+
+def _allowed(field: FieldInfo) -> str:
+    """The values that a setting may have, in a few words; empty if all of its type."""
+    details = _details(field)
+    if details.get("choices") is not None:
+        own = [OWN] if details["own"] else []
+        return "|".join([*map(str, details["choices"]), *own])
+    low, high = ("" if details.get(bound) is None else details[bound] for bound in ("low", "high"))
+    return "" if low == high == "" else f"{low} .. {high}".strip()
+
+
+def _with_parts(model: type[C], values: Mapping[str, Any] | None = None) -> type[C]:
+    """The model with the parts that ``values`` choose; without ``values`` with all parts."""
+    parts = []
+    for name, models in model.PARTS.items():
+        value = OWN if values is None else str(values.get(name, model.model_fields[name].default))
+        part = models.get(OWN if ":" in value else value)
+        parts += [part] if part else []
+    return _joined(model, *parts)
+
+
+@cache
+def _joined(model: type[C], *parts: type[Config]) -> type[C]:
+    bases: Any = (model, *(part for part in parts if not issubclass(model, part)))
+    return model if bases == (model,) else create_model(model.__name__, __base__=bases, __doc__=model.__doc__)
+
+
+def _choices_with(model: type[Config], name: str) -> list[str]:
+    """The choices, SETTING=VALUE, that bring the setting ``name``."""
+    found = []
+    for setting_name, models in model.PARTS.items():
+        found += [f"{setting_name}={value}" for value, part in models.items() if name in part.model_fields]
+    return found
+
+
+def _refusal(model: type[Config], values: Mapping[str, Any], error: ValidationError, stage: str) -> UserError:
+    """What is said of the first fault."""
+    fault = error.errors()[0]
+    name = str(fault["loc"][0])
+    advice = f"See 'hypogoal config {stage}'."
+    if name in model.model_fields:
+        limits = _allowed(model.model_fields[name])
+        where = f"{name}={fault['input']!r:.200} in {stage}"
+        return UserError(fault["msg"].removeprefix("Value error, "), where, f"Allowed: {limits}." if limits else advice)
+    if choices := _choices_with(model, name):
+        chooses = choices[0].partition("=")[0]
+        value = values.get(chooses, model.model_fields[chooses].default)
+        return UserError(f"{chooses}={value} has no setting", name, f"It belongs to {', '.join(choices)}.")
+    return UserError(f"{stage} has no setting", name, f"{near(name, _with_parts(model).model_fields)}{advice}")

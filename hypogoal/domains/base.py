@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core import own_code
 from hypogoal.core.checkpoints import ANEW, Resumable
-from hypogoal.core.config import from_values
+from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
 from hypogoal.domains.observations import reading_of
@@ -305,7 +305,7 @@ class Domain(ABC):
         name: for messages.
         sub_goals: their names (G).
         usual_sub_goals: those that ``collect`` labels by default; all, if it labels all.
-        config_class: the settings of ``collect``, a frozen dataclass of ``core.config.setting`` fields.
+        config_class: the settings of ``collect``, a ``Config`` of ``core.config.setting`` fields.
         engine_settings: the names of the settings that define the world; later stages play with them too.
         defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
         env_id: the id of its registered Gymnasium environment, if any.
@@ -323,7 +323,7 @@ class Domain(ABC):
 
     name: str
     sub_goals: tuple[str, ...]
-    config_class: type
+    config_class: type[Config]
     engine_settings: tuple[str, ...] = ()
     defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
     sources: Mapping[str, str] = MappingProxyType({})
@@ -385,7 +385,7 @@ class Domain(ABC):
         ``make_engine``; values that ``collect`` would refuse are a ``UserError``.
         """
         values = {name: config[name] for name in self.engine_settings if name in config}
-        checked: Any = from_values(self.config_class, values, "collect") if values else None
+        checked = resolve(self.config_class, values, stage="collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
     def task(self, world: Mapping[str, Any]) -> str:
@@ -480,3 +480,29 @@ def defaults_of(domain: str, stage: str) -> Mapping[str, Any]:
     """The domain's own defaults for the settings of a stage; see :func:`installed_domain`."""
     installed = installed_domain(domain)
     return installed.defaults.get(stage, {}) if installed else {}
+
+
+def layers_of(stage: str, domain: str, preset_name: str | None = None) -> list[tuple[Mapping[str, Any], str]]:
+    """What replaces the defaults of a stage's settings, and its source: the domain's own, then a preset's."""
+    installed = installed_domain(domain)
+    layers = []
+    if installed:
+        layers.append((installed.defaults.get(stage, {}), installed.sources.get(stage, f"{domain}'s own")))
+    return [*layers, (preset(preset_name, stage, domain), f"preset {preset_name}")]
+
+
+def settings_of(
+    stage: str,
+    domain: str,
+    preset_name: str | None = None,
+    typed: Mapping[str, Any] | None = None,
+    *,
+    inherited: Mapping[str, Any] | None = None,
+) -> Any:
+    """The settings of a stage on a domain: its defaults, those ``inherited``, a preset's, then what the user typed.
+
+    ``inherited`` are of the options that the stage continues. What is unknown or not allowed is a ``UserError``.
+    """
+    model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
+    *defaults, of_preset = [values for values, _ in layers_of(stage, domain, preset_name)]
+    return resolve(model, *defaults, inherited or {}, of_preset, typed or {}, stage=stage)

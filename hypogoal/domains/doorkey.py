@@ -5,21 +5,22 @@ See also ``doorkey_env`` (the Gymnasium environment and the sub-goals) and ``doo
 
 import itertools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 from hypogoal.data import Collected, States, joined, leave_out, require_classes
 from hypogoal.domains import doorkey_env as env
 from hypogoal.domains.base import Domain
-from hypogoal.domains.doorkey_defaults import DEFAULTS, SOURCES
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 
+# So that options behind other options learn in time.
+LEARNING: Mapping[str, Any] = MappingProxyType({"epsilon_steps": 2_000, "update_interval": 8})
 
-@dataclass(frozen=True)
-class DoorKeyConfig:
+
+class DoorKeyConfig(Config):
     """Settings of ``hypogoal collect doorkey``."""
 
     labelled_seed: int = setting(0, "layout seed of the labelled states", source="paper, MiniGrid experiment", low=0)
@@ -83,7 +84,8 @@ class DoorKeyDomain(Domain):
     engine_settings = ("door_label", "wrong_key")
     env_id = "hypogoal.envs:hypogoal/DoorKey-8x8-v0"
     many_layouts = True
-    defaults, sources = DEFAULTS, SOURCES
+    defaults = MappingProxyType({"train-options": LEARNING, "train-meta": LEARNING})
+    sources = MappingProxyType(dict.fromkeys(defaults, "ours: docs/results/history.md"))
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """Spec B3: labelled, unlabelled and held-out states, each with its origin.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import as_dict, setting
+from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
@@ -24,8 +24,7 @@ Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
 
 
-@dataclass(frozen=True)
-class GymnasiumConfig:
+class GymnasiumConfig(Config):
     """Settings of ``hypogoal collect`` for such a domain."""
 
     labelled_seeds: tuple[int, ...] = setting(
@@ -68,7 +67,7 @@ class GymnasiumDomain(Domain):
         features: names of the numbers in observations other than pictures; default: those of a ``Dict``, or x0, x1, ...
         resize: the side in pixels to which pictures are resized; 0: no resizing.
         name: for messages; artefacts use the name that the user passed to ``collect``.
-        config_class: a frozen dataclass that adds settings to ``GymnasiumConfig``; ``make`` gets them in collection,
+        config_class: a class derived from ``GymnasiumConfig`` that adds settings; ``make`` gets them in collection,
             training, baselines and evaluation.
 
     Example, for ``hypogoal collect my_module:DOMAIN``::
@@ -97,8 +96,8 @@ class GymnasiumDomain(Domain):
         self.make, self.memory, self.name = make, memory, name
         self.success, self._named, self.resize = success, tuple(features), resize
         self.config_class = config_class
-        generic = {each.name for each in fields(GymnasiumConfig)}
-        self._own_settings = {each.name: each.default for each in fields(config_class) if each.name not in generic}
+        generic, settings = GymnasiumConfig.model_fields, config_class.model_fields
+        self._own_settings = {name: field.default for name, field in settings.items() if name not in generic}
         self.engine_settings = tuple(self._own_settings)
         self.labels = engines.Labels(sub_goals, labels)
         self.sub_goals = self.labels.names
@@ -156,7 +155,7 @@ class GymnasiumDomain(Domain):
         )
 
     def small(self, config: GymnasiumConfig) -> GymnasiumConfig:
-        return replace(config, states=min(config.states, 200))
+        return config.model_copy(update={"states": min(config.states, 200)})
 
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states reached in play on each layout, each picture once.
@@ -166,7 +165,7 @@ class GymnasiumDomain(Domain):
         unlabelled or no held-out states.
         """
         seeds_of_sets = [getattr(config, name) for name in SEEDS]
-        env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
+        env = engines.make_checked(partial(self.make_env, **self.world(config.model_dump())))
         progress.total = config.steps * sum(map(len, seeds_of_sets))
         training: set[bytes] = set()  # digests of labelled and unlabelled states
         sets: list[States] = []

@@ -6,17 +6,17 @@ positions), ``montezuma_sub_goals`` (climbing, passing enemies), ``montezuma_sta
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.config import setting
-from hypogoal.core.errors import UserError
+from hypogoal.core.config import Config, setting
 from hypogoal.core.processes import allowed, in_processes
 from hypogoal.data import Collected, States, joined
 from hypogoal.domains.base import Domain
@@ -61,14 +61,14 @@ ALONE: Mapping[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class MontezumaConfig:
+class MontezumaConfig(Config):
     """Settings of ``hypogoal collect montezuma``."""
 
     groups: int = setting(1, "ladder groups with labels (N), out of seven", source="Figure 3", low=1, high=len(GROUPS))
-    sub_goals: tuple[str, ...] = setting(
+    sub_goals: Annotated[tuple[str, ...], Field(min_length=1)] = setting(
         (CLIMB_DOWN.name,),
-        f"what is labelled: {', '.join(SUB_GOALS)}; others than ladders have five or three groups",
+        "what is labelled; others than ladders have five or three groups",
+        choices=SUB_GOALS,
         source="paper; the others: the authors' code",
     )
     states_per_room: int = setting(
@@ -82,11 +82,6 @@ class MontezumaConfig:
     )
     heldout_seed: int = setting(0, "another number draws other held-out states and changes nothing else", low=0)
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
-
-    def __post_init__(self) -> None:
-        for name in self.sub_goals or ("",):
-            if name not in SUB_GOALS:
-                raise UserError("no such sub-goal", name or "sub_goals", f"Choose among {', '.join(SUB_GOALS)}.")
 
 
 class _Task(NamedTuple):

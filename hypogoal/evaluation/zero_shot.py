@@ -6,7 +6,6 @@ What limits an agent, its options tell: they stop at a false positive of their m
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +83,7 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> list[tuple[dict[str,
 
     config, sub_goals = artefact.config, load_domain(artefact.config["domain"]).sub_goals
     loop = agent_of(artefact, artefact.seed, len(layouts), layouts)
-    loop.config = replace(loop.config, restart_options=False)
+    loop.config = loop.config.model_copy(update={"restart_options": False})
     ways = shortest_ways(loop.engine)
     players: list[tuple[dict[str, Any], Played]] = []
     if artefact.kind == "meta":
@@ -93,7 +92,7 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> list[tuple[dict[str,
             episodes = play(loop, chooser, EPISODES)
             scores = episodes.scores(ways[:, -1:]) | {"length": episodes.length}
             players.append((fields, {quantity: values.mean(1) for quantity, values in scores.items()}))
-    loop.config = replace(loop.config, mask_reached=False)
+    loop.config = loop.config.model_copy(update={"mask_reached": False})
     for option, (sub_goal, member) in enumerate(product(config["sub_goals"], range(config["members"]))):
         if sub_goal in sub_goals:  # else the user's own labels said it: its truth here is not known
             goal = sub_goals.index(sub_goal)

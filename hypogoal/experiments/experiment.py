@@ -15,14 +15,14 @@ import inspect
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, make_dataclass
+from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from hypogoal.core.config import parse_integers, setting
+from hypogoal.core.config import Config, integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load, names_in, require_trust
 
@@ -48,14 +48,14 @@ class Experiment:
 
     name: str
     function: Callable[..., Iterable[Any]]  # of the settings, by keyword; yields Command or its fields
-    config_class: type  # the settings of ``hypogoal run``: the function's, then those of all experiments
+    config_class: type[Config]  # the settings of ``hypogoal run``: the function's, then those of all experiments
     domain: str | None = None  # whose presets and settings its stages take; None: each command says all itself
     stages: tuple[str, ...] = ()  # whose settings can be changed for all commands
 
     @property
     def settings(self) -> tuple[str, ...]:
         """The names of the function's settings."""
-        return tuple(name for name in inspect.get_annotations(self.config_class) if name not in COMMON)
+        return tuple(name for name in self.config_class.model_fields if name not in COMMON)
 
     def commands(self, settings: Mapping[str, Any], stage: Callable[[str], Any]) -> list[Command]:
         """What the function yields; ``stage`` gives a stage's settings. What is no command is a ``UserError``."""
@@ -77,8 +77,7 @@ class Experiment:
 
 def explained(meaning: str, **limits: Any) -> Mapping[str, Any]:
     """What a setting means, for its annotation; ``limits`` are those of :func:`hypogoal.core.config.setting`."""
-    metadata: Mapping[str, Any] = setting(None, meaning, **limits).metadata
-    return metadata
+    return {"meaning": meaning, **limits}
 
 
 Layouts = Annotated[Integers, explained("layouts, each with an agent of its own", source="paper, Figure 6", low=0)]
@@ -123,7 +122,7 @@ def _experiment_of(
     function: Callable[..., Iterable[Any]], domain: str | None = None, stages: Sequence[str] = ()
 ) -> Experiment:
     """A function as an experiment whose settings are those that the function's signature describes."""
-    fields = []
+    fields = {}
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in inspect.signature(function).parameters.items():
         if name == "stage" and domain:
@@ -134,18 +133,17 @@ def _experiment_of(
         kind, metadata = hints[name], explained("")
         if get_origin(kind) is Annotated:
             kind, metadata = get_args(kind)
-        fields.append((name, kind, setting(parameter.default, **metadata)))
+        fields[name] = (kind, setting(parameter.default, **metadata))
     return Experiment(function.__name__.replace("_", "-"), function, _run_config(fields), domain, (*stages,))
 
 
-def _run_config(fields: Sequence[tuple[str, Any, Any]], workers: int = 0, evaluate: bool = True) -> type:
-    """The settings of ``hypogoal run``: an experiment's own, then those of all experiments."""
-    common: list[tuple[str, Any, Any]] = [
-        ("workers", int, setting(workers, "cells at once; 0 for one per core", low=0, high=1024)),
-        ("evaluate", bool, setting(evaluate, "evaluation and report at the end")),
-    ]
-    namespace = {"__doc__": "Which cells there are."}
-    return make_dataclass("RunConfig", [*fields, *common], namespace=namespace, frozen=True)
+def _run_config(fields: Mapping[str, Any], workers: int = 0, evaluate: bool = True) -> type[Config]:
+    """The settings of ``hypogoal run``: an experiment's own, by name (type, setting), then those of all experiments."""
+    common = {
+        "workers": (int, setting(workers, "cells at once; 0 for one per core", low=0, high=1024)),
+        "evaluate": (bool, setting(evaluate, "evaluation and report at the end")),
+    }
+    return create_model("RunConfig", __base__=Config, __doc__="Which cells there are.", **{**fields, **common})
 
 
 class _Cells(BaseModel):
@@ -204,10 +202,10 @@ def read_toml(path: Path) -> Experiment:
             raise UserError(problem, path, MEND) from None
 
     axes = {
-        name: tuple(parse_integers(values)) if isinstance(values, str) else tuple(values)
+        name: tuple(integers(values)) if isinstance(values, str) else tuple(values)
         for name, values in file.axes.items()
     }
-    settings = [(name, _kind(values), setting(values, "an axis")) for name, values in axes.items()]
+    settings = {name: (_kind(values), setting(values, "an axis")) for name, values in axes.items()}
     return Experiment(path.stem, commands, _run_config(settings, file.workers, file.evaluate))
 
 

@@ -6,11 +6,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import DOMAIN, parse_assignments, resolve
+from hypogoal.core.config import DOMAIN, MODELS, TABLES, Config, assigned, described, model_of, resolve
+from hypogoal.core.config import preset as read_preset
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import check_device, cores
 from hypogoal.core.terminal import amount
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import layers_of, load_domain, settings_of
 from hypogoal.experiments import slurm
 from hypogoal.experiments.experiment import Command, Experiment
 from hypogoal.experiments.named import EXPERIMENTS, find_experiment
@@ -25,10 +26,9 @@ from hypogoal.experiments.sweep import (
     read_plan,
     run_local,
 )
-from hypogoal.settings import CONFIGS, TABLES, configuration, options_of
 
 
-def config_class_of(stage: str, domain: str = DOMAIN) -> type:
+def config_class_of(stage: str, domain: str = DOMAIN) -> type[Config]:
     """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
     if stage == "collect":
         return load_domain(domain).config_class
@@ -37,9 +37,9 @@ def config_class_of(stage: str, domain: str = DOMAIN) -> type:
             if domain == experiment.domain and name != "choosing":
                 return experiment.config_class
         raise UserError("no experiment uses this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
-    if stage not in CONFIGS:
+    if stage not in MODELS:
         raise UserError("no such stage", stage, f"Choose one of {', '.join(TABLES)}.")
-    return CONFIGS[stage]
+    return model_of(stage)
 
 
 def plan(
@@ -63,22 +63,21 @@ def plan(
     seed = "seeds" if "seeds" in experiment.settings else "seed"
     of_run, by_stage = _split(experiment, [*fixed, *([f"{seed}={seeds}"] if seeds else []), *assignments])
     domain = experiment.domain or DOMAIN
-    config: Any = resolve(
-        experiment.config_class, stage="run", preset=preset, assignments=of_run, domain=domain, tables=TABLES
-    )
+    layers = read_preset(preset, "run", domain), assigned(of_run)
+    config: Any = resolve(experiment.config_class, *layers, stage="run")
 
     @cache
-    def settings_of(stage: str) -> Any:
-        return configuration(stage, domain, preset, by_stage.get(stage, ()))
+    def settings(stage: str) -> Any:
+        return settings_of(stage, domain, preset, assigned(by_stage.get(stage, ())))
 
-    commands = experiment.commands({key: getattr(config, key) for key in experiment.settings}, settings_of)
+    commands = experiment.commands({key: getattr(config, key) for key in experiment.settings}, settings)
     _check_free(experiment, commands, by_stage)
     common: dict[str, list[str]] = {}
     for stage in experiment.stages:
-        settings_of(stage)  # a mistake in any of them is refused, whether a command uses it or not
+        settings(stage)  # a mistake in any of them is refused, whether a command uses it or not
         common[stage] = ["--preset", preset] if preset else []
         common[stage] += [word for pair in by_stage.get(stage, ()) for word in ("--set", pair)]
-        common[stage] += ["--device", device] if device != "auto" and stage in CONFIGS else []
+        common[stage] += ["--device", device] if device != "auto" and stage in MODELS else []
     cells = cells_of(commands, common, short=experiment.domain is not None)
     check_settings(cells, domain)
     return cells + (closing_cells(cells) if config.evaluate else []), config.workers
@@ -106,7 +105,7 @@ def _check_free(experiment: Experiment, commands: Sequence[Command], by_stage: M
     """Refuse settings of stages that commands give as an option: it would win over ``--set``."""
     for command in commands:
         words = command.command.split()
-        for key in parse_assignments(by_stage.get(words[0], ())) if words else ():
+        for key in assigned(by_stage.get(words[0], ())) if words else ():
             if f"--{key.replace('_', '-')}" in words:
                 names = [name for name in experiment.settings if name.removesuffix("s") == key] or experiment.settings
                 do = f"Set {' or '.join(names)} instead."
@@ -118,12 +117,13 @@ def check_settings(cells: Sequence[Cell], domain: str) -> None:
 
     @cache
     def check(stage: str, preset: str | None, pairs: tuple[str, ...]) -> None:
-        configuration(stage, domain, preset, pairs)
+        layers = [values for values, _ in layers_of(stage, domain, preset)]
+        resolve(model_of(stage), *layers, assigned(pairs), {}, stage=stage)  # a control may lack what all are told
 
     for cell in cells:
-        if cell.stage not in CONFIGS:
+        if cell.stage not in MODELS:
             continue
-        known = options_of(cell.stage)
+        known = [f"--{row['name'].replace('_', '-')}" for row in described(model_of(cell.stage))]
         pairs, preset = [], None
         for option, value in pairwise(cell.words):
             if option == "--preset":

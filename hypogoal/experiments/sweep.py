@@ -24,6 +24,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hypogoal.core.artefacts import Draft
+from hypogoal.core.config import STAGES
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.own_code import environment
@@ -31,7 +32,6 @@ from hypogoal.core.processes import CORES
 from hypogoal.core.terminal import amount
 from hypogoal.experiments.experiment import MEND, Command, Value
 from hypogoal.look import unfinished
-from hypogoal.settings import STAGES
 
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # of a Python that multiprocessing starts
 PLAN, LOGS = "sweep.json", "logs"

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
-from hypogoal.core.config import setting
+from pydantic import model_validator
+
+from hypogoal.core.config import Config, setting
 
 BEYOND = "own: beyond the paper"
 FULL = "full"  # the view that shows all of an observation
+VIEW = "view."  # before a setting of a view of one's own
 
 
-@dataclass(frozen=True)
-class EnsembleConfig:
+class EnsembleConfig(Config):
     """The members and their training. Spec C6: the defaults are DoorKey's values (Table 3)."""
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
@@ -77,8 +79,18 @@ class EnsembleConfig:
         source=f"{BEYOND}; unlabelled-split: Otsu 1979",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _gather(cls, values: Any) -> Any:
+        """Values of a view of one's own, ``view.KEY``, as ``view_settings``."""
+        of_view = [name for name in values if name.startswith(VIEW)]
+        if not of_view:
+            return values
+        others = {name: value for name, value in values.items() if name not in of_view}
+        settings = [f"{name.removeprefix(VIEW)}={values[name]}" for name in of_view]
+        return others | {"view_settings": settings}
 
-@dataclass(frozen=True)
+
 class TrainEnsembleConfig(EnsembleConfig):
     """The settings of ``train-ensemble``: ensembles of some sub-goals."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import prod
 from typing import Any, ClassVar
 
@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.config import from_values, parse_assignments
+from hypogoal.core.config import Config, assigned, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.hypotheses.config import FULL, EnsembleConfig
@@ -40,11 +40,6 @@ class StateOrigins:
     unlabelled: Origins = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class NoSettings:
-    """Of a view without settings."""
-
-
 class View(nn.Module):
     """What members see of observations: all of them; ``view=module:Class`` names a subclass of one's own.
 
@@ -52,13 +47,13 @@ class View(nn.Module):
     ensemble, so it makes them in their final shapes.
 
     Attributes:
-        Settings: a dataclass of :func:`hypogoal.core.config.setting` fields, which ``--set view.KEY=VALUE`` changes.
+        Settings: a ``Config`` of :func:`hypogoal.core.config.setting` fields, which ``--set view.KEY=VALUE`` changes.
         changes: whether batches are changed at random.
         dtype: of observations, and of what members see.
         shape: of what members see of one.
     """
 
-    Settings: ClassVar[type] = NoSettings
+    Settings: ClassVar[type[Config]] = Config
     changes: ClassVar[bool] = False
     dtype: np.dtype[Any] = PICTURE
     shape: tuple[int, ...]
@@ -150,12 +145,12 @@ def own_view(name: str, settings: Sequence[str], observation_shape: tuple[int, .
     kind = load(name, "view", ENTRY_POINTS, {})
     if not (inspect.isclass(kind) and issubclass(kind, View)):
         raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
-    values = parse_assignments(settings)
-    known = [each.name for each in fields(kind.Settings)]
+    values = assigned(settings)
+    known = kind.Settings.model_fields
     for key in values:
         if key not in known:
             raise UserError("the view has no such setting", f"view.{key}", f"It has {', '.join(known) or 'none'}.")
-    view: View = kind(observation_shape, from_values(kind.Settings, values, name))
+    view: View = kind(observation_shape, resolve(kind.Settings, values, stage=name))
     return view
 
 

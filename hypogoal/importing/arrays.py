@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.config import meant
+from hypogoal.core.config import near
 from hypogoal.core.errors import UserError
 from hypogoal.data import Dataset
 from hypogoal.importing.files import reading
@@ -48,7 +48,7 @@ def parts_of(arrays: Mapping[str, Array], path: Path, group: str = "") -> Parts:
     for name, values in arrays.items():
         base, _, key = name.partition("/")
         if name not in (*KNOWN, *groups) and not (key and base in STATES):
-            do = meant(name, KNOWN) or f"Known are {', '.join(KNOWN)}; leave it out, or is it for --group?"
+            do = near(name, KNOWN) or f"Known are {', '.join(KNOWN)}; leave it out, or is it for --group?"
             raise UserError(f"unknown array {name!r}", path, do)
         found.setdefault(base, {})[key] = values
     for name in (*NEEDED, *groups[:1]):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from hypogoal.core.config import meant
+from hypogoal.core.config import near
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Integers
@@ -133,7 +133,7 @@ def _chosen(recording: Recording, keys: Sequence[str], where: str) -> list[str]:
     known = sorted(recording.observations)
     for key in keys:
         if key not in known:
-            raise UserError(f"no observation {key!r}", where, meant(key, known) or f"It has {', '.join(known)}.")
+            raise UserError(f"no observation {key!r}", where, near(key, known) or f"It has {', '.join(known)}.")
     if not known:
         raise UserError("it has no observations", where, "Give a recording with some.")
     return sorted(set(keys)) or known

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.config import meant
+from hypogoal.core.config import near
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load, place_of
 from hypogoal.data import Collected, Dataset, States, joined
@@ -46,7 +46,7 @@ def rule_of(text: str) -> Rule:
 
 def _by_column(name: str, recording: Recording) -> Mark:
     if name not in recording.columns:
-        do = meant(name, recording.columns) or f"Its columns are {', '.join(recording.columns) or 'none'}."
+        do = near(name, recording.columns) or f"Its columns are {', '.join(recording.columns) or 'none'}."
         others = "last:N, TABLE.csv and module:function label, too."
         raise UserError(f"no column {name!r} to label by", recording.name, f"{do} {others}")
     values = np.ravel(recording.columns[name])

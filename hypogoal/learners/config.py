@@ -1,12 +1,9 @@
 """Settings of the world in which an agent plays, with options or with the primitive actions."""
 
-from dataclasses import dataclass
-
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 
 
-@dataclass(frozen=True)
-class WorldConfig:
+class WorldConfig(Config):
     """The world that an agent plays in."""
 
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)

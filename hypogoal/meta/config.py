@@ -3,26 +3,14 @@
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar
-
-from hypogoal.core.config import MAX_RANGE, fixed, parse_integers, setting
+from hypogoal.core.config import MOST, Config, integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.learners.config import WorldConfig
 from hypogoal.options.config import OptionConfig
 
 
-@dataclass(frozen=True)
-class MetaConfig:
+class MetaConfig(Config):
     """PPO over options, with SMDP returns."""
-
-    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "chooser=random": (
-            *("meta_network", "head", "gae_lambda", "decisions", "epochs", "meta_batch"),
-            *("meta_learning_rate", "clip", "entropy", "advantage_floor"),
-        ),
-    }
 
     meta_network: str = setting(
         "light",
@@ -54,7 +42,6 @@ class MetaConfig:
     )
 
 
-@dataclass(frozen=True)
 class PlayConfig(OptionConfig, WorldConfig):
     """Where options are played."""
 
@@ -76,15 +63,14 @@ def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
     if not layouts.strip() and first is not None:
         return [first]
     if layouts.strip().isdecimal():
-        count, do = int(layouts), f"Give 1 to {MAX_RANGE}, or seeds as 2000-2099."
-        if first is None or not 0 < count <= MAX_RANGE:
+        count, do = int(layouts), f"Give 1 to {MOST}, or seeds as 2000-2099."
+        if first is None or not 0 < count <= MOST:
             raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
         return list(range(first, first + count))
-    return list(dict.fromkeys(parse_integers(layouts)))
+    return list(dict.fromkeys(integers(layouts)))
 
 
-@dataclass(frozen=True)
-class TrainOptionsConfig(PlayConfig):
+class PracticeConfig(PlayConfig):
     """How the options are learned, and for how long."""
 
     steps: int = setting(
@@ -96,13 +82,6 @@ class TrainOptionsConfig(PlayConfig):
         source="paper, policy learning",
         choices=("all", "each"),
     )
-    until: float = setting(
-        0.0,
-        "training ends once this share of the last 100 episodes has succeeded, at 'steps' at the latest; 0: only then",
-        source="ours: practice for a task in which choosing decides",
-        low=0.0,
-        high=1.0,
-    )
     chooser: str = setting(
         "random",
         "random: uniform among the options offered; even: the one with the fewest steps so far",
@@ -112,7 +91,18 @@ class TrainOptionsConfig(PlayConfig):
     )
 
 
-@dataclass(frozen=True)
+class TrainOptionsConfig(PracticeConfig):
+    """When learning ends."""
+
+    until: float = setting(
+        0.0,
+        "training ends once this share of the last 100 episodes has succeeded, at 'steps' at the latest; 0: only then",
+        source="ours: practice for a task in which choosing decides",
+        low=0.0,
+        high=1.0,
+    )
+
+
 class TrainMetaConfig(PlayConfig, MetaConfig):
     """How options are learned and chosen, and for how long."""
 
@@ -128,11 +118,9 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
     )
 
 
-@dataclass(frozen=True)
-class AuditConfig(TrainOptionsConfig):
+class AuditConfig(PracticeConfig):
     """How policies learn to fool a classifier, and what is tried against them."""
 
-    until: float = fixed(0.0)  # policies that fool a classifier do not bring the task to success
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
     mask_reached: bool = setting(False, "do not begin executions where the prediction is already positive")

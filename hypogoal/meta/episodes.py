@@ -1,13 +1,13 @@
 """Episodes of a trained agent: frame by frame for films, and as data for other software (Spec D1, E1)."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.config import from_values
+from hypogoal.core.config import known, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts, load_domain
@@ -52,10 +52,7 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
     A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
     """
     source, files = Artefact(artefact.input("ensemble")), artefact.manifest.files
-    settings = {
-        field.name: artefact.config[field.name] for field in fields(TrainMetaConfig) if field.name in artefact.config
-    }
-    settings |= {
+    settings = known(TrainMetaConfig, artefact.config) | {
         "environments": environments,
         "replay": REPLAY,
         "decisions": 2,
@@ -68,9 +65,8 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
             raise UserError(ONE_LAYOUT, domain.name, "Evaluate without --layouts.")
         settings |= {"layouts": "", "cap": 0.0}
         others = Layouts(layouts)
-    loop = assemble(
-        domain, source.path, source.config, from_values(TrainMetaConfig, settings, "train-meta"), seed, layouts=others
-    )
+    config = resolve(TrainMetaConfig, settings, {}, stage="train-meta")
+    loop = assemble(domain, source.path, source.config, config, seed, layouts=others)
     continue_with(loop, artefact)
     if FILE in files:
         loop.chooser.load(load_tensors(artefact.path / FILE))

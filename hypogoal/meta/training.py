@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, sha256_of
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.config import as_dict, parse_assignments
+from hypogoal.core.config import assigned
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
+from hypogoal.meta.config import MetaConfig, PlayConfig, PracticeConfig, TrainMetaConfig, layout_seeds
 from hypogoal.observations import PICTURE, Standard, standard_of
 from hypogoal.options import choosers
 from hypogoal.options.config import STACK
@@ -37,7 +37,7 @@ def assemble(
     domain: Domain,
     ensemble: Path,
     ensemble_config: Mapping[str, Any],
-    config: TrainOptionsConfig | TrainMetaConfig,
+    config: PracticeConfig | TrainMetaConfig,
     seed: int,
     device: str = "cpu",
     ends: Callable[[Engine], Terminations] | None = None,
@@ -154,7 +154,7 @@ def cut(engine: Engine, cap: float) -> None:
 
 def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence[str]) -> dict[str, Any]:
     """The domain's settings with which states were collected, after ``changes``, the setting ``world``."""
-    changed = parse_assignments(changes)
+    changed = assigned(changes)
     for name in changed:
         if name not in domain.engine_settings:
             names = ", ".join(domain.engine_settings) or "none"
@@ -255,7 +255,7 @@ def train(
 
 
 def check_fit(
-    trained: Artefact, source: Artefact, config: TrainOptionsConfig | TrainMetaConfig, fixed: Sequence[str]
+    trained: Artefact, source: Artefact, config: PracticeConfig | TrainMetaConfig, fixed: Sequence[str]
 ) -> None:
     """Refuse (``UserError``) to train options further that are of another ensemble or differ in ``fixed`` settings."""
     made_from = [entry.sha256 for entry in trained.manifest.inputs if entry.kind == "ensemble"]
@@ -293,7 +293,7 @@ def continue_with(loop: OptionLoop, trained: Artefact) -> None:
 
 def description(domain: Domain, ensemble_config: Mapping[str, Any], config: PlayConfig, **more: Any) -> dict[str, Any]:
     """An artefact's configuration: the stage's, what it takes from its ensemble's, and ``more``."""
-    return as_dict(config) | {
+    return config.model_dump(mode="json") | {
         "sub_goals": ensemble_config["sub_goals"],
         "members": options_of(ensemble_config, config) // len(ensemble_config["sub_goals"]),
         "domain": ensemble_config["domain"],

@@ -1,27 +1,12 @@
 """Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar
-
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
 
 
-@dataclass(frozen=True)
-class OptionConfig:
+class OptionConfig(Config):
     """How the intra-option policies are executed and learned."""
-
-    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "network=planned": (
-            *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
-            *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
-            *("exploration", "epsilon_steps", "epsilon_final", "epsilon_from", "recurrence"),
-        ),
-        "network=light": ("recurrence",),
-        "network=paper": ("positives",),
-    }
 
     network: str = setting(
         "light",

@@ -65,9 +65,9 @@ class Call:
 
     def settings(self, domain: str, inherited: Mapping[str, Any] | None = None) -> Any:
         """The stage's settings: defaults, the domain's, the preset's, those of continued options, the typed ones."""
-        from hypogoal.settings import configuration
+        from hypogoal.domains.base import settings_of
 
-        return configuration(self.stage, domain, self.preset, (), self.typed, inherited=inherited)
+        return settings_of(self.stage, domain, self.preset, self.typed, inherited=inherited)
 
     @contextmanager
     def training(
@@ -186,13 +186,13 @@ class Stage:
 
     def command(self) -> Any:
         """The command of the command line."""
-        from hypogoal.core.config import parse_assignments
+        from hypogoal.core.config import assigned
 
         def called(**values: Any) -> None:
             source, out = values.pop(self.source.name), values.pop("out")
             chosen = {name: values.pop(name) for name in self.often}
             typed = {name: value for name, value in chosen.items() if value is not None}
-            typed |= parse_assignments(values.pop("set_", None) or ())
+            typed |= assigned(values.pop("set_", None) or ())
             call, done = self.run(source, out, values, typed)
             if not call.quiet:
                 for line in done.lines:
@@ -242,10 +242,9 @@ def _options(stage: str, often: Sequence[str]) -> list[Parameter]:
     """Options that are short for ``--set``. Values stay text, read as those of ``--set``."""
     if not often:
         return []
-    from hypogoal.core.config import describe
-    from hypogoal.settings import CONFIGS
+    from hypogoal.core.config import described, model_of
 
-    rows = {row["name"]: row for row in describe(CONFIGS[stage])}
+    rows = {row["name"]: row for row in described(model_of(stage))}
     panel = f"Settings, with doorkey's defaults (all: hypogoal config {stage})"
     options = []
     for name in often:

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 from typer import Argument
 
 from hypogoal.core.artefacts import DATA, create
-from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
@@ -30,7 +29,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     played = load_domain(name)
     require_names(played.sub_goals)  # before play, not when the file is written
     config = call.settings(name)
-    settings = as_dict(config)
+    settings = config.model_dump(mode="json")
     with create(
         call.out,
         kind=DATA,

@@ -1,12 +1,10 @@
 """Spec A7, E7: train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
 
@@ -49,17 +47,17 @@ def train_baseline(
         check_start(played, config.start)
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
-        chosen = dataclasses.replace(chosen, environments=config.environments)
+        chosen = chosen.model_copy(update={"environments": config.environments})
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world, **begins)
     cut(engine, config.cap)
     require_one_kind(engine)
     if dataset and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, dataset.unlabelled())
-    settings = as_dict(config) | {
+    settings = config.model_dump(mode="json") | {
         "domain": domain,
         "domain_config": world,
         "environments": chosen.environments,
-        "hyperparameters": as_dict(chosen),
+        "hyperparameters": chosen.model_dump(mode="json"),
     }
     with call.training("baseline", settings, [data] if data else [], config.steps, tensorboard) as work:
         env = EngineEnv(engine)

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.artefacts import LOG
-from hypogoal.core.config import as_dict
 from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
 
 ELSEWHERE = "Take unlabelled states from a data file, or options or a meta-policy with save_visited; repeatable."
@@ -61,7 +60,7 @@ def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str,
     """The artefact's configuration."""
     from hypogoal.observations import type_text
 
-    return as_dict(config) | {
+    return config.model_dump(mode="json") | {
         "sub_goals": list(sub_goals),
         "observation_shape": list(dataset.observation_shape),
         "observation_dtype": type_text(dataset.observation_dtype),

@@ -1,181 +1,277 @@
-"""Settings, presets and their errors (the command line's contract in the house rules)."""
+"""Settings, presets and what is said of mistakes in them."""
 
+import dataclasses
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import hypogoal
-from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
+from hypogoal.core.config import (
+    MODELS,
+    OWN,
+    STAGES,
+    TABLES,
+    Config,
+    as_toml,
+    assigned,
+    described,
+    integers,
+    known,
+    model_of,
+    preset,
+    resolve,
+    setting,
+)
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import defaults_of
+from hypogoal.domains.base import defaults_of, layers_of, settings_of
 from hypogoal.experiments.run import config_class_of
-from hypogoal.settings import TABLES, configuration, described
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 
 
-@dataclass(frozen=True)
-class Example:
-    steps: int = setting(10, "steps", unit="steps", low=1, high=1000)
+class Example(Config):
+    """What a stage may have.
+
+    More of it.
+    """
+
+    steps: int = setting(10, "steps", unit="steps", source="Table 1", low=1, high=1000)
     rate: float = setting(0.5, "rate", low=0.0)
     kind: str = setting("a", "kind", choices=("a", "b"))
+    code: str = setting("a", "code", choices=("a", "b"), own=True)
     on: bool = setting(True, "switch")
     seeds: tuple[int, ...] = setting((1, 2), "seeds", low=0)
+    names: tuple[str, ...] = setting(("x",), "names", choices=("x", "y"))
 
 
-def resolved(*assignments: str, **options: object) -> Example:
-    return resolve(Example, stage="example", options=options, assignments=assignments)
+class Slow(Config):
+    """Only slow ones."""
+
+    patience: int = setting(3, "patience", low=1)
 
 
-def test_precedence_is_set_over_option_over_preset_over_default(tmp_path: Path) -> None:
-    """--set > option > preset > default."""
-    preset = tmp_path / "own.toml"
-    preset.write_text("[example]\nsteps = 20\nrate = 1\nkind = 'b'\n")
-    config = resolve(
-        Example,
-        stage="example",
-        preset=str(preset),
-        options={"steps": 30, "rate": 2.0, "kind": None},
-        assignments=["steps=40"],
-    )
-    assert config == Example(steps=40, rate=2.0, kind="b", on=True, seeds=(1, 2))
+class Fast(Config):
+    """Only fast ones."""
+
+    speed: float = setting(2.0, "speed")
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[train_ensemble]\nsteps = 3", "Did you mean 'train-ensemble'"),
-        ("[trane]\nsteps = 3", "A preset has tables for collect, "),
-        ("steps = 7\n[train-ensemble]\nmembers = 3", "no such table in a preset: steps in "),
-    ],
-)
-def test_what_belongs_to_no_stage_is_no_preset(tmp_path: Path, text: str, words: str) -> None:
-    """Spec G2: a mistyped table must not pass for one that changes nothing."""
-    preset = tmp_path / "own.toml"
-    preset.write_text(text)
-    with pytest.raises(UserError, match=words):
-        resolve(Example, stage="train-ensemble", preset=str(preset), tables=TABLES)
+class Either(Slow, Fast):
+    """Code of one's own."""
 
 
-def test_a_domains_defaults_stand_between_the_presets_and_the_general_ones(tmp_path: Path) -> None:
-    """Preset > the domain's default > default; an unknown key of a domain is told like any other."""
-    preset = tmp_path / "own.toml"
-    preset.write_text("[example]\nsteps = 20\n")
-    config = resolve(Example, stage="example", preset=str(preset), defaults={"steps": 5, "rate": 3.0})
-    assert (config.steps, config.rate, config.kind) == (20, 3.0, "a")
-    with pytest.raises(UserError, match="no setting: rates"):
-        resolve(Example, stage="example", defaults={"rates": 3.0})
-    assert {row["name"]: row["default"] for row in describe(Example, ({"steps": 5}, "its own"))}["steps"] == 5
+class Staged(Example):
+    """A stage with parts."""
+
+    PARTS: ClassVar[Any] = {"code": {"a": Slow, "b": Fast, OWN: Either}}
+
+
+def resolved(*assignments: str) -> Any:
+    return resolve(Example, assigned(assignments), stage="example")
 
 
 def test_texts_become_values() -> None:
-    config = resolved("steps=1_000", "rate=1e-3", "on=false", "seeds=3,4,5")
-    assert config == Example(steps=1000, rate=1e-3, on=False, seeds=(3, 4, 5))
+    config = resolved("steps=1_000", "rate=1e-3", "on=no", "seeds=3, 5-7,4", "names=", "code=mine:Class", "kind=b")
+    values = {"steps": 1000, "rate": 1e-3, "on": False, "seeds": (3, 5, 6, 7, 4), "names": ()}
+    assert config == Example(**values, code="mine:Class", kind="b")
+    assert resolved("steps=3e2").steps == 300 and isinstance(resolved("steps=3e2").steps, int)
+    assert resolved("steps=7.0", "seeds=").model_dump(mode="json") | {"seeds": []} == resolved(
+        "steps=7", "seeds="
+    ).model_dump(mode="json")
+    assert integers("0-3,7") == [0, 1, 2, 3, 7]
 
 
 @pytest.mark.parametrize(
-    ("assignment", "words"),
+    ("value", "words"),
     [
-        ("step=3", "Did you mean 'steps'"),
-        ("steps=0", "Allowed: 1 .. 1000"),
-        ("steps=1001", "out of range"),
-        ("steps=many", "It must be int"),
-        ("steps=2.5", "It must be int"),
-        ("rate=nan", "not finite"),
-        ("kind=c", "Choose one of a, b"),
-        ("on=perhaps", "true or false"),
-        ("seeds=1,-1", "out of range"),
-        ("steps", "key=value"),
+        ({"step": 3}, "example has no setting: step. Did you mean 'steps'? See 'hypogoal config example'."),
+        ({"steps": 0}, "value out of range: steps=0 in example. Allowed: 1 .. 1000."),
+        ({"steps": 1001}, "steps=1001 in example"),
+        ({"steps": "many"}, "valid integer, unable to parse string as an integer: steps='many' in example"),
+        ({"steps": "2.5"}, "valid integer"),
+        ({"steps": "1e400"}, "steps=inf"),
+        ({"steps": True}, "must be a number: steps=True"),
+        ({"rate": "nan"}, "finite number: rate='nan' in example. Allowed: 0.0 .."),
+        ({"rate": False}, "must be a number"),
+        ({"kind": "c"}, "kind='c' in example. Allowed: a|b."),
+        ({"code": "c"}, "Allowed: a|b|module:object."),
+        ({"on": "perhaps"}, "valid boolean"),
+        ({"seeds": "1,-1"}, "Allowed: 0 .."),
+        ({"seeds": "1,x"}, "seeds='1,x'"),
+        ({"seeds": "0-999999999"}, "at most 10000 integers"),
+        ({"seeds": 3}, "valid tuple"),
+        ({"names": "x,z"}, "Allowed: x|y."),
+        ({"kind": 3}, "valid string"),
+        ({"kind": "c\n" * 300}, "kind="),
     ],
 )
-def test_each_mistake_gets_one_line(assignment: str, words: str) -> None:
+def test_each_mistake_gets_one_line(value: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError) as caught:
-        resolved(assignment)
-    assert words in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_unknown_and_broken_presets(tmp_path: Path) -> None:
-    broken = tmp_path / "broken.toml"
-    broken.write_text("[example\n")
-    for preset, words in (("nosuch", "demo"), (str(broken), "not valid TOML"), (str(tmp_path / "no.toml"), "no such")):
-        with pytest.raises(UserError, match=words):
-            resolve(Example, stage="example", preset=preset)
-
-
-@pytest.mark.parametrize(
-    ("experiment", "preset"), [(path.parent.name, path.stem) for path in sorted(PRESETS.glob("*/*.toml"))]
-)
-def test_the_presets_resolve_for_every_stage(experiment: str, preset: str) -> None:
-    """Every table of a preset is a stage, every key a setting, with a value in range."""
-    tables = tomllib.loads((PRESETS / experiment / f"{preset}.toml").read_text())
-    assert set(tables) <= set(TABLES)
-    for stage in TABLES:
-        config_class, defaults = config_class_of(stage, experiment), defaults_of(experiment, stage)
-        config = resolve(config_class, stage=stage, preset=preset, domain=experiment, defaults=defaults)
-        assert from_values(type(config), as_dict(config), stage) == config
-
-
-@pytest.mark.parametrize("stage", ["train-options", "train-meta"])
-def test_what_was_published_keeps_its_settings(stage: str) -> None:
-    """Spec D3: DoorKey's own defaults end exploration early and update often; presets of published results do not."""
-    published = {"paper": (8_000, 4), "choosing": (8_000, 16), "demo": (8_000, 16)}
-    for preset, settings in {None: (2_000, 8), "figure6": (2_000, 8), **published}.items():
-        config = configuration(stage, "doorkey", preset, [], {})
-        assert (config.epsilon_steps, config.update_interval) == settings
-    rows = {row["name"]: row for row in described(config_class_of(stage), stage, "doorkey")}
-    assert (rows["epsilon_steps"]["default"], rows["update_interval"]["default"]) == (2_000, 8)
-    assert defaults_of("doorkey", stage) == {"epsilon_steps": 2_000, "update_interval": 8}
-
-
-def test_the_paper_preset_has_the_papers_tables() -> None:
-    """Spec C6, D3, E3: Tables 3, 4 and 5 to the letter."""
-    ensemble = resolve(config_class_of("train-ensemble"), stage="train-ensemble", preset="paper")
-    assert (ensemble.learning_rate, ensemble.diversity_weight, ensemble.members) == (2e-4, 1e-4, 3)
-    assert (ensemble.l2_weight, ensemble.batch_size) == (1e-4, 64)
-    assert (ensemble.class_weight_negative, ensemble.class_weight_positive) == (0.5, 0.5)
-    meta = resolve(config_class_of("train-meta"), stage="train-meta", preset="paper")
-    assert (meta.replay, meta.update_interval, meta.target_interval, meta.target_tau) == (100_000, 4, 10, 1.0)
-    assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
-    assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
-    assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.01, 0.97, 64, 10)
-    assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
-    assert (meta.meta_network, meta.head) == ("paper", "gaussian")
-    run = resolve(config_class_of("run"), stage="run", preset="paper")
-    assert not run.pretrain and run.paired
-    assert len(set(run.layout_seeds)) == len(set(run.seeds)) == 10, "ten agents, each with an ensemble of its own"
-    collect = resolve(config_class_of("collect"), stage="collect", preset="paper")
-    assert collect.door_label == "in-front"
-
-
-def test_the_paper_preset_has_the_papers_ladders() -> None:
-    """Spec D4, F1, F3: Figures 3 and 4 for every number of labelled ladder groups, ten seeds."""
-    run = resolve(config_class_of("run", "montezuma"), stage="run", preset="paper", domain="montezuma")
-    assert run.groups == run.option_groups == tuple(range(1, 8))
-    assert len(set(run.seeds)) == 10 and run.ladders
-    ensemble = resolve(config_class_of("train-ensemble"), stage="train-ensemble", preset="paper", domain="montezuma")
-    beyond = {"view": "full", "threshold": "0.5", "unlabelled_bn": False}
-    assert {name: getattr(ensemble, name) for name in beyond} == beyond
-
-
-@pytest.mark.parametrize("stage", TABLES)
-def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> None:
-    """'hypogoal config' says something of each setting."""
-    config_class = config_class_of(stage)
-    assert all(row["meaning"] for row in describe(config_class))
-    from_values(config_class, as_dict(config_class()), stage)
+        resolve(Example, value, stage="example")
+    line = str(caught.value)
+    assert words in line and "\n" not in line and len(line) < 400
 
 
 @given(st.text(max_size=40))
 def test_no_text_crashes_the_parser(text: str) -> None:
-    """Any --set text either resolves or is a UserError."""
-    for key in ("steps", "rate", "kind", "on", "seeds"):
+    """Any --set text either resolves or is a UserError of one line."""
+    for key in Example.model_fields:
         lines = 0
         try:
             resolved(f"{key}={text}")
         except UserError as error:
             lines = str(error).count("\n")
         assert lines == 0
+
+
+@pytest.mark.parametrize("text", ["steps", "=3", ""])
+def test_set_is_a_key_and_a_value(text: str) -> None:
+    with pytest.raises(UserError, match="--set needs key=value"):
+        assigned([text])
+
+
+def test_what_is_no_list_of_integers_is_one_line() -> None:
+    with pytest.raises(UserError, match=r"not integers: '3-'. Write them as 0-3,7\."):
+        integers("3-")
+
+
+def test_later_layers_win_and_none_is_not_given() -> None:
+    """The domain's defaults, a preset, what is typed."""
+    layers = {"steps": 20, "rate": 1.0, "kind": "b"}, {"steps": 30, "rate": 2}, {"steps": "40", "kind": None}
+    assert resolve(Example, *layers, stage="example") == Example(steps=40, rate=2.0, kind="b")
+
+
+def test_a_part_has_its_settings_where_it_is_chosen() -> None:
+    """Flat names; a part's setting without the part is dropped from presets and refused where typed."""
+    assert resolve(Staged, {"patience": 5}, stage="staged").model_dump() == Example().model_dump() | {"patience": 5}
+    fast = resolve(Staged, {"patience": 5}, {"code": "b", "speed": 3}, stage="staged")
+    assert fast.speed == 3.0 and isinstance(fast, Fast) and not hasattr(fast, "patience")
+    own = resolve(Staged, {"patience": 5, "speed": 1, "code": "mine:Class"}, stage="staged")
+    assert isinstance(own, Either) and (own.patience, own.speed) == (5, 1)
+    with pytest.raises(UserError) as caught:
+        resolve(Staged, {"code": "b"}, {"patience": 5}, stage="staged")
+    assert str(caught.value) == "code=b has no setting: patience. It belongs to code=a, code=module:object."
+    with pytest.raises(UserError, match=r"staged has no setting: patients. Did you mean 'patience'"):
+        resolve(Staged, {"patients": 5}, {}, stage="staged")
+    with pytest.raises(UserError, match=r"code='c' in staged. Allowed: a\|b\|module:object"):
+        resolve(Staged, {"code": "c", "patience": 5}, {}, stage="staged")
+
+
+def test_a_manifest_may_have_more() -> None:
+    """Settings of an earlier version, and of parts that were not chosen, are ignored."""
+    written = {"steps": 7, "gone": 1, "speed": 9.0, "patience": 2}
+    read = resolve(Staged, known(Staged, written), {}, stage="staged")
+    assert (read.steps, read.patience) == (7, 2) and not hasattr(read, "speed")
+
+
+def test_a_dataclass_is_told_what_to_be() -> None:
+    for base in (object, Config):
+        old = dataclasses.make_dataclass("Mine", [("x", int, setting(3, "x"))], bases=(base,), frozen=True)
+        with pytest.raises(UserError, match=r"Mine\. Write 'class Mine\(Config\):', without @dataclass"):
+            resolve(old, stage="collect")
+
+
+def test_settings_are_described_with_their_parts() -> None:
+    rows = {row["name"]: row for row in described(Staged, ({"steps": "9", "patience": 4}, "its own"))}
+    assert [*rows] == [*Example.model_fields, "patience", "speed"]
+    expected = {"type": "int", "default": 9, "unit": "steps", "meaning": "steps", "source": "its own"}
+    assert rows["steps"] == {"name": "steps", "allowed": "1 .. 1000", "part": "What a stage may have"} | expected
+    assert rows["speed"]["part"] == "Only fast ones" and rows["code"]["allowed"] == "a|b|module:object"
+    assert (rows["kind"]["source"], rows["names"]["default"], rows["patience"]["default"]) == ("", ["x"], 4)
+    table = tomllib.loads(as_toml("staged", [*rows.values()]))["staged"]
+    assert table == {name: row["default"] for name, row in rows.items()}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[train_ensemble]\nsteps = 3", "no such table in a preset: train_ensemble in .*Did you mean 'train-ensemble'"),
+        ("[trane]\nsteps = 3", "A preset has tables for collect, "),
+        ("steps = 7\n[train-ensemble]\nmembers = 3", "no such table in a preset: steps in "),
+        ("collect = 7", "no such table"),
+        ("[collect\n", "the preset cannot be read"),
+        ("[collect]\nx = '\udcff'", "the preset cannot be read"),
+        (None, "no such preset: .* Choose one of choosing, demo, figure6, paper, or give a .toml file"),
+    ],
+)
+def test_a_broken_preset_is_one_line(tmp_path: Path, text: str | None, words: str) -> None:
+    file = tmp_path / "own.toml"
+    if text is not None:
+        file.write_bytes(text.encode(errors="surrogateescape"))
+    for name in [str(file)] if text else [str(file), "nosuch"]:
+        with pytest.raises(UserError, match=words):
+            preset(name, "collect")
+
+
+def test_a_preset_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text("[collect]\nsteps = 20\n", encoding="utf-8-sig")
+    assert preset(str(tmp_path / "own.toml"), "collect") == {"steps": 20}
+    assert preset(str(tmp_path / "own.toml"), "run") == preset(None, "run") == {}
+
+
+@pytest.mark.parametrize(("domain", "name"), [(file.parent.name, file.stem) for file in sorted(PRESETS.glob("*/*"))])
+def test_the_presets_resolve_for_every_stage(domain: str, name: str) -> None:
+    """Every table of a preset is a stage, every key a setting, with a value in range; a manifest gives it back."""
+    for stage in STAGES:
+        config = settings_of(stage, domain, name)
+        assert resolve(type(config), config.model_dump(mode="json"), stage=stage) == config
+    assert resolve(config_class_of("run", domain), preset(name, "run", domain), stage="run")
+
+
+@pytest.mark.parametrize("stage", TABLES)
+def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> None:
+    """'hypogoal config' says something of each setting."""
+    model = config_class_of(stage)
+    assert all(row["meaning"] for row in described(model))
+    assert resolve(model, model().model_dump(mode="json"), {}, stage=stage) == resolve(model, stage=stage)
+    with pytest.raises(UserError, match="no such stage"):
+        config_class_of("no-stage")
+
+
+@pytest.mark.parametrize("stage", ["train-options", "train-meta"])
+def test_what_was_published_keeps_its_settings(stage: str) -> None:
+    """Spec D3: DoorKey's own defaults end exploration early and update often; presets of published results do not."""
+    published = {"paper": (8_000, 4), "choosing": (8_000, 16), "demo": (8_000, 16)}
+    for name, values in {None: (2_000, 8), "figure6": (2_000, 8), **published}.items():
+        config = settings_of(stage, "doorkey", name)
+        assert (config.epsilon_steps, config.update_interval) == values
+    rows = {row["name"]: row for row in described(model_of(stage), *layers_of(stage, "doorkey"))}
+    assert (rows["epsilon_steps"]["default"], rows["update_interval"]["default"]) == (2_000, 8)
+    assert defaults_of("doorkey", stage) == {"epsilon_steps": 2_000, "update_interval": 8}
+
+
+def test_the_paper_preset_has_the_papers_tables() -> None:
+    """Spec C6, D3, E3: Tables 3, 4 and 5 to the letter."""
+    ensemble = settings_of("train-ensemble", "doorkey", "paper")
+    assert (ensemble.learning_rate, ensemble.diversity_weight, ensemble.members) == (2e-4, 1e-4, 3)
+    assert (ensemble.l2_weight, ensemble.batch_size) == (1e-4, 64)
+    assert (ensemble.class_weight_negative, ensemble.class_weight_positive) == (0.5, 0.5)
+    meta = settings_of("train-meta", "doorkey", "paper")
+    assert (meta.replay, meta.update_interval, meta.target_interval, meta.target_tau) == (100_000, 4, 10, 1.0)
+    assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
+    assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
+    assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.01, 0.97, 64, 10)
+    assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
+    assert (meta.meta_network, meta.head) == ("paper", "gaussian")
+    run: Any = resolve(config_class_of("run"), preset("paper", "run"), stage="run")
+    assert not run.pretrain and run.paired
+    assert len(set(run.layout_seeds)) == len(set(run.seeds)) == 10, "ten agents, each with an ensemble of its own"
+    assert settings_of("collect", "doorkey", "paper").door_label == "in-front"
+
+
+def test_the_paper_preset_has_the_papers_ladders() -> None:
+    """Spec D4, F1, F3: Figures 3 and 4 for every number of labelled ladder groups, ten seeds."""
+    run: Any = resolve(config_class_of("run", "montezuma"), preset("paper", "run", "montezuma"), stage="run")
+    assert run.groups == run.option_groups == tuple(range(1, 8))
+    assert len(set(run.seeds)) == 10 and run.ladders
+    ensemble = settings_of("train-ensemble", "montezuma", "paper")
+    assert (ensemble.view, ensemble.threshold, ensemble.unlabelled_bn) == ("full", "0.5", False)
+
+
+def test_stages_have_no_more_settings_than_a_reader_can_take() -> None:
+    counts = {stage: len(described(model_of(stage))) for stage in MODELS}
+    assert counts["train-ensemble"] <= 18

@@ -129,11 +129,11 @@ def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.Ca
     """Spec B6: with the sub-goal and what gets there, as 'import' tells it; nothing where there are enough of both."""
     collect(ODD, tmp_path / "odd.h5", heldout_seeds=(4,), steps=100, max_episode_steps=100, quiet=True)
     assert capsys.readouterr().err == ""
-    collect(DOMAIN, tmp_path / "corridor.h5", quiet=True, **vars(SMALL))
+    collect(DOMAIN, tmp_path / "corridor.h5", quiet=True, **SMALL.model_dump())
     told = "has 1 positive among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
     ends = "hypogoal: {} " + told + "bring a policy that gets there."
     assert capsys.readouterr().err.splitlines() == [ends.format("left-end"), ends.format("right-end")]
-    one = vars(SMALL) | {
+    one = SMALL.model_dump() | {
         "heldout_seeds": (4,),
         "steps": 60,
         "max_episode_steps": 2,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import time
 from collections import Counter
-from dataclasses import replace
 from itertools import islice
 
 import gymnasium
@@ -13,13 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hypogoal.core.config import from_values
+from hypogoal.core.config import model_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, States
 from hypogoal.domains import montezuma_states
-from hypogoal.domains.base import Domain, defaults_of, load_domain
+from hypogoal.domains.base import Domain, defaults_of, load_domain, settings_of
 from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
 from hypogoal.domains.montezuma_emulator import (
     DOWN,
@@ -50,8 +49,6 @@ from hypogoal.domains.montezuma_states import (
     standing_places,
 )
 from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN, SUB_GOALS
-from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.observations import digest
 
 pytestmark = pytest.mark.atari
@@ -71,14 +68,14 @@ def one() -> Collected:
 @pytest.fixture(scope="module")
 def two() -> Collected:
     """N = 2, two others."""
-    return DOMAIN.collect(replace(TINY, groups=2, workers=2), SEED, Progress("collect", 1, quiet=True))
+    return DOMAIN.collect(TINY.model_copy(update={"groups": 2, "workers": 2}), SEED, Progress("collect", 1, quiet=True))
 
 
 @pytest.fixture(scope="module")
 def fresh() -> tuple[Collected, Progress]:
     """N = 1, other held-out states."""
     progress = Progress("collect", 1, quiet=True)
-    return DOMAIN.collect(replace(TINY, heldout_seed=1), SEED, progress), progress
+    return DOMAIN.collect(TINY.model_copy(update={"heldout_seed": 1}), SEED, progress), progress
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +283,7 @@ def test_stopped_processes_are_not_waited_for() -> None:
             raise KeyboardInterrupt
 
     begin = time.monotonic()
-    config = replace(TINY, workers=2, states_per_room=10_000, heldout_per_room=1)
+    config = TINY.model_copy(update={"workers": 2, "states_per_room": 10_000, "heldout_per_room": 1})
     with pytest.raises(KeyboardInterrupt):
         DOMAIN.collect(config, SEED, Stopped("collect", 1, quiet=True))
     assert not multiprocessing.active_children()
@@ -339,10 +336,10 @@ def test_the_domain_interface() -> None:
     assert DOMAIN.distance(bases).tolist() == [0] * 12
     assert DOMAIN.distance(bases[:1] + np.array([0, 5, 0])).tolist() == [5]
     assert DOMAIN.pixel(bases).shape == (12, 2)
-    for stage, config_class in (("train-ensemble", EnsembleConfig), ("train-options", TrainOptionsConfig)):
+    for stage in ("train-ensemble", "train-options"):
+        config, plain = settings_of(stage, "montezuma"), model_of(stage)()
         own = defaults_of("montezuma", stage)
-        config = from_values(config_class, own, stage)
-        assert all(getattr(config, key) == value != getattr(config_class(), key) for key, value in own.items())
+        assert all(getattr(config, key) == value != getattr(plain, key) for key, value in own.items())
 
 
 def test_engine_and_environment_agree() -> None:

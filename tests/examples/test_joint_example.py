@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import sys
 from pathlib import Path
@@ -58,7 +57,7 @@ def test_two_taught_members_own_a_feature_each(joint: ModuleType) -> None:
     """The main claim: labels fit shape and place; taught members own one each, untaught ones do not."""
     *states, _ = rooms(1.0)
     taught = followed(fit(*states, TAUGHT, 0))
-    untaught = followed(fit(*states, dataclasses.replace(TAUGHT, teacher=""), 0))
+    untaught = followed(fit(*states, TAUGHT.model_copy(update={"teacher": ""}), 0))
     assert (taught.max(0) > 0.9).all() and sorted(taught.argmax(1)) == [0, 1], taught
     assert untaught.max(0).min() < 0.8, untaught
 
@@ -162,7 +161,7 @@ def test_what_does_not_suit_is_one_clear_line(joint: ModuleType) -> None:
     *states, _ = rooms(1.0)
     for members in (1, 9):
         with pytest.raises(UserError, match=rf"raised ValueError: proposals .* from 2 to 8 members, not {members}"):
-            fit(*states, dataclasses.replace(TAUGHT, members=members), 0)
+            fit(*states, TAUGHT.model_copy(update={"members": members}), 0)
     observations, labels, unlabelled = states
     with pytest.raises(ValueError, match="too small"):
         joint.teach(observations[:, :7], labels, unlabelled[:, :7], 2, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 from dataclasses import replace
@@ -94,7 +93,7 @@ def test_members_disagree_where_they_agree_without(name: str, weight: float) -> 
     labels, free = np.arange(200) % 2 == 0, np.arange(200)
     seen, elsewhere = numbers(labels, labels, 0), numbers(free % 2 == 0, free % 4 < 2, 1)
     plain = EnsembleConfig(members=3, steps=150, learning_rate=1e-3, diversity="none")
-    diverse = dataclasses.replace(plain, diversity=f"objectives:{name}", diversity_weight=weight)
+    diverse = plain.model_copy(update={"diversity": f"objectives:{name}", "diversity_weight": weight})
     found = []
     for config in (plain, diverse):
         ensemble = fit(seen, labels, elsewhere, config, seed=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints, State
-from hypogoal.core.config import from_values
+from hypogoal.core.config import known, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected, States, open_dataset, write_dataset
@@ -309,8 +308,7 @@ def test_what_is_saved_is_what_was_trained(tmp_path: Path) -> None:
     back = read_ensemble(artefact.path, artefact.config, "base")
     dataset = open_dataset(data)
     split, origins = dataset.labelled("base"), dataset.unlabelled_origins()
-    known = {field.name: artefact.config[field.name] for field in dataclasses.fields(EnsembleConfig) if field.init}
-    config = from_values(EnsembleConfig, known, "train-ensemble")
+    config = resolve(EnsembleConfig, known(EnsembleConfig, artefact.config), stage="train-ensemble")
     seed = seed_for(0, "ensemble", "base")
     direct = fit(
         split.observations,

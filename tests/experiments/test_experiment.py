@@ -10,7 +10,7 @@ import pytest
 from command_line import refuses, run
 
 from hypogoal.core import own_code
-from hypogoal.core.config import describe
+from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.experiment import read_toml
 from hypogoal.experiments.named import EXPERIMENTS
@@ -253,8 +253,8 @@ def test_the_papers_figures_are_experiments() -> None:
 
 def test_settings_of_run_are_the_signatures() -> None:
     """'hypogoal config run' lists types, defaults, bounds and meanings of the arguments."""
-    rows = {row["name"]: row for row in describe(config_class_of("run", "montezuma"))}
-    assert (rows["groups"]["default"], rows["groups"]["allowed"]) == ((1, 2, 3, 7), "1 .. 7")
+    rows = {row["name"]: row for row in described(config_class_of("run", "montezuma"))}
+    assert (rows["groups"]["default"], rows["groups"]["allowed"]) == ([1, 2, 3, 7], "1 .. 7")
     assert rows["methods"]["allowed"] == "dbat|none|cnn" and rows["methods"]["source"] == "Figure 3"
     assert rows["oracle"]["type"] == "bool" and "workers" in rows and "evaluate" in rows
     assert read_toml(ROOT / "examples" / "sweep-doorkey.toml").settings == ("seed", "layout", "members")

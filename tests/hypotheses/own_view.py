@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,12 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
 
 
-@dataclass(frozen=True)
-class Settings:
+class Settings(Config):
     jitter: int = setting(2, "the most by which pictures are moved", unit="pixels", low=0, high=8)
 
 

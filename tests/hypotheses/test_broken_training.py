@@ -1,6 +1,5 @@
 """Spec G1: ensembles trained with a break are those trained without, whatever is trained and changed on the way."""
 
-import dataclasses
 from pathlib import Path
 
 import pytest
@@ -26,8 +25,8 @@ def dropping(channels: int) -> tuple[list[torch.nn.Module], tuple[int, ...]]:
     "config",
     [
         OWN,
-        dataclasses.replace(OWN, schedule="sequential", threshold="unlabelled-split"),
-        dataclasses.replace(OWN, view="full", network="test_broken_training:dropping"),
+        OWN.model_copy(update={"schedule": "sequential", "threshold": "unlabelled-split"}),
+        OWN.model_copy(update={"view": "full", "network": "test_broken_training:dropping"}),
     ],
     ids=["own view", "sequential, thresholds", "dropout"],
 )

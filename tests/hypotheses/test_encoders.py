@@ -94,7 +94,7 @@ def states(count: int, side: int = 16) -> tuple[NDArray[np.uint8], NDArray[np.bo
 
 def trained(network: str, config: EnsembleConfig = FEW, side: int = 16, **settings: object) -> Ensemble:
     images, labels = states(24, side)
-    config = dataclasses.replace(config, network=network, **settings)
+    config = config.model_copy(update={"network": network, **settings})
     return fit(images[:12], labels[:12], images[12:], config, 0)
 
 
@@ -107,7 +107,7 @@ def test_large_networks_are_members(network: str, tmp_path: Path) -> None:
         engine.step(rng.integers(engine.n_actions, size=4))
     ids = np.arange(min(engine.n_states, 12))
     images, labels = engine.images(ids), np.arange(len(ids)) % 2 == 0
-    config = dataclasses.replace(FEW, network=network)
+    config = FEW.model_copy(update={"network": network})
     half = len(ids) // 2
     ensemble = fit(images[:half], labels[:half], images[half:], config, 0)
     weights = sum(weight.numel() for weight in ensemble.members[0].parameters())

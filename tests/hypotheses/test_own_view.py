@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from own_view import Moved, Settings
 from test_training import TOY, toy
 
-from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.hypotheses.batches import TrainingStates
@@ -20,7 +18,7 @@ from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.training import fit
 
-OWN = dataclasses.replace(TOY, steps=3, view="own_view:Moved", view_settings=("jitter=3",))
+OWN = TOY.model_copy(update={"steps": 3, "view": "own_view:Moved", "view_settings": ("jitter=3",)})
 CPU = torch.device("cpu")
 AS_THEY_ARE = torch.nn.Sequential(torch.nn.Flatten())  # a network whose outputs are its inputs
 
@@ -40,7 +38,8 @@ def test_it_learns_and_comes_back_from_disk(tmp_path: Path, monkeypatch: pytest.
     np.testing.assert_array_equal(seen, np.maximum(observations[:, 3:-3, 3:-3], shade) - shade)
     ensemble.set_thresholds(np.array([0.25, 0.75], dtype=np.float32))
     write_ensemble(tmp_path, "goal", ensemble)
-    config = as_dict(OWN) | {"sub_goals": ["goal"], "observation_shape": [48, 48, 3], "observation_dtype": "uint8"}
+    config = OWN.model_dump(mode="json") | {"sub_goals": ["goal"]}
+    config |= {"observation_shape": [48, 48, 3], "observation_dtype": "uint8"}
     back = read_ensemble(tmp_path, config, "goal")
     np.testing.assert_array_equal(back.predict(observations), ensemble.predict(observations))
     np.testing.assert_array_equal(back.predictions(observations), ensemble.predictions(observations))
@@ -82,7 +81,7 @@ def test_changes_decide_what_is_learned() -> None:
     """Another ensemble than from unchanged states, the same one again with the same seed."""
     observations, labels, unlabelled = toy()
     first, second = (fit(observations, labels, unlabelled, OWN, seed=0).state() for _ in range(2))
-    plain = dataclasses.replace(OWN, view_settings=("jitter=0",))
+    plain = OWN.model_copy(update={"view_settings": ("jitter=0",)})
     assert all(torch.equal(first[name], second[name]) for name in first)
     other = fit(observations, labels, unlabelled, plain, seed=0).state()
     assert not torch.equal(first["members.0.0.weight"], other["members.0.0.weight"])
@@ -103,7 +102,7 @@ def test_methods_see_the_same_labelled_states_changed_the_same_way(monkeypatch: 
     monkeypatch.setattr(TrainingStates, "_images_of", recorded)
     for changes in ({}, {"diversity": "none"}, {"diversity": "none", "unlabelled_bn": False}):
         seen.append([])
-        fit(observations, labels, unlabelled, dataclasses.replace(OWN, **changes), seed=0)
+        fit(observations, labels, unlabelled, OWN.model_copy(update=changes), seed=0)
     assert [len(method) for method in seen] == [3, 3, 3]
     assert all(torch.equal(one, other) for method in seen[1:] for one, other in zip(seen[0], method, strict=True))
     assert not torch.equal(seen[0][0], seen[0][1])
@@ -145,4 +144,4 @@ def test_what_does_not_fit_is_one_line(changes: dict[str, object], line: str) ->
     """Spec G2."""
     observations, labels, unlabelled = toy()
     with pytest.raises(UserError, match=line):
-        fit(observations, labels, unlabelled, dataclasses.replace(OWN, **changes), seed=0)
+        fit(observations, labels, unlabelled, OWN.model_copy(update=changes), seed=0)

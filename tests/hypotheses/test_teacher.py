@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import Round, fit
 
-CONFIG = dataclasses.replace(TOY, diversity="none", teacher="test_teacher:easy_and_hard")
+CONFIG = TOY.model_copy(update={"diversity": "none", "teacher": "test_teacher:easy_and_hard"})
 calls: list[tuple[object, ...]] = []
 
 
@@ -49,7 +48,7 @@ def test_each_member_learns_what_it_is_taught() -> None:
     """With nothing else to make them differ; without a teacher both take the easy feature."""
     easy, hard = follows(fit(*toy(), CONFIG, seed=1))
     assert easy[0] > 0.9 and hard[1] > 0.9
-    easy, hard = follows(fit(*toy(), dataclasses.replace(CONFIG, teacher=""), seed=1))
+    easy, hard = follows(fit(*toy(), CONFIG.model_copy(update={"teacher": ""}), seed=1))
     assert (easy > 0.9).all()
     ((shape, labels, elsewhere, members, _),) = calls
     assert (shape, labels, elsewhere, members) == ((64, 48, 48, 3), toy()[1].tolist(), (128, 48, 48, 3), 2)
@@ -75,7 +74,7 @@ def test_teaching_weighs_in_proportion_to_the_scores() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Round, "_losses", recorded)
-        fit(observations, labels, unlabelled, dataclasses.replace(CONFIG, steps=1, batch_size=32), 0)
+        fit(observations, labels, unlabelled, CONFIG.model_copy(update={"steps": 1, "batch_size": 32}), 0)
     assert len(seen) == 2
     assert torch.stack(seen).abs().max() < 1e-4
 
@@ -83,7 +82,7 @@ def test_teaching_weighs_in_proportion_to_the_scores() -> None:
 @pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
 def test_a_broken_training_is_resumed_to_the_last_bit(tmp_path: Path, schedule: str) -> None:
     """Spec G1: and the teacher is not asked again."""
-    config = dataclasses.replace(CONFIG, steps=4, schedule=schedule)
+    config = CONFIG.model_copy(update={"steps": 4, "schedule": schedule})
 
     def trained(checkpoints: Checkpoints | None) -> dict[str, torch.Tensor]:
         return fit(*toy(), config, 0, checkpoints=checkpoints).state()
@@ -108,7 +107,7 @@ def test_a_broken_training_is_resumed_to_the_last_bit(tmp_path: Path, schedule: 
 def test_scores_that_do_not_fit_are_refused(teacher: str, message: str) -> None:
     """Spec G2: in one line, with the place in the user's file."""
     with pytest.raises(UserError, match=message):
-        fit(*toy(), dataclasses.replace(CONFIG, teacher=f"test_teacher:{teacher}"), 0)
+        fit(*toy(), CONFIG.model_copy(update={"teacher": f"test_teacher:{teacher}"}), 0)
 
 
 def test_what_is_no_teacher_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -53,8 +52,8 @@ def follows(ensemble: Ensemble) -> tuple[NDArray[np.float64], NDArray[np.float64
 def test_diversity_finds_the_feature_that_is_hidden(schedule: str) -> None:
     """Spec C1, C4: without diversity every member takes the easy feature; with D-BAT one takes the other."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, schedule=schedule)
-    alike = fit(observations, labels, unlabelled, dataclasses.replace(config, diversity="none"), seed=1)
+    config = TOY.model_copy(update={"schedule": schedule})
+    alike = fit(observations, labels, unlabelled, config.model_copy(update={"diversity": "none"}), seed=1)
     diverse = fit(observations, labels, unlabelled, config, seed=1)
     for ensemble in (alike, diverse):
         assert ((ensemble.predict(observations) > 0.5) == labels[:, None]).mean() > 0.95, "all explain the labels"
@@ -67,7 +66,7 @@ def test_diversity_finds_the_feature_that_is_hidden(schedule: str) -> None:
 def test_a_single_member_is_the_plain_cnn() -> None:
     """Spec C1: K = 1 has no pairs, needs no unlabelled states, and learns."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, members=1)
+    config = TOY.model_copy(update={"members": 1})
     reports: list[dict[str, float]] = []
     ensemble = fit(observations, labels, unlabelled[:0], config, 0, Watcher(lambda _, numbers: reports.append(numbers)))
     assert ensemble.predict(observations).shape == (64, 1)
@@ -79,7 +78,7 @@ def test_a_single_member_is_the_plain_cnn() -> None:
 def test_the_same_seed_gives_the_same_bytes(schedule: str) -> None:
     """Spec G1: and another seed other ones; the global random state is neither read nor moved."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=3, schedule=schedule)
+    config = TOY.model_copy(update={"steps": 3, "schedule": schedule})
     torch.manual_seed(1)
     first = fit(observations, labels, unlabelled, config, seed=3).state()
     drawn = torch.rand(1)
@@ -94,16 +93,16 @@ def test_the_same_seed_gives_the_same_bytes(schedule: str) -> None:
 def test_members_start_the_same_whatever_the_ensemble() -> None:
     """Spec C1: a single CNN is the first member of an ensemble without diversity: a fair comparison."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=4, diversity="none")
-    three = fit(observations, labels, unlabelled, dataclasses.replace(config, members=3), seed=3)
-    one = fit(observations, labels, unlabelled, dataclasses.replace(config, members=1), seed=3)
+    config = TOY.model_copy(update={"steps": 4, "diversity": "none"})
+    three = fit(observations, labels, unlabelled, config.model_copy(update={"members": 3}), seed=3)
+    one = fit(observations, labels, unlabelled, config.model_copy(update={"members": 1}), seed=3)
     np.testing.assert_allclose(three.predict(observations)[:, :1], one.predict(observations), atol=1e-6)
 
 
 def test_tables_of_patches_do_not_change_what_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec C4: some steps through the plain network end where those through distinct patches end."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=4)
+    config = TOY.model_copy(update={"steps": 4})
     tabled = fit(observations, labels, unlabelled, config, seed=0)
     with monkeypatch.context() as patch:
         patch.setattr(batches.patches, "make_tables", lambda *_: None)
@@ -117,7 +116,7 @@ def test_tables_of_patches_do_not_change_what_is_learned(monkeypatch: pytest.Mon
 def test_reports_are_the_losses_of_equation_1(diversity: str) -> None:
     """Eq. (1): loss = sum of labelled losses + weight x sum over ordered pairs; reported every ten steps."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, members=3, steps=12, diversity=diversity, diversity_weight=0.5)
+    config = TOY.model_copy(update={"members": 3, "steps": 12, "diversity": diversity, "diversity_weight": 0.5})
     reports: list[tuple[int, dict[str, float]]] = []
     fit(observations, labels, unlabelled, config, 0, Watcher(lambda *report: reports.append(report)))
     assert [step for step, _ in reports] == [10, 12]
@@ -130,7 +129,7 @@ def test_reports_are_the_losses_of_equation_1(diversity: str) -> None:
 def test_a_look_leaves_no_trace(schedule: str) -> None:
     """The members looked at on the way are those of a shorter training, the last those of one without looks."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=12, schedule=schedule)
+    config = TOY.model_copy(update={"steps": 12, "schedule": schedule})
     looked: dict[int, dict[str, torch.Tensor]] = {}
 
     def look(step: int, ensemble: Ensemble) -> None:
@@ -145,7 +144,7 @@ def test_a_look_leaves_no_trace(schedule: str) -> None:
         torch.equal(found[name], value) and torch.equal(looked[total][name], value) for name, value in unlooked.items()
     )
     if schedule == "simultaneous":
-        shorter = fit(observations, labels, unlabelled, dataclasses.replace(config, steps=5), 0).state()
+        shorter = fit(observations, labels, unlabelled, config.model_copy(update={"steps": 5}), 0).state()
         assert all(torch.equal(looked[5][name], value) for name, value in shorter.items())
 
 
@@ -163,10 +162,10 @@ class Watched(Checkpoints):
 def test_sequential_members_do_not_move_once_trained() -> None:
     """Spec C4: D-BAT's own order: an ensemble of two begins with the ensemble of one."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=5, schedule="sequential")
+    config = TOY.model_copy(update={"steps": 5, "schedule": "sequential"})
     steps: list[int] = []
     watched = Watched()
-    one = fit(observations, labels, unlabelled, dataclasses.replace(config, members=1), seed=0)
+    one = fit(observations, labels, unlabelled, config.model_copy(update={"members": 1}), seed=0)
     two = fit(
         observations, labels, unlabelled, config, 0, Watcher(lambda step, _: steps.append(step)), checkpoints=watched
     )
@@ -183,10 +182,10 @@ def test_sequential_members_do_not_move_once_trained() -> None:
 def test_which_batches_count_in_running_statistics(unlabelled_bn: bool) -> None:
     """Spec C6: the switch decides whether unlabelled states move BatchNorm's running mean."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=2, unlabelled_bn=unlabelled_bn)
+    config = TOY.model_copy(update={"steps": 2, "unlabelled_bn": unlabelled_bn})
     means = []
     for others in (unlabelled, 255 - unlabelled):
-        state = fit(observations, labels, others, dataclasses.replace(config, members=1), seed=0).state()
+        state = fit(observations, labels, others, config.model_copy(update={"members": 1}), seed=0).state()
         means.append(state["members.0.1.running_mean"])
     assert torch.equal(means[0], means[1]) != unlabelled_bn
 
@@ -202,8 +201,14 @@ def test_batchnorm_sees_unlabelled_states_whatever_the_diversity(
     if not tables:
         monkeypatch.setattr(batches.patches, "make_tables", lambda *_: None)
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(
-        TOY, steps=2, learning_rate=0.0, diversity=diversity, diversity_weight=weight, unlabelled_bn=unlabelled_bn
+    config = TOY.model_copy(
+        update={
+            "steps": 2,
+            "learning_rate": 0.0,
+            "diversity": diversity,
+            "diversity_weight": weight,
+            "unlabelled_bn": unlabelled_bn,
+        }
     )
     states = [fit(observations, labels, others, config, seed=0).state() for others in (unlabelled, 255 - unlabelled)]
     for name in ("members.0.1", "members.1.5"):
@@ -215,7 +220,7 @@ def test_batchnorm_sees_unlabelled_states_whatever_the_diversity(
 def test_a_step_is_that_of_the_plain_loop(unlabelled_bn: bool) -> None:
     """Eq. (1), Spec C3, C6: a loop over members in NCHW, labelled and unlabelled apart, ends with the same weights."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, members=3, steps=5, diversity_weight=0.5, unlabelled_bn=unlabelled_bn)
+    config = TOY.model_copy(update={"members": 3, "steps": 5, "diversity_weight": 0.5, "unlabelled_bn": unlabelled_bn})
     found = fit(observations, labels, unlabelled, config, seed=0)
     plain = Ensemble("doorkey", observations.shape[1:], 3, torch_generator(0, "weights"))
     networks = [member for member in plain.members if isinstance(member, torch.nn.Sequential)]
@@ -247,13 +252,13 @@ def test_thresholds_are_set_after_training(monkeypatch: pytest.MonkeyPatch) -> N
     """Beyond the paper: a number, the split of unlabelled states, a function of one's own; probabilities stay."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=20)
+    config = TOY.model_copy(update={"steps": 20})
     plain = fit(observations, labels, unlabelled, config, seed=0)
     probabilities = plain.predict(unlabelled)
     np.testing.assert_array_equal(plain.predictions(unlabelled), probabilities > 0.5)
 
     def by(rule: str) -> Ensemble:
-        return fit(observations, labels, unlabelled, dataclasses.replace(config, threshold=rule), seed=0)
+        return fit(observations, labels, unlabelled, config.model_copy(update={"threshold": rule}), seed=0)
 
     split = by("unlabelled-split")
     np.testing.assert_array_equal(split.predict(unlabelled), probabilities)
@@ -269,7 +274,7 @@ def test_thresholds_are_set_after_training(monkeypatch: pytest.MonkeyPatch) -> N
     ):
         with pytest.raises(UserError, match=line):
             by(rule)
-    alone = dataclasses.replace(config, members=1, threshold="unlabelled-split")
+    alone = config.model_copy(update={"members": 1, "threshold": "unlabelled-split"})
     with pytest.raises(UserError, match="unlabelled states are needed to set thresholds on"):
         fit(observations, labels, unlabelled[:0], alone, seed=0)
 
@@ -304,7 +309,7 @@ def test_layers_that_draw_are_repeatable(schedule: str, monkeypatch: pytest.Monk
     """Spec C5, G1: Dropout in a network of one's own: same seed, same bytes, whoever drew before."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, steps=6, network="test_broken_training:dropping", schedule=schedule)
+    config = TOY.model_copy(update={"steps": 6, "network": "test_broken_training:dropping", "schedule": schedule})
     first = fit(observations, labels, unlabelled, config, seed=3).state()
     torch.rand(7)
     second = fit(observations, labels, unlabelled, config, seed=3).state()
@@ -335,10 +340,10 @@ def test_class_weights_weigh_the_classes() -> None:
     observations, labels, unlabelled = toy()
     rng = np.random.default_rng(0)
     labels = rng.permutation(labels)  # nothing to learn but the prior
-    config = dataclasses.replace(TOY, members=1, steps=30)
+    config = TOY.model_copy(update={"members": 1, "steps": 30})
     says = []
     for negative in (0.95, 0.05):
-        weighted = dataclasses.replace(config, class_weight_negative=negative, class_weight_positive=1 - negative)
+        weighted = config.model_copy(update={"class_weight_negative": negative, "class_weight_positive": 1 - negative})
         says.append(fit(observations, labels, unlabelled, weighted, seed=0).predict(unlabelled).mean())
     assert says[0] < 0.4 < 0.6 < says[1]
 
@@ -346,11 +351,11 @@ def test_class_weights_weigh_the_classes() -> None:
 def test_nan_stops_the_run_and_names_the_member() -> None:
     """Spec G3: member and step; a learning rate that explodes is found when it happens."""
     observations, labels, unlabelled = toy()
-    config = dataclasses.replace(TOY, learning_rate=1e30)
+    config = TOY.model_copy(update={"learning_rate": 1e30})
     with pytest.raises(NumericalError, match=r"^the labelled loss of member 0 is (nan|inf) at step [23]$"):
         fit(observations, labels, unlabelled, config, seed=0)
     with pytest.raises(NumericalError, match=r"of member [01] is NaN or Inf after step 1$"):
-        fit(observations, labels, unlabelled, dataclasses.replace(config, learning_rate=1e39, steps=1), seed=0)
+        fit(observations, labels, unlabelled, config.model_copy(update={"learning_rate": 1e39, "steps": 1}), seed=0)
 
 
 def test_an_objective_that_gives_nan_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -365,7 +370,7 @@ def test_an_objective_that_gives_nan_is_named(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(training, "load_objective", lambda _: Objective("broken", pair_loss=pair_loss))
     with pytest.raises(NumericalError, match="the diversity loss of members 0 and 2 is nan at step 5"):
-        fit(observations, labels, unlabelled, dataclasses.replace(TOY, members=3), seed=0)
+        fit(observations, labels, unlabelled, TOY.model_copy(update={"members": 3}), seed=0)
 
 
 def test_data_that_cannot_be_learned_from_are_one_clear_line() -> None:
@@ -378,4 +383,4 @@ def test_data_that_cannot_be_learned_from_are_one_clear_line() -> None:
     with pytest.raises(UserError, match="do not fit together"):
         fit(observations, labels[:5], unlabelled, TOY, seed=0)
     with pytest.raises(UserError, match="unknown diversity objective: spread"):
-        fit(observations, labels, unlabelled, dataclasses.replace(TOY, diversity="spread"), seed=0)
+        fit(observations, labels, unlabelled, TOY.model_copy(update={"diversity": "spread"}), seed=0)

@@ -83,10 +83,10 @@ def test_what_would_end_a_command_is_an_error(run: Path, tmp_path: Path) -> None
     data, out = run / "data.h5", tmp_path / "out"
     cases = [
         ({"stepz": 3}, "train-ensemble has no setting: stepz. Did you mean 'steps'"),
-        ({"steps": "many"}, "wrong type of value"),
+        ({"steps": "many"}, "valid integer"),
         ({"members": 0}, "value out of range"),
         ({"diversity": "none:such"}, "cannot be loaded"),
-        ({"preset": "none-such"}, "unknown preset"),
+        ({"preset": "none-such"}, "no such preset"),
         ({"device": "tpu"}, "unknown device"),
         ({"seed": -1}, "'seed'"),
     ]

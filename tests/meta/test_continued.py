@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +164,7 @@ def test_pictures_too_small_for_options_are_refused() -> None:
 def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:
     """Spec E7, G2: one line instead of what the library raises."""
     env = EngineEnv(DoorKeyEngine(100, 4, max_steps=50))
-    chosen = replace(HYPERPARAMETERS["ppo", "paper"], rollout=3)
+    chosen = HYPERPARAMETERS["ppo", "paper"].model_copy(update={"rollout": 3})
     with pytest.raises(UserError, match="fewer than there are environments: environments=4"):
         make_agent(env, chosen, 0)
 

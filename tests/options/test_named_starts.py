@@ -12,7 +12,7 @@ from toy_data import fill
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create, open_artefact
-from hypogoal.core.config import describe
+from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
@@ -147,7 +147,7 @@ def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
 
 def test_the_papers_number_of_steps_is_told() -> None:
     """Spec D4: ``hypogoal config train-options`` says that the paper's 3e5 steps are those of each option."""
-    (steps,) = [row for row in describe(TrainOptionsConfig) if row["name"] == "steps"]
+    (steps,) = [row for row in described(TrainOptionsConfig) if row["name"] == "steps"]
     assert "3e5 for each option" in steps["source"]
 
 

@@ -1,7 +1,6 @@
 """Options that each begin at a start state, on engines that forget (Spec D1-D4, D6, E6, F3)."""
 
 import csv
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -248,7 +247,7 @@ def test_the_paper_network_learns_from_pictures() -> None:
 def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
     """Spec D3: members of the paper's kind share the engine's memory; executions that are gone are not replayed."""
     config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 100, "option_timeout": 4}))
-    config = replace(config, warm_up=100_000, option_batch=4)
+    config = config.model_copy(update={"warm_up": 100_000, "option_batch": 4})
     engine = LongCorridor(4, memory=240)
     verdicts = oracle_terminations(engine, (0, 1))
     learner, chooser = RecurrentLearner(engine, verdicts, config, 0), Chosen([0] * 8 + [1] * 400)

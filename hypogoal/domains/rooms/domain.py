@@ -5,13 +5,12 @@ tell which of them counts: ``truth`` of the world that an agent is trained in.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, States
@@ -36,8 +35,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class RoomsConfig:
+class RoomsConfig(Config):
     """Settings of ``hypogoal collect rooms``."""
 
     factors: tuple[str, ...] = setting(

@@ -4,14 +4,11 @@ The paper gives Tables 4 and 5 only for the agents it trains itself and says no 
 read the two tables as theirs too. Where it is silent the value is stable-baselines3's default or ours, and says so.
 """
 
-from dataclasses import dataclass
-
-from hypogoal.core.config import setting
+from hypogoal.core.config import Config, setting
 from hypogoal.learners.config import WorldConfig
 
 
-@dataclass(frozen=True)
-class PPOSettings:
+class PPOSettings(Config):
     """Hyperparameters of proximal policy optimisation (Schulman et al. 2017)."""
 
     network: str = setting("three-conv", "feature network, see networks.py", choices=("three-conv", "cells"))
@@ -26,8 +23,7 @@ class PPOSettings:
     clip: float = setting(0.2, "clip range of the probability ratio", source="stable-baselines3")
 
 
-@dataclass(frozen=True)
-class DQNSettings:
+class DQNSettings(Config):
     """Hyperparameters of deep Q-learning (Mnih et al. 2015)."""
 
     network: str = setting("three-conv", "feature network, see networks.py", choices=("three-conv", "cells"))
@@ -68,7 +64,6 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 }
 
 
-@dataclass(frozen=True)
 class BaselineConfig(WorldConfig):
     """Which agent, and for how long; 'setting' chooses the hyperparameters."""
 
