@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembl
         load_teacher(config.teacher)
     if config.view != FULL:
         own_view(config.view, config.view_settings, dataset.observation_shape)
-    config = replace(config, network=network_for(config.network, dataset.observation_dtype))
+    config = config.model_copy(update={"network": network_for(config.network, dataset.observation_dtype)})
     for name in names_in(config.network):
         load_network(name)
     sub_goals = config.sub_goals or dataset.sub_goals
