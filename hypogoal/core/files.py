@@ -8,7 +8,6 @@ import csv
 import io
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -16,7 +15,6 @@ from typing import Any, TypeGuard
 from hypogoal.core.errors import UserError
 
 MAX_NAME_BYTES = 200  # of a file's name
-MOST_INTEGER = (1 << 53) - 1  # many readers of JSON treat numbers as 64-bit floats
 NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
 
 
@@ -55,14 +53,6 @@ def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
             value = json.loads(line)
             if isinstance(value, dict):
                 yield value
-
-
-def parse_toml(text: str, where: object, subject: str, do: str) -> dict[str, Any]:
-    """The table of a TOML text."""
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{subject} not valid TOML ({error})", where, do) from None
 
 
 def replace_text(path: Path, text: str) -> None:
