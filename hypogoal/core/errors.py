@@ -12,8 +12,12 @@ class UserError(Exception):
 
     def __init__(self, what: str, where: object = None, do: str = ""):
         self.what, self.where, self.do = what, where, do
-        line = what if where is None else f"{what}: {where}"
-        super().__init__(printable(f"{line}. {do}" if do else line))
+        line = what
+        if where is not None:
+            line += f": {where}"
+        if do:
+            line += f". {do}"
+        super().__init__(printable(line))
 
 
 class Killed(UserError):
@@ -37,5 +41,7 @@ class NumericalError(Exception):
 
 def printable(text: str) -> str:
     """A text as one line without control, invisible and bidirectional characters, which are shown as ``?``."""
-    line = " ".join(part.strip() for part in text.splitlines() if part.strip())
-    return "".join(sign if sign.isprintable() else "?" for sign in line)
+    parts = (part.strip() for part in text.splitlines())
+    line = " ".join(filter(None, parts))
+    signs = (sign if sign.isprintable() else "?" for sign in line)
+    return "".join(signs)
