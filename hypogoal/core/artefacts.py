@@ -20,7 +20,7 @@ from typing import Any
 from filelock import FileLock, Timeout, lock_descriptor
 from pydantic import BaseModel, ValidationError
 
-from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.checkpoints import ANEW, Checkpoints
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.files import read_json, replace_text, sync
 from hypogoal.core.processes import peak_memory
@@ -37,7 +37,6 @@ FRONT = 1 << 16  # bytes of a file that are looked at for its kind
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers", "quiet")  # settings that change no result
 AGAIN = "Make the artefact again."
-ANEW = "Give --force and no --resume to begin anew."
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
     "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
@@ -253,8 +252,8 @@ class Draft:
             yield
         finally:
             if not self.is_resumable and not (self.files / MANIFEST).is_file():
-                for folder in (self.checkpoint, self.files, self.folder):  # the lock last
-                    shutil.rmtree(folder, ignore_errors=True)
+                self._clear()
+                shutil.rmtree(self.folder, ignore_errors=True)  # the lock last
                 with contextlib.suppress(OSError):
                     for folder in made:
                         folder.rmdir()
@@ -262,11 +261,14 @@ class Draft:
 
     def begin(self, wanted: Manifest) -> None:
         """Remove what an earlier process left, and begin anew."""
+        self._clear()
+        self.files.mkdir()
+        replace_text(self.begun, _text_of(wanted.model_dump()))
+
+    def _clear(self) -> None:
         self.begun.unlink(missing_ok=True)  # first: what is left then is not resumed
         for folder in (self.checkpoint, self.files):
             shutil.rmtree(folder, ignore_errors=True)
-        self.files.mkdir()
-        replace_text(self.begun, _text_of(wanted.model_dump()))
 
 
 @contextlib.contextmanager
@@ -294,9 +296,6 @@ def create(
     """
     started = time.monotonic()
     draft = Draft(out)
-    for path in inputs:
-        if path.resolve().is_relative_to(draft.out):
-            raise UserError("the output would replace an input", path, "Choose another --out.")
     entries = [_input(path, draft.out) for path in inputs]
     wanted = Manifest(kind=kind, config=dict(config), seed=seed, inputs=entries, versions=versions())
     wanted.command = _command()
@@ -327,6 +326,8 @@ def _command() -> list[str]:
 
 
 def _input(path: Path, out: Path) -> Input:
+    if path.resolve().is_relative_to(out):
+        raise UserError("the output would replace an input", path, "Choose another --out.")
     kind = Artefact(path).kind if path.is_dir() else DATA
     relative = os.path.relpath(path.resolve(), out)
     return Input(kind=kind, path=str(path), relative=relative, sha256=sha256_of(path))
@@ -404,9 +405,8 @@ def kind_of(out: Path) -> str | None:
 
 def _finish(draft: Draft, manifest: Manifest) -> None:
     """Write the manifest of what is in the draft, and put it in place."""
-    files = [path for path in sorted(draft.files.rglob("*")) if path.is_file()]
-    listed = [path for path in files if path.name != TO_FILL_IN]
-    manifest.files = {path.relative_to(draft.files).as_posix(): sha256_of(path) for path in listed}
+    files = [path for path in sorted(draft.files.rglob("*")) if path.is_file() and path.name != TO_FILL_IN]
+    manifest.files = {path.relative_to(draft.files).as_posix(): sha256_of(path) for path in files}
     for path in files:
         sync(path)
     if manifest.kind in SIGNATURES:
