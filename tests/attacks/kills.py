@@ -25,6 +25,7 @@ from pathlib import Path
 
 from hypogoal.core.artefacts import Artefact, Draft
 from hypogoal.core.checkpoints import PACE
+from hypogoal.core.processes import CORES
 
 PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
 QUICK = "--set warm_up=100 --set max_episode_steps=60 --set random_episodes=5 --set environments=8"
@@ -177,6 +178,7 @@ def main() -> int:
         if out not in given.commands:
             continue
         if given.drop:
+            os.environ[CORES] = "1"  # other processes would import the class as it is
             module, _, place = given.drop.partition(":")
             kind = getattr(import_module(module), place.partition(".")[0])
             kind.CHANGING = tuple(name for name in kind.CHANGING if name != place.partition(".")[2])
