@@ -63,7 +63,7 @@ def test_what_one_typed_is_loaded(folder: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv(own_code.VARIABLE, "evilmod:obj")
     with pytest.raises(UserError, match="Do you trust it"):
         load_domain("evilmod:obj")
-    refuses("the object is not a domain", "collect", "evilmod:obj", "--out", folder / "out")
+    refuses("the object is not a domain", "collect", "evilmod:obj", "--out", folder / "made" / "out")
     own_code._allowed.clear()
     monkeypatch.setenv(own_code.VARIABLE, "1")
     with pytest.raises(UserError, match="not a domain"):
