@@ -25,6 +25,7 @@ distilled-agents.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,6 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.learners.double_dqn import descend
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.learner import Learner as AnyLearner
 from hypogoal.options.learner import Transitions
@@ -120,7 +120,7 @@ class Learner(LightLearner):
 
     CHANGING = (*AnyLearner.CHANGING, "online", "optimiser", "best", "kind", "steps", "updates", "_due")
 
-    def build(self, config: OptionConfig, seed: int) -> None:
+    def build(self, config: Any, seed: int) -> None:
         assert isinstance(config, TrainOptionsConfig | TrainMetaConfig)
         self.last = config.steps
         self.actions = plan_of(self.engine, self.terminations, config, self.engine.ids[:1]).actions
@@ -137,7 +137,7 @@ class Learner(LightLearner):
         self.loaded = False
 
     @staticmethod
-    def reach(config: OptionConfig, options: int) -> int:
+    def reach(config: Any, options: int) -> int:
         return 0
 
     def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:

@@ -27,7 +27,7 @@ from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
 
 TESTS = Path(__file__).parent
-CONFIG = OptionConfig(environments=4, warm_up=20, update_interval=4, option_batch=16)
+CONFIG = OptionConfig.of(environments=4, warm_up=20, update_interval=4, option_batch=16)
 
 
 def loop_of(engine: Corridor) -> OptionLoop:
@@ -67,7 +67,7 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None
     """Spec G3: the same for the independent networks of ``paper``."""
     engine = Corridor(1)
     verdicts = oracle_terminations(engine, (0, 1))
-    config = OptionConfig(network="paper", experience="own", environments=1, warm_up=4, option_batch=4)
+    config = OptionConfig.of(network="paper", experience="own", environments=1, warm_up=4, option_batch=4)
     learner = RecurrentLearner(engine, verdicts, config, 0)
     loop = OptionLoop(
         engine, verdicts, learner, RandomChooser(np.random.default_rng(0)), Recorder(2, engine), config, gamma=0.9

@@ -45,7 +45,12 @@ class Config(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    PARTS: ClassVar[Mapping[str, Mapping[str, type["Config"]]]] = {}
+    PARTS: ClassVar[dict[str, dict[str, type["Config"]]]] = {}
+
+    @classmethod
+    def of(cls, **values: Any) -> Any:
+        """The settings with these values, of the parts that they choose; those of other parts have no effect."""
+        return resolve(cls, values, {}, stage=cls.__name__)
 
     @field_validator("*", mode="before")
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -14,6 +15,7 @@ from hypogoal.core import own_code
 from hypogoal.core.checkpoints import ANEW, Resumable
 from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
+from hypogoal.core.processes import CORES
 from hypogoal.data import Collected
 from hypogoal.domains.observations import reading_of
 from hypogoal.observations import PICTURE, Observations, Standard
@@ -505,4 +507,7 @@ def settings_of(
     """
     model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
     *defaults, of_preset = [values for values, _ in layers_of(stage, domain, preset_name)]
-    return resolve(model, *defaults, inherited or {}, of_preset, typed or {}, stage=stage)
+    layers = [*defaults, inherited or {}, of_preset, typed or {}]
+    if CORES in os.environ:  # a cell of an experiment, which tells all cells alike, controls among them
+        layers.append({})
+    return resolve(model, *layers, stage=stage)

@@ -237,9 +237,11 @@ def name_apart(
         alike = [other for other, others_kind in zip(flat, kinds, strict=True) if others_kind == kind]
         differing = []
         for key in sorted({key for other in alike for key in other} - NOT_A_VARIANT):
-            values = [_text(other.get(key)) for other in alike]
+            if key not in config:  # of a learner or a chooser that this one is not
+                continue
+            values = [_text(other[key]) for other in alike if key in other]
             usual, count = Counter(values).most_common(1)[0]
-            if (text := _text(config.get(key))) != usual or 2 * count <= len(values):
+            if (text := _text(config[key])) != usual or 2 * count <= len(values):
                 differing.append(f"{key}={text}")
         names.append(", ".join([base, *differing]))
     return names

@@ -3,14 +3,18 @@
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """
 
-from hypogoal.core.config import MOST, Config, integers, setting
+from typing import Any, ClassVar
+
+from hypogoal.core.config import MOST, OWN, Config, integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.learners.config import WorldConfig
 from hypogoal.options.config import OptionConfig
 
+GAMMA = 0.99  # discount per environment step, ours: an option of tau steps counts GAMMA^tau; the paper gives none
+
 
 class MetaConfig(Config):
-    """PPO over options, with SMDP returns."""
+    """PPO over options, with SMDP returns: chooser=ppo."""
 
     meta_network: str = setting(
         "light",
@@ -22,9 +26,6 @@ class MetaConfig(Config):
     head: str = setting(
         "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")
     )
-    gamma: float = setting(
-        0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="paper: not given"
-    )
     gae_lambda: float = setting(
         0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0
     )
@@ -32,7 +33,6 @@ class MetaConfig(Config):
     epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
     meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
     meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
-    clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0)
     entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
     advantage_floor: float = setting(
         0.1,
@@ -103,8 +103,10 @@ class TrainOptionsConfig(PracticeConfig):
     )
 
 
-class TrainMetaConfig(PlayConfig, MetaConfig):
+class TrainMetaConfig(PlayConfig):
     """How options are learned and chosen, and for how long."""
+
+    PARTS: ClassVar[Any] = OptionConfig.PARTS | {"chooser": {"ppo": MetaConfig, OWN: MetaConfig}}
 
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1

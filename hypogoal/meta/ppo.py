@@ -21,10 +21,10 @@ from hypogoal.meta.networks import HEADS, meta_network
 from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Ids, Offered, Outcome
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
+CLIP = 0.2  # of the ratio of probabilities: Schulman et al. 2017
 VALUE_WEIGHT = 0.5  # of the value loss: Schulman et al. 2017
 
 
@@ -81,7 +81,7 @@ class MetaPolicy(Chooser):
         self.updates = 0
 
     @classmethod
-    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+    def refuse(cls, config: Any, engine: Engine) -> None:
         """Without settings of PPO there is nothing to learn by; the paper's network sees pictures only."""
         if not isinstance(config, MetaConfig):
             raise UserError("only train-meta learns the meta-policy", "chooser=ppo", "Give chooser=random or even.")
@@ -90,8 +90,7 @@ class MetaPolicy(Chooser):
             raise UserError("the paper's networks see pictures only", "meta_network=paper", do)
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
-        assert isinstance(config, MetaConfig)
+    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
         return cls(engine, options, config, seed, device)
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
@@ -164,7 +163,7 @@ class MetaPolicy(Chooser):
                 pick = tensor(rows, self.device)
                 out = self._outputs(states[rows])
                 log_prob, entropy = self.head.log_prob(out[:, :-1], offered[pick], drawn[pick])
-                loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)
+                loss = clipped_surrogate(log_prob, old[pick], scaled[pick], CLIP)
                 loss = loss + VALUE_WEIGHT * (out[:, -1] - goal[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
                 where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"

@@ -18,7 +18,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import Domain, Engine, Layouts, require_one_kind
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import MetaConfig, PlayConfig, PracticeConfig, TrainMetaConfig, layout_seeds
+from hypogoal.meta.config import GAMMA, MetaConfig, PlayConfig, PracticeConfig, TrainMetaConfig, layout_seeds
 from hypogoal.observations import PICTURE, Standard, standard_of
 from hypogoal.options import choosers
 from hypogoal.options.config import STACK
@@ -77,7 +77,7 @@ def assemble(
         chooser.create(engine, options, config, seed, device),
         Recorder(options, engine),
         config,
-        config.gamma if isinstance(config, MetaConfig) else 1.0,
+        GAMMA if isinstance(config, TrainMetaConfig) else 1.0,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
     if near := nearness(domain, engine, ensemble_config, config):
@@ -266,7 +266,7 @@ def check_fit(
     for key in fixed:
         if key == "layout_seed" and before["layouts"]:  # options of many layouts may be played in any
             continue
-        if before[key] != getattr(config, key):
+        if before.get(key) != getattr(config, key, before.get(key)):  # a part's, where the network has that part
             fault = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
             raise UserError(fault, trained.path, f"Give --set {key}={before[key]}, or leave it out.")
 
@@ -276,7 +276,8 @@ def inherited(trained: Artefact | None, fixed: Sequence[str]) -> dict[str, Any]:
     if trained is None:
         return {}
     anywhere = bool(trained.config["layouts"])
-    return {name: trained.config[name] for name in fixed if name != "layout_seed" or not anywhere}
+    hold = [name for name in fixed if name in trained.config and (name != "layout_seed" or not anywhere)]
+    return {name: trained.config[name] for name in hold}
 
 
 def options_of(ensemble_config: Mapping[str, Any], config: PlayConfig) -> int:

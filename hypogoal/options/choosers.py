@@ -5,13 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.parts import Part, load_part
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ class Chooser(Part, ABC):
     """A policy over options."""
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
         """A fresh one that chooses among so many options; ``seed`` is of weights and draws."""
         return cls()
 
@@ -86,7 +85,7 @@ class RandomChooser(Chooser):
         self.rng = rng
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
         return cls(rng_for(seed, "random-choice"))
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
@@ -106,7 +105,7 @@ class EvenChooser(RandomChooser):
         self.steps = np.zeros(options, dtype=np.int64)
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
         return cls(options, rng_for(seed, "random-choice"))
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:

@@ -1,6 +1,6 @@
 """Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
 
-from hypogoal.core.config import Config, setting
+from hypogoal.core.config import OWN, Config, setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
 
@@ -16,24 +16,11 @@ class OptionConfig(Config):
         choices=("light", "paper", "planned"),
         own=True,
     )
-    recurrence: str = setting(
-        "execution",
-        "what the conv-GRU remembers: its execution, from the option's first step on; or none, each step a sequence "
-        "of its own (network=paper)",
-        source="execution: paper; none: the authors' code",
-        choices=("execution", "none"),
-    )
     termination: str = setting(
         "learned",
         "where options end: learned, at the first positive prediction; oracle, at true sub-goals (upper bound); or a "
         "rule of your own, module:Class or module:Class:NUMBER",
         source="paper: learned",
-    )
-    embedding: str = setting(
-        "auto",
-        "how the light network reads observations: cells, convolutions or numbers, whichever suits them; or a member "
-        "network's layers, by name or as module:function",
-        source="ours",
     )
     experience: str = setting(
         "shared",
@@ -48,30 +35,23 @@ class OptionConfig(Config):
         False, "every option begins a new episode, at a start state", source="paper, policy learning"
     )
     mask_reached: bool = setting(True, "do not offer options where their sub-goal already holds", source="ours")
-    bootstrap_timeout: bool = setting(
-        True, "do not treat an option's timeout as a terminal state", source="paper, appendix; light: ours"
-    )
+    environments: int = setting(16, "environments stepped together", low=1, high=4096)
+
+
+class LearnerConfig(OptionConfig):
+    """How option policies learn, with network=light or paper."""
+
     bounded_values: bool = setting(
         True, "clip the targets of values to 0..1, the range of an option's return", source="ours; paper: false"
     )
     option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
-    environments: int = setting(16, "environments stepped together", low=1, high=4096)
     replay: int = setting(100_000, "transitions kept", source="Table 4", low=100)
     warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1)
     update_interval: int = setting(16, "environment steps per update", unit="steps", source="paper: 4", low=1)
     option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
-    positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
     option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
     target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
     target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
-    n_step: int = setting(
-        1,
-        "steps of an n-step return, within one execution (light, experience=own)",
-        unit="steps",
-        source="paper: 1; Hessel et al. 2018",
-        low=1,
-        high=1_000,
-    )
     exploration: str = setting(
         "independent",
         "how long a random action lasts: one step, or several",
@@ -86,3 +66,42 @@ class OptionConfig(Config):
         source="paper: start",
         choices=("start", "first-positive"),
     )
+
+
+class LightConfig(LearnerConfig):
+    """What only network=light has."""
+
+    embedding: str = setting(
+        "auto",
+        "how the network reads observations: cells, convolutions or numbers, whichever suits them; or a member "
+        "network's layers, by name or as module:function",
+        source="ours",
+    )
+    positives: float = setting(0.25, "share of a batch that reached a sub-goal", low=0.0, high=1.0)
+    n_step: int = setting(
+        1,
+        "steps of an n-step return, within one execution (experience=own)",
+        unit="steps",
+        source="paper: 1; Hessel et al. 2018",
+        low=1,
+        high=1_000,
+    )
+
+
+class PaperConfig(LearnerConfig):
+    """What only network=paper has."""
+
+    recurrence: str = setting(
+        "execution",
+        "what the conv-GRU remembers: its execution, from the option's first step on; or none, each step a sequence "
+        "of its own",
+        source="execution: paper; none: the authors' code",
+        choices=("execution", "none"),
+    )
+
+
+class OwnLearnerConfig(LightConfig, PaperConfig):
+    """All that an option learner of one's own may heed."""
+
+
+OptionConfig.PARTS = {"network": {"light": LightConfig, "paper": PaperConfig, OWN: OwnLearnerConfig}}

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import LearnerConfig
 
 EXPONENT, LONGEST = 2.0, 10_000  # of how long a random action lasts, P(n) ~ n^-2, at most so many steps
 
@@ -20,7 +20,7 @@ class Exploration(Resumable):
 
     CHANGING = ("_kept", "_left")  # the generator is its owner's
 
-    def __init__(self, config: OptionConfig, environments: int, actions: int, rng: np.random.Generator):
+    def __init__(self, config: LearnerConfig, environments: int, actions: int, rng: np.random.Generator):
         self.actions, self.rng = actions, rng
         self.persistent = config.exploration == "persistent"
         self._kept = np.zeros(environments, dtype=np.int64)

@@ -15,11 +15,10 @@ from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.parts import Part, load_part
 from hypogoal.options.termination import ORACLE, Terminations
@@ -87,14 +86,14 @@ class Learner(Part, ABC):
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO}
+    NEEDS: ClassVar[Mapping[str, Any]] = {}
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *COUNTERS)
 
     def __init__(
         self,
         engine: Engine,
         terminations: Terminations,
-        config: OptionConfig,
+        config: Any,
         seed: int,
         device: torch.device | str = "cpu",
     ):
@@ -102,7 +101,8 @@ class Learner(Part, ABC):
         self.engine, self.terminations, self.config = engine, terminations, config
         self.options, self.device = terminations.options, torch.device(device)
         self.rng = rng_for(seed, "options")
-        self.exploration = Exploration(config, engine.count, engine.n_actions, self.rng)
+        if isinstance(config, LearnerConfig):
+            self.exploration = Exploration(config, engine.count, engine.n_actions, self.rng)
         self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), dtype=np.int64)
         self.build(config, seed)
         reach = self.reach(config, self.options)
@@ -114,7 +114,7 @@ class Learner(Part, ABC):
             )
 
     @classmethod
-    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+    def refuse(cls, config: Any, engine: Engine) -> None:
         """Raise a ``UserError`` where it cannot learn with these settings in this engine."""
         for name, value in cls.NEEDS.items():
             if getattr(config, name) != value:
@@ -130,12 +130,12 @@ class Learner(Part, ABC):
         )
 
     @abstractmethod
-    def build(self, config: OptionConfig, seed: int) -> None:
+    def build(self, config: Any, seed: int) -> None:
         """The policies, once all above is there."""
 
     @staticmethod
     @abstractmethod
-    def reach(config: OptionConfig, options: int) -> int:
+    def reach(config: Any, options: int) -> int:
         """How many states back the learner looks."""
 
     @abstractmethod

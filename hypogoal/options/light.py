@@ -9,7 +9,6 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import STACK, OptionConfig
+from hypogoal.options.config import STACK, LightConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
 from hypogoal.options.networks import (
     LightQNetwork,
@@ -57,10 +56,8 @@ class LightLearner(Learner):
         *("online", "target", "optimiser", "replay", "ahead", "positive", "steps", "updates", "_due"),
     )
 
-    NEEDS: ClassVar[Mapping[str, Any]] = {}
-
     @classmethod
-    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+    def refuse(cls, config: LightConfig, engine: Engine) -> None:
         """Other members' sub-goals may lie between the first and the last of several steps."""
         if config.n_step > 1 and config.experience != "own":
             fault = "several steps at once are for an option's own member: others' sub-goals may lie among them"
@@ -71,7 +68,7 @@ class LightLearner(Learner):
     def policies(cls, saved: SavedOptions) -> Policies:
         return LightPolicies(saved)
 
-    def build(self, config: OptionConfig, seed: int) -> None:
+    def build(self, config: LightConfig, seed: int) -> None:
         self.running_only = config.experience == "own"
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
@@ -88,7 +85,7 @@ class LightLearner(Learner):
         self.steps = self.updates = self._due = 0
 
     @staticmethod
-    def reach(config: OptionConfig, options: int) -> int:
+    def reach(config: LightConfig, options: int) -> int:
         """A transition waits n steps, and its turn in the ring n more."""
         return config.replay + (2 * config.n_step + STACK) * config.environments
 
@@ -158,8 +155,6 @@ class LightLearner(Learner):
         inside, reached = self._judged(batch)
         owner = batch.option[:, None] == np.arange(self.options)
         terminal = reached | batch.terminated[:, None]
-        if not self.config.bootstrap_timeout:
-            terminal = terminal | (owner & batch.timed_out[:, None])
         learns = ~inside & owner if self.running_only else ~inside
         ahead = self.tensor(batch.steps).float()[:, None]
 

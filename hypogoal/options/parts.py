@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
-from hypogoal.options.config import OptionConfig
 
 if TYPE_CHECKING:
     from hypogoal.domains.base import Engine
@@ -19,7 +18,7 @@ class Part(Resumable):
     """A part of an agent. Its class knows which settings and engines it works with."""
 
     @classmethod
-    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+    def refuse(cls, config: Any, engine: Engine) -> None:
         """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
 
 

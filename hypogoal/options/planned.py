@@ -5,6 +5,7 @@ whose options are planned shows what its hypotheses are worth, whatever option l
 """
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.learner import COUNTERS, Learner, Transitions
 from hypogoal.options.termination import Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
@@ -32,6 +33,8 @@ class PlannedLearner(Learner):
     Raises:
         UserError: nobody knows what follows in this engine.
     """
+
+    CHANGING: ClassVar[tuple[str, ...]] = ("rng", "positives", *COUNTERS)  # it does not explore
 
     def build(self, config: OptionConfig, seed: int) -> None:
         plan = plan_of(self.engine, self.terminations, config)

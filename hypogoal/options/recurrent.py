@@ -26,7 +26,7 @@ from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import STACK, OptionConfig
+from hypogoal.options.config import STACK, PaperConfig
 from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
 from hypogoal.options.paper_network import PaperQNetwork, looked_at
 
@@ -49,9 +49,7 @@ class Member(Resumable):
 
     CHANGING = ("online", "target", "optimiser", "replay", "updates", "due", "executions")
 
-    def __init__(
-        self, engine: Engine, config: OptionConfig, seed: int, option: int, actions: int, device: torch.device
-    ):
+    def __init__(self, engine: Engine, config: PaperConfig, seed: int, option: int, actions: int, device: torch.device):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights", option))
             remembers = config.recurrence == "execution"
@@ -66,10 +64,10 @@ class RecurrentLearner(Learner):
     """The intra-option policies of all O options, each on its own; arguments as of :class:`Learner`."""
 
     CHANGING = (*Learner.CHANGING, "members", "hidden", "running")
-    NEEDS: ClassVar[Mapping[str, Any]] = {**Learner.NEEDS, "experience": "own", "n_step": 1}
+    NEEDS: ClassVar[Mapping[str, Any]] = {"experience": "own"}
 
     @classmethod
-    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+    def refuse(cls, config: PaperConfig, engine: Engine) -> None:
         """It sees pictures only, and learns single steps of its members' own executions."""
         super().refuse(config, engine)
         if engine.observation_dtype != PICTURE:
@@ -79,14 +77,14 @@ class RecurrentLearner(Learner):
     def policies(cls, saved: SavedOptions) -> Policies:
         return PaperPolicies(saved)
 
-    def build(self, config: OptionConfig, seed: int) -> None:
+    def build(self, config: PaperConfig, seed: int) -> None:
         count = self.engine.n_actions
         self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
         self.running: list[list[tuple[int, int, int, bool, bool, bool]]] = [[] for _ in range(self.engine.count)]
 
     @staticmethod
-    def reach(config: OptionConfig, options: int) -> int:
+    def reach(config: PaperConfig, options: int) -> int:
         """How many states back the replays hold when each has had as many steps as another.
 
         A running execution is stored when it ends. Of what a member that had fewer has stored, the oldest may be
@@ -174,8 +172,6 @@ class RecurrentLearner(Learner):
         next_states = data.next_state[indices].astype(np.int64)
         reached = self.terminations.of_running(next_states, np.full(len(indices), option))
         terminal = reached | data.terminated[indices]
-        if not config.bootstrap_timeout:
-            terminal = terminal | data.timed_out[indices]
         goal = double_q_targets(
             self.tensor(reached).float(),
             self.tensor(terminal),

@@ -49,7 +49,7 @@ PRESET = {
     "collect": {"door_label": "open", "unlabelled_seeds": [1, 2], "heldout_layouts": 20},
     "train-ensemble": {"members": 3, "sub_goals": ["go-to-goal"], "diversity_weight": 1e-4, "network": "doorkey"},
     "train-options": {"steps": 100, "option_timeout": 9},
-    "train-meta": {"clip": 0.2, "decisions": 64, "termination": "learned"},
+    "train-meta": {"head": "gaussian", "decisions": 64, "termination": "learned"},
     "run": {"layout_seeds": [100, 101], "seeds": [0]},
 }
 EXPERIMENT = {"format": 1, "evaluate": False, "axes": {"seed": [0, 1], "layout": "210-211"}, "cells": [

@@ -11,7 +11,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import judge, qualities, rank_correlation
 from hypogoal.evaluation.frozen import Choices, play
-from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
@@ -24,11 +24,11 @@ RIGHT = [0, 3, 6, 9, 12]  # the first member of every sub-goal knows it
 
 def agent(layout_seed: int, steps: int) -> OptionLoop:
     """PPO over planned options of planted members, in a world where a wrong key ends the episode."""
-    engine, config = harsh(layout_seed, 16), TrainMetaConfig(network="planned")
+    engine, config = harsh(layout_seed, 16), TrainMetaConfig.of(network="planned")
     terminations = planted(engine)
     learner = PlannedLearner(engine, terminations, config, seed=0)
     loop = OptionLoop(
-        engine, terminations, learner, MetaPolicy(engine, 15, config, 0), Recorder(15, engine), config, config.gamma
+        engine, terminations, learner, MetaPolicy(engine, 15, config, 0), Recorder(15, engine), config, GAMMA
     )
     while loop.recorder.steps < steps:
         loop.step()
@@ -55,9 +55,9 @@ def test_right_members_have_quality_one() -> None:
     """Where their sub-goal can be had within the timeout and no other key comes into their way."""
     engine = DoorKeyEngine(220, 1)
     terminations = planted(engine)
-    config = TrainMetaConfig(network="planned")
+    config = TrainMetaConfig.of(network="planned")
     learner = PlannedLearner(engine, terminations, config, seed=0)
-    loop = OptionLoop(engine, terminations, learner, Silent(), Recorder(15, engine), config, config.gamma)
+    loop = OptionLoop(engine, terminations, learner, Silent(), Recorder(15, engine), config, GAMMA)
     quality = qualities(loop, GOALS, engine.reachable())
     assert (quality[RIGHT] == 1).all()
     assert (np.delete(quality, RIGHT) < 1).all()

@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import play
-from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
@@ -43,12 +43,12 @@ def forced_loop(failures: float, cap: int, environments: int) -> OptionLoop:
     """An agent with the true sub-goals that solves a forced share of its episodes, each in the fewest steps."""
     engine = DoorKeyEngine(LAYOUT, environments)
     engine.max_steps = cap
-    config = TrainMetaConfig(network="planned", termination="oracle")
+    config = TrainMetaConfig.of(network="planned", termination="oracle")
     terminations = oracle_terminations(engine, (4,))  # go-to-goal alone: the shortest path
     learner = Forgetful(engine, terminations, config, seed=0)
     learner.failures, learner.rng = failures, np.random.default_rng(cap)
     chooser = RandomChooser(np.random.default_rng(0))
-    return OptionLoop(engine, terminations, learner, chooser, Recorder(1, engine), config, config.gamma)
+    return OptionLoop(engine, terminations, learner, chooser, Recorder(1, engine), config, GAMMA)
 
 
 @pytest.mark.parametrize("cap", [57, 500])
@@ -91,10 +91,10 @@ def test_nothing_of_an_earlier_chooser_is_left() -> None:
     """The second one is asked first where episodes begin, in every environment, and plays as if it were alone."""
 
     def loop_at(seed: int) -> OptionLoop:
-        engine, config = harsh(220, 16), TrainMetaConfig(network="planned")
+        engine, config = harsh(220, 16), TrainMetaConfig.of(network="planned")
         terminations, rng = planted(engine), np.random.default_rng(seed)
         learner = PlannedLearner(engine, terminations, config, seed=0)
-        return OptionLoop(engine, terminations, learner, RandomChooser(rng), Recorder(15, engine), config, config.gamma)
+        return OptionLoop(engine, terminations, learner, RandomChooser(rng), Recorder(15, engine), config, GAMMA)
 
     loop, noting = loop_at(1), Noting()
     begin = loop.engine.ids.copy()
@@ -126,14 +126,14 @@ class Falling(Terminations):
 def test_play_teaches_nothing() -> None:
     """Thresholds and counters are after it what they were before."""
     engine = harsh(220, 16)
-    config = TrainMetaConfig(network="planned")
+    config = TrainMetaConfig.of(network="planned")
     truth = planted(engine)
     ends = Falling(truth.classify, 15)
     learner = PlannedLearner(engine, truth, config, seed=0)
     chooser = RandomChooser(np.random.default_rng(0))
     ends.thresholds = np.full(15, 0.5, np.float32)
     before = ends.thresholds.copy()
-    loop = OptionLoop(engine, ends, learner, chooser, Recorder(15, engine), config, config.gamma)
+    loop = OptionLoop(engine, ends, learner, chooser, Recorder(15, engine), config, GAMMA)
     play(loop, chooser, 3)
     np.testing.assert_array_equal(ends.thresholds, before)
     assert not learner.option_steps.any() and not learner.positives.any()

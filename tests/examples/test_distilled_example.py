@@ -54,7 +54,7 @@ def trusted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def loop_of(engine: Any, kind: type[Learner] = Learner) -> OptionLoop:
-    ends, config = oracle_terminations(engine, range(GOALS)), TrainOptionsConfig(**QUICK)
+    ends, config = oracle_terminations(engine, range(GOALS)), TrainOptionsConfig.of(**QUICK)
     learner, recorder = kind(engine, ends, config, seed=0), Recorder(GOALS, engine)
     return OptionLoop(engine, ends, learner, RandomChooser(rng_for(0, "c")), recorder, config, gamma=1.0)
 
@@ -152,7 +152,7 @@ def test_it_goes_on_where_it_was() -> None:
 def test_it_needs_a_model() -> None:
     """One line of what, where and what to do."""
     engine = Corridor(2)
-    config = TrainOptionsConfig(network="examples.distilled:Learner")
+    config = TrainOptionsConfig.of(network="examples.distilled:Learner")
     with pytest.raises(UserError, match=r"does not know what each action leads to: network=examples.distilled:Learner"):
         Learner(engine, oracle_terminations(engine, (0,)), config, seed=0)
 

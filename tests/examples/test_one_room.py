@@ -466,7 +466,7 @@ def test_patience_goes_on_where_it_was() -> None:
 
 def loop_of(rule: Terminations, environments: int) -> OptionLoop:
     engine = Corridor(environments)
-    config = OptionConfig(
+    config = OptionConfig.of(
         experience="own",
         mask_reached=False,
         environments=environments,

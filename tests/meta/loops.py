@@ -58,7 +58,7 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
 def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     """Options that are played and learned, of the case, from the same seeds each time."""
     engine_class, network, changes, chooser_name = CASES[case]
-    config = OptionConfig(**{"option_timeout": 10, **QUICK, **changes})  # type: ignore[arg-type]
+    config = OptionConfig.of(network=network, **{"option_timeout": 10, **QUICK, **changes})
     engine = engine_class(3)
     verdicts = oracle_terminations(engine, (0, 1))
     learner = load_learner(network)(engine, verdicts, config, seed=1, device=device)

@@ -33,7 +33,8 @@ QUICK: dict[str, Any] = {"environments": 2, "warm_up": 20, "update_interval": 4,
 def learner_of(kind: type, **changes: Any) -> Any:
     engine = DoorKeyEngine(100, 2, max_steps=50)
     verdicts = oracle_terminations(engine, range(GOALS))
-    return kind(engine, verdicts, OptionConfig(**{**QUICK, **changes}), seed=0)
+    network = "paper" if kind is RecurrentLearner else "light"
+    return kind(engine, verdicts, OptionConfig.of(**{"network": network, **QUICK, **changes}), seed=0)
 
 
 def walk(learner: Any, steps: int) -> None:
@@ -171,7 +172,7 @@ def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:
 
 def test_an_engine_remembers_what_the_meta_policy_looks_back_at() -> None:
     """Spec E2: states where all decisions of an update began, each of which may have taken an option's whole time."""
-    config = TrainMetaConfig(replay=100, environments=4, decisions=64, option_timeout=200)
+    config = TrainMetaConfig.of(replay=100, environments=4, decisions=64, option_timeout=200)
     assert frames_kept(config, GOALS) >= 64 * 200
-    config = TrainMetaConfig(replay=100_000, environments=4, decisions=64)
+    config = TrainMetaConfig.of(replay=100_000, environments=4, decisions=64)
     assert frames_kept(config, GOALS) == LightLearner.reach(config, GOALS)

@@ -83,7 +83,7 @@ def test_where_strides_reach_all_there_is_no_margin(side: int) -> None:
 def test_an_own_embedding_learns_and_plays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2, H6: an encoder as members have it: both options go straight to their ends, also out of their weights."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    engine, config = LongCorridor(4), OptionConfig(**QUICK, **BEGIN, embedding=NAME)
+    engine, config = LongCorridor(4), OptionConfig.of(**QUICK, **BEGIN, embedding=NAME)
     verdicts = oracle_terminations(engine, (0, 1))
     learner, recorder = LightLearner(engine, verdicts, config, 0), Recorder(2, engine)
     fresh = {name: value.clone() for name, value in learner.state().items()}

@@ -18,7 +18,7 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
     engine = DoorKeyEngine(5, 4)
     for _ in range(50):
         engine.step(rng.integers(engine.n_actions, size=4))
-    learner = LightLearner(engine, oracle_terminations(engine, range(5)), OptionConfig(environments=4), 0)
+    learner = LightLearner(engine, oracle_terminations(engine, range(5)), OptionConfig.of(environments=4), 0)
     with torch.no_grad():
         for weight in learner.target.parameters():
             weight.mul_(0.9)  # so that the target is another network

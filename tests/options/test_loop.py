@@ -64,7 +64,7 @@ class FirstOption:
 
 def loop_of(engine, learner, chooser, **changes):
     verdicts = oracle_terminations(engine, (0, 1))
-    config = OptionConfig(**{"option_timeout": 10, **changes})
+    config = OptionConfig.of(**{"option_timeout": 10, **changes})
     recorder = Recorder(2, engine, window=50)
     return OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=0.9), recorder
 
@@ -189,7 +189,7 @@ def test_the_paper_network_unrolls_its_memory() -> None:
 
 def run_corridor(learner_class: type, steps: int, seed: int = 0, **changes):
     engine = Corridor(4)
-    config = OptionConfig(**(QUICK | changes))
+    config = OptionConfig.of(**(QUICK | changes))
     verdicts = oracle_terminations(engine, (0, 1))
     learner = learner_class(engine, verdicts, config, seed)
     loop = OptionLoop(
@@ -264,7 +264,7 @@ def test_the_meta_policy_learns_which_option_pays() -> None:
     """Spec E1-E3: with options that work, PPO comes to choose the one that earns the reward."""
     for head in ("categorical", "gaussian"):
         engine = Corridor(8)
-        config = OptionConfig(environments=8)
+        config = OptionConfig.of(environments=8)
         verdicts = oracle_terminations(engine, (0, 1))
         learner = Perfect()
         policy = MetaPolicy(

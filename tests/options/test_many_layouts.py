@@ -95,7 +95,7 @@ def test_plans_are_of_all_layouts_together() -> None:
 
 def planned_loop(terminations: Any) -> OptionLoop:
     engine = DoorKeyEngine(Layouts(SEEDS), 4)
-    ends, config = terminations(engine), OptionConfig(network="planned", environments=4, mask_reached=False)
+    ends, config = terminations(engine), OptionConfig.of(network="planned", environments=4, mask_reached=False)
     learner = PlannedLearner(engine, ends, config, seed=0)
     return OptionLoop(engine, ends, learner, RandomChooser(rng_for(0, "c")), Recorder(5, engine), config, gamma=1.0)
 
@@ -133,7 +133,7 @@ def test_states_visited_are_of_their_layouts() -> None:
     seeds = tuple(range(8))
     engine = corridors(drawn(seeds), 3)
     ends = oracle_terminations(engine, (0, 1))
-    config = OptionConfig(environments=3, warm_up=10**6)
+    config = OptionConfig.of(environments=3, warm_up=10**6)
     from hypogoal.options.light import LightLearner
 
     visited = Visited(engine, 200, 0, 0)

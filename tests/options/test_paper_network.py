@@ -31,9 +31,9 @@ WITHOUT_SLOPE |= {"features.0.bias", "features.4.bias"}  # which BatchNorm takes
 def learner_of(recurrence: str) -> RecurrentLearner:
     """One option after random play on DoorKey, nothing learned."""
     engine = DoorKeyEngine(100, 4)
-    config = OptionConfig(
-        experience="own", network="paper", environments=4, warm_up=0, update_interval=4, recurrence=recurrence
-    )
+    config = OptionConfig.of(
+        experience="own", network="paper", environments=4, update_interval=4, recurrence=recurrence
+    ).model_copy(update={"warm_up": 0})
     verdicts = oracle_terminations(engine, [0])
     learner = RecurrentLearner(engine, verdicts, config, 0)
     loop = OptionLoop(

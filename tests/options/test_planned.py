@@ -12,7 +12,7 @@ from hypogoal.options.termination import Terminations, oracle_terminations
 
 
 def planned(engine: DoorKeyEngine, terminations: Terminations) -> PlannedLearner:
-    return PlannedLearner(engine, terminations, OptionConfig(network="planned"), seed=0)
+    return PlannedLearner(engine, terminations, OptionConfig.of(network="planned"), seed=0)
 
 
 def test_distances_by_hand() -> None:

@@ -8,9 +8,7 @@ import torch
 from corridor import Corridor
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.learners.double_dqn import double_q_targets
 from hypogoal.learners.episodes import LAST
-from hypogoal.options import light, recurrent
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import load_learner
@@ -41,7 +39,7 @@ class Endless(Corridor):
 
 def learned(network: str, **changes: Any) -> tuple[OptionLoop, dict[str, torch.Tensor]]:
     """Options whose sub-goals never hold, after some updates, and their weights."""
-    engine, config = Endless(3), OptionConfig(**{**QUICK, **changes})
+    engine, config = Endless(3), OptionConfig.of(network=network, **{**QUICK, **changes})
     never = Terminations(lambda ids: np.zeros((len(ids), 2), np.bool_), 2)
     learner = load_learner(network)(engine, never, config, seed=1, device="cpu")
     loop = OptionLoop(
@@ -50,24 +48,6 @@ def learned(network: str, **changes: Any) -> tuple[OptionLoop, dict[str, torch.T
     for _ in range(40):
         loop.step()
     return loop, {name: value.clone() for name, value in learner.state().items()}
-
-
-@pytest.mark.parametrize("network", ["light", "paper"])
-@pytest.mark.parametrize("bootstrap", [True, False])
-def test_a_timeout_is_terminal_only_where_it_is_not_bootstrapped(
-    network: str, bootstrap: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Spec D3: nothing else ends an execution here."""
-    terminal: list[bool] = []
-
-    def watched(rewards: Any, ends: torch.Tensor, *others: Any, **more: Any) -> torch.Tensor:
-        terminal.append(bool(ends.any()))
-        return double_q_targets(rewards, ends, *others, **more)
-
-    for module in (light, recurrent):
-        monkeypatch.setattr(module, "double_q_targets", watched)
-    learned(network, bootstrap_timeout=bootstrap)
-    assert terminal and any(terminal) != bootstrap
 
 
 @pytest.mark.parametrize("network", ["light", "paper"])

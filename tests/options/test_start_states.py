@@ -63,7 +63,7 @@ class Chosen:
 
 def play(engine, actions, options, **changes):
     chooser, recorder = Chosen(options), Recorder(2, engine)
-    config = OptionConfig(**(BEGIN | {"option_timeout": 4} | changes))
+    config = OptionConfig.of(**(BEGIN | {"option_timeout": 4} | changes))
     verdicts = oracle_terminations(engine, (0, 1))
     loop = OptionLoop(engine, verdicts, Script(actions), chooser, recorder, config, gamma=1.0)
     for _ in range(len(actions)):
@@ -148,7 +148,8 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
 
 
 def learned(learner_class: type, steps: int, seed: int = 0, memory: int = 200_000, count: int = 4, **changes):
-    config = OptionConfig(**(QUICK | BEGIN | {"option_timeout": 10} | changes))
+    network = "paper" if learner_class is RecurrentLearner else "light"
+    config = OptionConfig.of(**(QUICK | BEGIN | {"network": network, "option_timeout": 10} | changes))
     engine = LongCorridor(count, memory=memory, seed=seed)
     verdicts = oracle_terminations(engine, (0, 1))
     learner = learner_class(engine, verdicts, config, seed)
@@ -185,11 +186,9 @@ def test_values_over_several_steps_are_the_discounted_ones() -> None:
 
 
 def test_a_step_of_several_needs_own_experience() -> None:
-    """Spec D2: others' sub-goals may lie in between; the paper's network learns one step ahead."""
+    """Spec D2: others' sub-goals may lie in between."""
     with pytest.raises(UserError, match="experience=own"):
         learned(LightLearner, 4, n_step=3, experience="shared")
-    with pytest.raises(UserError, match="n_step=1"):
-        learned(RecurrentLearner, 4, n_step=3, network="paper")
 
 
 @pytest.mark.usefixtures("small_gru")
@@ -206,7 +205,7 @@ def test_a_replay_longer_than_the_memory_is_refused(learner_class: type) -> None
 def test_forgotten_states_are_not_learned_from() -> None:
     """Spec D3: positives from long ago are kept by id; once their pictures are gone they are not drawn again."""
     engine = LongCorridor(4, memory=400)
-    config = OptionConfig(**(QUICK | BEGIN | {"replay": 200, "n_step": 3, "positives": 0.5}))
+    config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 200, "n_step": 3, "positives": 0.5}))
     verdicts = oracle_terminations(engine, (0, 1))
     learner = LightLearner(engine, verdicts, config, 0)
     recorder, chooser = Recorder(2, engine), RandomChooser(np.random.default_rng(0))
@@ -224,7 +223,7 @@ def test_forgotten_states_are_not_learned_from() -> None:
 
 def test_the_replay_never_outlives_the_memory() -> None:
     """Spec D3: with the smallest memory that is accepted, thousands of steps ask for no forgotten state."""
-    config = OptionConfig(**(QUICK | BEGIN | {"replay": 300, "n_step": 7}))
+    config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 300, "n_step": 7}))
     smallest = LightLearner.reach(config, 2)
     slow = {"update_interval": 32, "option_batch": 300}  # few updates, each with most of the replay
     learned(LightLearner, 2000, memory=smallest, replay=300, n_step=7, option_timeout=9, **slow)
@@ -246,7 +245,7 @@ def test_the_paper_network_learns_from_pictures() -> None:
 @pytest.mark.usefixtures("small_gru")
 def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
     """Spec D3: members of the paper's kind share the engine's memory; executions that are gone are not replayed."""
-    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 100, "option_timeout": 4}))
+    config = OptionConfig.of(**(QUICK | BEGIN | {"network": "paper", "replay": 100, "option_timeout": 4}))
     config = config.model_copy(update={"warm_up": 100_000, "option_batch": 4})
     engine = LongCorridor(4, memory=240)
     verdicts = oracle_terminations(engine, (0, 1))
@@ -265,7 +264,9 @@ def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
 def test_an_execution_whose_beginning_was_overwritten_is_not_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2, D3: five steps of an execution, then five of the next in a replay of eight: only those are unrolled."""
     engine = LongCorridor(1)
-    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 8, "option_timeout": 5}))
+    config = OptionConfig.of(**(QUICK | BEGIN | {"network": "paper", "option_timeout": 5})).model_copy(
+        update={"replay": 8}
+    )
     learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
     states = [int(engine.ids[0]), *(int(engine.step(np.array([STAY])).next_ids[0]) for _ in range(10))]
     for begin in (0, 5):
@@ -283,7 +284,9 @@ def test_an_execution_whose_beginning_was_overwritten_is_not_replayed(monkeypatc
 def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D1, D2: reward 1 there, and no value of what lies behind, though the episode goes on."""
     engine = LongCorridor(1)
-    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 8, "option_timeout": 5}))
+    config = OptionConfig.of(**(QUICK | BEGIN | {"network": "paper", "option_timeout": 5})).model_copy(
+        update={"replay": 8}
+    )
     learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
     middle, beside, end = int(engine.ids[0]), *(int(engine.step(np.array([LEFT])).next_ids[0]) for _ in range(2))
     learner._store(0, [(middle, LEFT, beside, False, False, False), (beside, LEFT, end, False, False, True)])
@@ -324,7 +327,7 @@ def test_even_choice_gives_every_option_as_many_steps() -> None:
     """Spec D4: option 0 takes 2 steps each time, option 1 its full 10; uniform choice would give it 5 of 6 steps."""
     engine = LongCorridor(4)
     recorder = Recorder(2, engine)
-    config = OptionConfig(**(BEGIN | {"option_timeout": 10}))
+    config = OptionConfig.of(**(BEGIN | {"option_timeout": 10}))
     verdicts = oracle_terminations(engine, (0, 1))
     chooser = EvenChooser(2, np.random.default_rng(0))
     loop = OptionLoop(engine, verdicts, Script([LEFT] * 1000), chooser, recorder, config, 1.0)
