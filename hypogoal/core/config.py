@@ -272,9 +272,13 @@ def _with_parts(model: type[C], values: Mapping[str, Any] | None = None) -> type
 
 
 @cache
-def _joined(model: type[C], *parts: type[Config]) -> type[C]:
-    bases: Any = (model, *(part for part in parts if not issubclass(model, part)))
-    return model if bases == (model,) else create_model(model.__name__, __base__=bases, __doc__=model.__doc__)
+def _joined(model: type[C], *parts: type[Config]) -> Any:
+    bases: list[Any] = []
+    for base in (model, *parts):
+        others = {model, *parts} - {base}
+        if not any(issubclass(other, base) for other in others):
+            bases.append(base)
+    return bases[0] if len(bases) == 1 else create_model(model.__name__, __base__=tuple(bases), __doc__=model.__doc__)
 
 
 def _choices_with(model: type[Config], name: str) -> list[str]:
