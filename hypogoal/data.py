@@ -411,11 +411,13 @@ def open_dataset(path: Path) -> Dataset:
     return dataset
 
 
-def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, NDArray[np.int64]]]:
+def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, Integers]]:
     """The unlabelled states (M, *obs) of some files one after another, and the origins that all files have."""
     datasets = [open_dataset(file) for file in files]
     states = [dataset.unlabelled() for dataset in datasets]
     origins = [dataset.unlabelled_origins() for dataset in datasets]
     shared = set.intersection(*map(set, origins))
-    together = {name: np.concatenate([each[name] for each in origins]) for name in sorted(shared)}
+    together = {}
+    for name in sorted(shared):
+        together[name] = np.concatenate([each[name] for each in origins])
     return states[0] if len(states) == 1 else np.concatenate(states), together
