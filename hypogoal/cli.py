@@ -322,7 +322,7 @@ def config(
     """List every setting of a stage: default, unit, meaning, source."""
     from hypogoal.core.config import TABLES, as_toml, described
     from hypogoal.core.files import replace_text
-    from hypogoal.domains.base import layers_of
+    from hypogoal.domains.base import layers_of, load_domain
     from hypogoal.experiments.run import config_class_of
 
     if stage is None:
@@ -330,6 +330,8 @@ def config(
         echo(list(TABLES), as_json, [f"{name:15}{helps[name]}" for name in TABLES])
         return
     rows = described(config_class_of(stage, domain), *layers_of(stage, domain, preset))
+    if not load_domain(domain).starts:
+        rows = [row for row in rows if row["name"] != "start"]  # it would be refused
     if write is None:
         echo(rows, as_json, _setting_lines(rows))
         return

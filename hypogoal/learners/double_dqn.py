@@ -11,6 +11,8 @@ from torch.nn.utils import clip_grad_norm_
 
 from hypogoal.core.errors import NumericalError
 
+SOFT = 0.01  # how far a target network follows at an update where it is not copied now and then
+
 
 def double_q_targets(
     rewards: Tensor,
@@ -44,6 +46,13 @@ def double_q_targets(
 
 
 @torch.no_grad()
+def target_rate(updates: int, interval: int) -> float:
+    """How far the target network follows after so many updates: all the way every ``interval``; 0: a little at each."""
+    if interval == 0:
+        return SOFT
+    return 1.0 if updates % interval == 0 else 0.0
+
+
 def follow(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
     """Move a target network's tensors towards the online network's by ``tau``; integers, and all at 1, are copied."""
     for ours, theirs in zip(target, online, strict=True):

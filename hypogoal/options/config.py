@@ -50,8 +50,12 @@ class LearnerConfig(OptionConfig):
     update_interval: int = setting(16, "environment steps per update", unit="steps", source="paper: 4", low=1)
     option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
     option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
-    target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
-    target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
+    target_interval: int = setting(
+        0,
+        "updates between two copies of the network into the target network; 0: it follows by 1 % at each update",
+        source="0: ours; paper: 10",
+        low=0,
+    )
     exploration: str = setting(
         "independent",
         "how long a random action lasts: one step, or several",
@@ -77,7 +81,6 @@ class LightConfig(LearnerConfig):
         "network's layers, by name or as module:function",
         source="ours",
     )
-    positives: float = setting(0.25, "share of a batch that reached a sub-goal", low=0.0, high=1.0)
     n_step: int = setting(
         1,
         "steps of an n-step return, within one execution (experience=own)",

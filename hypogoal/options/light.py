@@ -20,7 +20,7 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import below, load_fitting, load_into
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
-from hypogoal.learners.double_dqn import descend, double_q_targets, follow
+from hypogoal.learners.double_dqn import descend, double_q_targets, follow, target_rate
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Ids
@@ -36,6 +36,7 @@ from hypogoal.options.networks import (
 )
 
 POSITIVES_KEPT = 512  # per member
+POSITIVE_SHARE = 0.25  # of a batch: steps that reached a sub-goal
 GRADIENT_NORM = 10.0
 
 
@@ -137,7 +138,7 @@ class LightLearner(Learner):
             kept &= self.engine.remembers(self.positive.state) & self.engine.remembers(self.positive.next_state)
         counts = kept.sum(1)
         have = np.flatnonzero(counts)
-        extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
+        extra = round(self.config.option_batch * POSITIVE_SHARE) if len(have) else 0
         extra = min(extra, self.config.option_batch - 1)  # priorities need one drawn by them
         indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
         batch = self.replay.data.at(indices)
@@ -201,8 +202,8 @@ class LightLearner(Learner):
         where = f"in the batch of update {self.updates}, step {self.steps}"
         descend(loss, self.online, self.optimiser, owner, where, GRADIENT_NORM)
         self.updates += 1
-        if self.updates % self.config.target_interval == 0:
-            follow(self.target.parameters(), self.online.parameters(), self.config.target_tau)
+        if rate := target_rate(self.updates, self.config.target_interval):
+            follow(self.target.parameters(), self.online.parameters(), rate)
 
     def weights(self) -> dict[str, Tensor]:
         return {f"online.{name}": value for name, value in self.online.state_dict().items()}

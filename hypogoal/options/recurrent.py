@@ -22,7 +22,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import below, load_fitting, load_into
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import descend, double_q_targets, follow
+from hypogoal.learners.double_dqn import descend, double_q_targets, follow, target_rate
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options.choosers import Ids
@@ -187,10 +187,10 @@ class RecurrentLearner(Learner):
         where = f"in the batch of its update {member.updates}, its step {self.option_steps[option]}"
         descend(loss, member.online, member.optimiser, f"option {option}", where)
         member.updates += 1
-        if member.updates % config.target_interval == 0:
+        if rate := target_rate(member.updates, config.target_interval):
             networks = (member.target, member.online)
             target, online = ([*network.parameters(), *network.buffers()] for network in networks)
-            follow(target, online, config.target_tau)
+            follow(target, online, rate)
         member.replay.set_priorities(indices, error.detach().abs().cpu().numpy())
         return float(loss.detach())
 

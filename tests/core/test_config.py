@@ -34,10 +34,7 @@ PRESETS = Path(hypogoal.__file__).parent / "presets"
 
 
 class Example(Config):
-    """What a stage may have.
-
-    More of it.
-    """
+    """What a stage may have. More of it."""
 
     steps: int = setting(10, "steps", unit="steps", source="Table 1", low=1, high=1000)
     rate: float = setting(0.5, "rate", low=0.0)
@@ -79,9 +76,6 @@ def test_texts_become_values() -> None:
     values = {"steps": 1000, "rate": 1e-3, "on": False, "seeds": (3, 5, 6, 7, 4), "names": ()}
     assert config == Example(**values, code="mine:Class", kind="b")
     assert resolved("steps=3e2").steps == 300 and isinstance(resolved("steps=3e2").steps, int)
-    assert resolved("steps=7.0", "seeds=").model_dump(mode="json") | {"seeds": []} == resolved(
-        "steps=7", "seeds="
-    ).model_dump(mode="json")
     assert integers("0-3,7") == [0, 1, 2, 3, 7]
 
 
@@ -128,13 +122,10 @@ def test_no_text_crashes_the_parser(text: str) -> None:
         assert lines == 0
 
 
-@pytest.mark.parametrize("text", ["steps", "=3", ""])
-def test_set_is_a_key_and_a_value(text: str) -> None:
-    with pytest.raises(UserError, match="--set needs key=value"):
-        assigned([text])
-
-
-def test_what_is_no_list_of_integers_is_one_line() -> None:
+def test_what_is_no_assignment_or_no_list_is_refused() -> None:
+    for text in ("steps", "=3", ""):
+        with pytest.raises(UserError, match="--set needs key=value"):
+            assigned([text])
     with pytest.raises(UserError, match=r"not integers: '3-'. Write them as 0-3,7\."):
         integers("3-")
 
@@ -251,7 +242,7 @@ def test_the_paper_preset_has_the_papers_tables() -> None:
     assert (ensemble.l2_weight, ensemble.batch_size) == (1e-4, 64)
     assert (ensemble.class_weight_negative, ensemble.class_weight_positive) == (0.5, 0.5)
     meta = settings_of("train-meta", "doorkey", "paper")
-    assert (meta.replay, meta.update_interval, meta.target_interval, meta.target_tau) == (100_000, 4, 10, 1.0)
+    assert (meta.replay, meta.update_interval, meta.target_interval) == (100_000, 4, 10)
     assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
     assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
     assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.01, 0.97, 64, 10)
@@ -274,4 +265,4 @@ def test_the_paper_preset_has_the_papers_ladders() -> None:
 
 def test_stages_have_no_more_settings_than_a_reader_can_take() -> None:
     counts = {stage: len(described(model_of(stage))) for stage in MODELS}
-    assert counts["train-ensemble"] <= 18
+    assert counts["train-ensemble"] <= 18 and counts["train-options"] <= 34 and counts["train-meta"] <= 41

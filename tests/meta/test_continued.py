@@ -123,8 +123,7 @@ def test_a_continued_paper_learner_fills_its_replay_first() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"positives": 1.0},
-        {"option_batch": 1, "positives": 0.6},
+        {"option_batch": 1},
         {"warm_up": 1, "n_step": 10, "update_interval": 1, "experience": "own", "mask_reached": False},
     ],
 )

@@ -231,7 +231,7 @@ def test_the_paper_learner_learns_both_options() -> None:
     """
     learner = run_corridor(
         RecurrentLearner, 1600, experience="own", network="paper", option_batch=16, option_gamma=0.9,
-        target_tau=1.0, target_interval=5, option_learning_rate=1e-3,
+        target_interval=5, option_learning_rate=1e-3,
     )  # fmt: skip
     assert greedy(learner) == [[2, 1, 0], [2, 3, 4, 5]]
 

@@ -205,7 +205,7 @@ def test_a_replay_longer_than_the_memory_is_refused(learner_class: type) -> None
 def test_forgotten_states_are_not_learned_from() -> None:
     """Spec D3: positives from long ago are kept by id; once their pictures are gone they are not drawn again."""
     engine = LongCorridor(4, memory=400)
-    config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 200, "n_step": 3, "positives": 0.5}))
+    config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 200, "n_step": 3}))
     verdicts = oracle_terminations(engine, (0, 1))
     learner = LightLearner(engine, verdicts, config, 0)
     recorder, chooser = Recorder(2, engine), RandomChooser(np.random.default_rng(0))
