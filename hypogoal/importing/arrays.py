@@ -1,7 +1,5 @@
 """NumPy arrays: a ``.npz`` file, or a folder of ``.npy`` files with the same names."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

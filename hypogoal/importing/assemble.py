@@ -1,7 +1,5 @@
 """Users' states, checked and split into the sets of a data file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """From what users have to a data file (Spec B6)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path

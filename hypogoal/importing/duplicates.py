@@ -1,7 +1,5 @@
 """Labels of equal and nearly equal states: contradictions, and held-out pictures that are hardly new."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -71,22 +69,21 @@ def near_duplicates(
     if labelled.observations.dtype != PICTURE:
         return []
     known, tests = _Sketched(labelled, names[0]), _Sketched(heldout, names[1])
-    lines = []
-    text = _near(
-        tests, known, np.arange(len(tests.names)), np.arange(len(known.names)), "held-out pictures", "labelled one"
-    )
-    if text:
-        lines.append(f"{text}: scores on them say little about new ones")
+    every = np.arange(len(tests.names)), np.arange(len(known.names))
+    said = [
+        _near(tests, known, *every, "held-out pictures", "labelled one", "scores on them say little about new ones")
+    ]
     for goal, column in zip(goals, known.labels.T, strict=True):
         equal = np.isin(known.looks, np.intersect1d(known.looks[column], known.looks[~column]))
         positives, negatives = np.flatnonzero(column & ~equal), np.flatnonzero(~column & ~equal)
-        text = _near(known, known, positives, negatives, f"positives of {goal}", "negative")
-        if text:
-            lines.append(f"{text}: are their labels right?")
-    return lines
+        of_goal = f"positives of {goal}", "negative", "are their labels right?"
+        said.append(_near(known, known, positives, negatives, *of_goal))
+    return [line for line in said if line]
 
 
-def _near(some: _Sketched, others: _Sketched, rows: Integers, other_rows: Integers, kind: str, other: str) -> str:
+def _near(
+    some: _Sketched, others: _Sketched, rows: Integers, other_rows: Integers, kind: str, other: str, so: str
+) -> str:
     """How many of some pictures nearly equal one of the others, and a pair of them; empty if none does."""
     from scipy.spatial import KDTree
 
@@ -98,4 +95,4 @@ def _near(some: _Sketched, others: _Sketched, rows: Integers, other_rows: Intege
     if not len(near):
         return ""
     pair = f"{some.names[rows[near[0]]]} and {others.names[other_rows[nearest[near[0]]]]}"
-    return f"{len(near)} of {len(rows)} {kind} nearly equal a {other}, such as {pair} ({RULE})"
+    return f"{len(near)} of {len(rows)} {kind} nearly equal a {other}, such as {pair} ({RULE}): {so}"

@@ -4,8 +4,6 @@ A reader is a generator of :class:`Recording`; choosing keys and frames, labelli
 once, here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

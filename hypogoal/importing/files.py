@@ -1,7 +1,5 @@
 """Files that other programs wrote: which there are, and why one cannot be read."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Frames of films, by PyAV (``hypogoal[lerobot]``): of the first moving stream, turned as players turn it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What labels states: the rules of ``--label`` for episodes, and tables that people fill in (Spec I6)."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from functools import partial

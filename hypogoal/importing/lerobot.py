@@ -4,8 +4,6 @@ In v2.1 each episode has files of its own, in v3.0 many episodes share files, an
 film an episode begins. The package lerobot is not needed, pyarrow and PyAV are (``hypogoal[lerobot]``).
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -71,7 +69,8 @@ def _listed(source: Path, version: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     if version.startswith("v2"):
         with reading(file, DO):
-            rows += map(json.loads, file.read_text(encoding="utf-8-sig").splitlines())
+            lines = file.read_text(encoding="utf-8-sig").splitlines()
+            rows += map(json.loads, filter(str.strip, lines))
     for table in sorted((source / EPISODES).glob("*/*.parquet")):
         rows += _table(table).to_pylist()
     if not rows:

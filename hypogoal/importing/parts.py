@@ -1,7 +1,5 @@
 """States as users bring them, unchecked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias

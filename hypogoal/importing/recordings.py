@@ -1,7 +1,5 @@
 """Readers of recorded episodes: Minari, LeRobotDataset, robomimic's HDF5, folders of films (Spec I6)."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """What is taken for what: states as read become pictures or numbers, key by key (the table in docs/own-domain.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -75,29 +75,27 @@ def columns(episode: int, first: int) -> dict[str, Any]:
 
 
 def facts(version: str, kind: str) -> dict[str, Any]:
-    """``meta/info.json``."""
-    cameras = {
-        key: {"dtype": kind, "shape": [*SIDES[key.rpartition(".")[2]], 3], "names": ["height", "width", "channels"]}
-        for key in (TOP, WRIST)
-    }
-    one = {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in {
-        "timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
-        "task_index": "int64", "next.reward": "float32", "next.success": "bool",
-    }.items()}  # fmt: skip
-    numbers = {STATE: {"dtype": "float32", "shape": [3], "names": ["a", "b", "c"]}}
-    numbers |= {"action": {"dtype": "float32", "shape": [2], "names": ["x", "y"]}}
+    """``meta/info.json``: what of it is read."""
+    features = {key: {"dtype": kind, "shape": [*SIDES[key.rpartition(".")[2]], 3]} for key in (TOP, WRIST)}
+    features |= {STATE: {"dtype": "float32", "shape": [3]}, "action": {"dtype": "float32", "shape": [2]}}
+    for name in ("timestamp", "next.reward"):
+        features[name] = {"dtype": "float32", "shape": [1]}
+    for name in ("frame_index", "episode_index", "index", "task_index"):
+        features[name] = {"dtype": "int64", "shape": [1]}
+    features["next.success"] = {"dtype": "bool", "shape": [1]}
+    files = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+    episodes = "episode_{episode_index:06d}"
     new = version == "v3.0"
-    paths = {
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    return {
+        "codebase_version": version,
+        "fps": FPS,
+        "chunks_size": 1000,
+        "features": features,
+        "data_path": f"data/{files}.parquet" if new else f"data/chunk-{{episode_chunk:03d}}/{episodes}.parquet",
+        "video_path": f"videos/{{video_key}}/{files}.mp4"
         if new
-        else "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-        if new
-        else "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+        else f"videos/chunk-{{episode_chunk:03d}}/{{video_key}}/{episodes}.mp4",
     }
-    totals = {"total_episodes": len(LENGTHS), "total_frames": sum(LENGTHS), "total_tasks": 1, "chunks_size": 1000}
-    about = {"codebase_version": version, "robot_type": "so100", "fps": FPS, "splits": {"train": f"0:{len(LENGTHS)}"}}
-    return {**about, **totals, **paths, "features": {**cameras, **numbers, **one}}
 
 
 def cells(camera: str, episode: int) -> pa.Array:

@@ -29,7 +29,7 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     data = folder / "data.h5"
     said = run("import", tmp_path / "own.npz", "--out", data, "--sub-goal", "at-right")
-    assert said.out.startswith("taken for pictures, 48 x 48 x 3 uint8\n") and not said.err
+    assert said.out.startswith("states: taken for pictures, 48 x 48 x 3 uint8\n") and not said.err
     found = open_dataset(data)
     np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
     assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
@@ -38,16 +38,6 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     run("evaluate", folder, "-q")
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     assert metrics["hypotheses"][0]["worst"]["mean"] > 0.9
-
-
-def test_options_of_states_of_no_domain_are_refused(tmp_path: Path) -> None:
-    """Spec B6, G2: what to do is said: which domain the states are of is told when they are imported."""
-    np.savez(tmp_path / "own.npz", **arrays())
-    run("import", tmp_path / "own.npz", "--out", tmp_path / "data.h5", "-q")
-    few = settings("steps=2", "members=1")
-    run("train-ensemble", tmp_path / "data.h5", "--out", tmp_path / "ensemble", "-q", *few)
-    command = ["train-options", tmp_path / "ensemble", "--out", tmp_path / "options", "-q"]
-    refuses("the domain of these imported states is not known: imported. Import them again with --domain", *command)
 
 
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:

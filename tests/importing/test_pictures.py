@@ -3,122 +3,24 @@
 from __future__ import annotations
 
 import io
-import struct
-import zlib
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from command_line import refuses, run
 from PIL import Image
 
-from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.importing.pictures import picture_of, read_pictures
+from hypogoal.importing.pictures import read_pictures
 from hypogoal.importing.taken import Taking
 from tests.importing.states import SIDE, arrays, pictures, save_minari, save_pictures
-
-UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
-HERE = Path("x.png")
-# How a picture is stored, by its EXIF orientation; and what a player's display matrix has of each.
-STORED = {
-    1: UPRIGHT,  # row 0 is at the top, column 0 at the left
-    2: UPRIGHT[:, ::-1],  # top, right
-    3: UPRIGHT[::-1, ::-1],  # bottom, right
-    4: UPRIGHT[::-1],  # bottom, left
-    5: UPRIGHT.swapaxes(0, 1),  # left, top
-    6: UPRIGHT[:, ::-1].swapaxes(0, 1),  # right, top
-    7: UPRIGHT[::-1, ::-1].swapaxes(0, 1),  # right, bottom
-    8: UPRIGHT[::-1].swapaxes(0, 1),  # left, bottom
-}
 
 
 def saved(values: np.ndarray, kind: str = "PNG", **more: Any) -> bytes:
     file = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(values)).save(file, kind, **more)
     return file.getvalue()
-
-
-def deep_png(values: np.ndarray) -> bytes:
-    """A PNG of 16 bits a channel, which Pillow does not write: values uint16 (H, W, C)."""
-    height, width, channels = values.shape
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    facts = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
-    chunks = [(b"IHDR", facts), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    parts = [
-        struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part)) for name, part in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
-
-
-def exif_of(orientation: int, order: str = "<") -> bytes:
-    """EXIF with one entry, in either order of bytes."""
-    head = {"<": b"II", ">": b"MM"}[order] + struct.pack(f"{order}HI", 42, 8)
-    return b"Exif\0\0" + head + struct.pack(f"{order}HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
-
-
-def check_upright(data: bytes, wanted: np.ndarray, off: int = 0) -> None:
-    seen = picture_of(data, HERE)
-    assert seen.shape == wanted.shape
-    assert np.abs(seen.astype(int) - wanted)[4::16, 4::16].max() <= off  # away from edges, which JPEG smears
-
-
-@pytest.mark.parametrize("orientation", STORED)
-def test_a_picture_is_upright(orientation: int) -> None:
-    """Spec B6: as the EXIF orientation says, in all formats that have it, in colour and grey."""
-    stored, grey = STORED[orientation], UPRIGHT[..., :1]
-    exif = exif_of(orientation, "<>"[orientation % 2])
-    check_upright(saved(stored, exif=exif), UPRIGHT)
-    check_upright(saved(stored[..., 0], exif=exif), grey)
-    check_upright(saved(stored, "JPEG", exif=exif, quality=95), UPRIGHT, 40)
-    check_upright(saved(stored[..., 0], "JPEG", exif=exif, quality=95), grey, 40)
-    check_upright(saved(stored, "WEBP", exif=exif, lossless=True), UPRIGHT)
-    check_upright(
-        saved(np.asarray(Image.fromarray(np.ascontiguousarray(stored)).quantize(15).convert("RGB")), exif=exif), UPRIGHT
-    )
-    chunk = exif[6:]
-    chunk = struct.pack(">I", len(chunk)) + b"eXIf" + chunk + struct.pack(">I", zlib.crc32(b"eXIf" + chunk))
-    plain = saved(stored)
-    check_upright(plain[:-12] + chunk + plain[-12:], UPRIGHT)  # behind the pixels
-
-
-def test_an_orientation_that_is_none_is_ignored() -> None:
-    """Spec G2: of no known value, or in metadata that are damaged, as viewers do."""
-    for exif in (
-        exif_of(0),
-        exif_of(9),
-        exif_of(65_535),
-        b"",
-        b"Exif\0\0II*\0\xff\xff\xff\xff",
-        exif_of(6)[:18],
-        b"nonsense",
-    ):
-        check_upright(saved(UPRIGHT, exif=exif), UPRIGHT)
-        check_upright(saved(UPRIGHT, "JPEG", exif=exif, quality=95), UPRIGHT, 40)
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_of_16_bits_the_upper_ones_are_taken(channels: int) -> None:
-    """Spec B6: the file says how deep it is, not the library; values of 12 bits would leave 16 levels."""
-    values = np.random.default_rng(0).integers(0, 1 << 16, (9, 7, channels)).astype(np.uint16)
-    if channels in (2, 4):
-        values[..., -1] = 65_535
-    seen = picture_of(deep_png(values), HERE)
-    colours = values[..., :1] if channels < 3 else values[..., :3]
-    np.testing.assert_array_equal(seen, np.broadcast_to(colours >> 8, seen.shape))
-    with pytest.raises(UserError, match="of the picture's 16 bits a channel the upper ones are unused"):
-        picture_of(deep_png(np.where(values == 65_535, values, values >> 4)), HERE)
-
-
-def test_of_several_pictures_the_first_is_taken() -> None:
-    frames = [Image.new("L", (SIDE, SIDE), value) for value in (90, 180, 0)]
-    for kind in ("GIF", "PNG", "WEBP", "TIFF"):
-        file = io.BytesIO()
-        frames[0].save(file, kind, save_all=True, append_images=frames[1:])
-        seen = picture_of(file.getvalue(), HERE)
-        assert seen.shape[:2] == (SIDE, SIDE) and np.unique(seen).tolist() == [90], kind
 
 
 def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
@@ -131,7 +33,7 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     for data, said in (
         (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size: positive/zz.png is (48, 20, 3)"),
         (b"no image", "this cannot be read"),
-        (saved(UPRIGHT)[:200], "this cannot be read"),
+        (saved(pictures(1)[0][0])[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
         (clear, "the picture is transparent in places"),
         (palette.getvalue(), "the picture is transparent in places"),
@@ -249,8 +151,8 @@ def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path) -> None:
         "montezuma",
     ]
     said = run(*given)
-    [line] = [line for line in said.err.splitlines() if "--resize" in line]
+    [line] = [line for line in said.out.splitlines() if "--resize" in line]
     assert "pictures of 240 x 192 x 3 need much memory and time; add --resize 160 --force" in line
-    assert "--resize" not in run(*given, *line.partition("add ")[2].split()).err
+    assert "--resize" not in run(*given, *line.partition("add ")[2].split()).out
     after = open_dataset(tmp_path / "data.h5")
     assert after.observation_shape == (160, 128, 3) and after.domain == "montezuma"

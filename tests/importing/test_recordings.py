@@ -11,23 +11,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import h5py
 import numpy as np
 import pytest
 from command_line import refuses, run
 
-from hypogoal.cli import main
 from hypogoal.data import Dataset, open_dataset
 from hypogoal.importing.episodes import kept, split_episodes
 from hypogoal.importing.films import count_frames, frames_at
 from tests.importing import robot_data
 from tests.importing.robot_data import LENGTHS, STATE, TOP, WRIST
 from tests.importing.states import SIDE, save_minari
-from tests.importing.test_pictures import STORED, UPRIGHT
+from tests.importing.test_odd import turned
 
 FORMATS = [("v2.1", "video"), ("v3.0", "video"), ("v2.1", "image"), ("v3.0", "image")]
 LABEL = ["--label", "reached=next.success"]
+UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
 RIGHT = ["--label", "right=tests.importing.states:at_right"]
 
 
@@ -77,21 +76,6 @@ def test_a_lerobot_dataset_is_read_frame_by_frame(datasets: Path, tmp_path: Path
     held = {robot_data.episode_of(state[WRIST]) for state in data.heldout("reached").observations}
     learned = {robot_data.episode_of(state[WRIST]) for state in data.labelled("reached").observations}
     assert held and learned and not held & learned
-
-
-@pytest.mark.parametrize("codec", ["libsvtav1", "libx264"])
-def test_films_of_any_codec_hold_the_same_frames(datasets: Path, tmp_path: Path, codec: str) -> None:
-    """LeRobot writes AV1 by default; the pictures are those of the table, up to compression."""
-    if codec not in av.codecs_available:
-        pytest.skip(f"this build of FFmpeg has no {codec}")
-    source = robot_data.write_lerobot(tmp_path / "source", codec=codec)
-    ours = frames_of(imported(source, tmp_path / "ours.h5", *LABEL))
-    exact = frames_of(imported(datasets / "v3.0-image", tmp_path / "exact.h5", *LABEL))
-    for (state, label), (whole, wanted) in zip(ours, exact, strict=True):
-        np.testing.assert_array_equal(state[STATE], whole[STATE])
-        assert label == wanted
-        for key in (TOP, WRIST):
-            assert np.abs(state[key].astype(int) - whole[key].astype(int)).mean() < 4
 
 
 def test_keys_are_chosen_and_one_picture_alone_is_a_picture(datasets: Path, tmp_path: Path) -> None:
@@ -202,8 +186,8 @@ def is_unsure(_: np.ndarray) -> Any:
 
 
 def write_turned(path: Path, orientation: int) -> None:
-    """A film of two frames whose pixels lie as :data:`STORED` says, with the display matrix that turns them back."""
-    stored = np.ascontiguousarray(STORED[orientation])
+    """A film of two frames that lie as :func:`turned` puts them, and the display matrix that turns them back."""
+    stored = np.ascontiguousarray(turned(UPRIGHT, orientation))
     robot_data.write_film(path, [stored, stored])
     matrix = {
         1: (1, 0, 0, 1), 2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1),
@@ -216,7 +200,7 @@ def write_turned(path: Path, orientation: int) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("orientation", STORED)
+@pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_film_is_turned_as_players_turn_it(tmp_path: Path, orientation: int) -> None:
     write_turned(tmp_path / "x.mp4", orientation)
     assert count_frames(tmp_path / "x.mp4") == 2
@@ -280,9 +264,9 @@ def info(key: str = "", **changes: object) -> Callable[[Path], None]:
     return work
 
 
-def other_film(camera: str, count: int, fps: int = robot_data.FPS) -> Callable[[Path], None]:
+def other_film(camera: str, count: int) -> Callable[[Path], None]:
     frames = [robot_data.picture(camera, 0.5, 0)] * count
-    return lambda folder: robot_data.write_film(folder / f"videos/{TOP}/chunk-000/file-000.mp4", frames, fps)
+    return lambda folder: robot_data.write_film(folder / f"videos/{TOP}/chunk-000/file-000.mp4", frames)
 
 
 FILM = f"videos/{WRIST}/chunk-000/file-001.mp4"
@@ -294,19 +278,12 @@ TABLE, LIST = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-0
     [
         (without(FILM), "no such file"),
         (cut(FILM), "file-001.mp4"),  # which cannot be read, or whose frames do not match the table
-        (cut(FILM, 0), "this cannot be read"),
         (other_film("top", 5), " s: its frames do not match the table"),
-        (other_film("top", 60, 3), " s: its frames do not match the table"),
         (other_film("wrist", 60), "states differ in size"),
         (cut(TABLE), "this cannot be read"),
-        (without(TABLE), "no such file"),
-        (cut(LIST), "this cannot be read"),
         (without(LIST), "the list of episodes is empty"),
         (cut("meta/info.json"), "this cannot be read"),
         (info(codebase_version="v1.6"), "the format v1.6 is not read"),
-        (info(features=[1]), "this cannot be read"),
-        (info(fps=0), "this cannot be read"),
-        (info(data_path="{nothing}"), "this cannot be read"),
         (info(STATE, shape=[4]), "this cannot be read"),
         (info(STATE, dtype="string"), "no observation 'observation.state'"),
     ],
@@ -327,10 +304,7 @@ def test_a_damaged_dataset_is_one_line(
     [
         ("episode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
         ("episode,from,to\n0,0,99\n", "a label is of frames '0' up to '99', episode 0 has 12"),
-        ("episode,from,to\n0,5,2\n", "frames '5' up to '2'"),
         ("episode,from,to\n0,a,2\n", "frames 'a' up to '2'"),
-        ("episode,from,to\n0,1\n", "frames '1' up to ''"),
-        ("take,begin\n0,1\n", "has no column 'episode'"),
         ("episode;from;to\n0;1;2\n", "Give a CSV file, with commas"),
         ("\ufeffepisode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
         ("episode,from,to\n0,1,2\n", "1 episodes cannot be labelled, held out"),
@@ -384,31 +358,6 @@ def test_what_is_wrong_with_minari_is_one_line(
 ) -> None:
     folder = save_minari(tmp_path / "own-v0", **settings)
     refuses(said, "import", folder, "--out", tmp_path / "data.h5", *words)
-
-
-@pytest.mark.parametrize("source", ["v2.1-video", "v3.0-image", "demo.hdf5", "takes"])
-def test_whatever_is_damaged_is_read_or_refused(
-    datasets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str
-) -> None:
-    """Spec G2: bytes changed, cut off or doubled anywhere: a data file, or one line and none."""
-    outcomes = set()
-    for case in range(12):
-        rng, place = np.random.default_rng(case), tmp_path / f"{case}-{source}"
-        (shutil.copytree if (datasets / source).is_dir() else shutil.copy)(datasets / source, place)
-        files = sorted(file for file in ([place] if place.is_file() else place.rglob("*")) if file.is_file())
-        damaged = files[int(rng.integers(len(files)))]
-        values = bytearray(damaged.read_bytes())
-        for at in rng.integers(len(values), size=int(rng.choice((1, 8, 64)))):
-            values[at] = int(rng.integers(256))
-        damaged.write_bytes(values[: int(rng.integers(len(values)))] if case % 3 == 0 else values)
-        label = {"demo.hdf5": "a=rewards", "takes": f"a={place / 'labels.csv'}"}.get(source, "a=next.reward")
-        out = tmp_path / f"{case}.h5"
-        code = main(["import", str(place), "--out", str(out), "--label", label, "--resize", "48", "-q"])
-        lines = capsys.readouterr().err.splitlines()
-        outcomes.add(code)
-        assert (code, out.exists()) in ((0, True), (2, False)), lines
-        assert code == 0 or (len(lines) == 1 and lines[0].startswith("hypogoal: ")), lines
-    assert 2 in outcomes, "nothing was refused: are the files damaged at all?"
 
 
 def test_the_extra_is_named_where_it_is_missing(
