@@ -32,7 +32,7 @@ def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
     from hypogoal.core.config import TABLES, described
     from hypogoal.domains.base import BUILT_IN, layers_of
-    from hypogoal.experiments.run import config_class_of
+    from hypogoal.experiments.named import config_class_of
 
     lines = [
         "# Settings",

@@ -323,7 +323,7 @@ def config(
     from hypogoal.core.config import TABLES, as_toml, described
     from hypogoal.core.files import replace_text
     from hypogoal.domains.base import layers_of, load_domain
-    from hypogoal.experiments.run import config_class_of
+    from hypogoal.experiments.named import config_class_of
 
     if stage is None:
         helps = STAGES | {"run": "Run all cells of an experiment."}

@@ -15,7 +15,7 @@ from toy_data import reseal
 import hypogoal
 from hypogoal.core.config import MODELS, described
 from hypogoal.data import open_dataset
-from hypogoal.experiments.run import config_class_of
+from hypogoal.experiments.named import config_class_of
 
 
 def test_steps_of_both_stages_count(tiny_run: Path) -> None:

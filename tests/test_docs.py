@@ -83,7 +83,7 @@ def test_the_reference_is_that_of_the_code(site: Path) -> None:
     """Every command and every setting of every stage is in the reference."""
     from hypogoal.cli import commands as made_commands
     from hypogoal.core.config import STAGES, described
-    from hypogoal.experiments.run import config_class_of
+    from hypogoal.experiments.named import config_class_of
 
     pages = {name: (site / f"reference/{name}.html").read_text(encoding="utf-8") for name in ("cli", "settings")}
     for name in made_commands():

@@ -2,8 +2,11 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from hypogoal.core.config import DOMAIN, MODELS, STAGES, model_of
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import load_domain
 from hypogoal.experiments.choosing import choosing
 from hypogoal.experiments.doorkey import doorkey
 from hypogoal.experiments.experiment import Experiment, load_experiment, read_toml
@@ -38,3 +41,17 @@ def find_experiment(name: str, preset: str | None) -> tuple[Experiment, str | No
         return load_experiment(name), preset, {}
     do = f"Choose one of {', '.join(NAMES)}, or give a .toml file or module:function."
     raise UserError("unknown experiment", name, do)
+
+
+def config_class_of(stage: str, domain: str = DOMAIN) -> Any:
+    """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
+    if stage == "collect":
+        return load_domain(domain).config_class
+    if stage == "run":
+        for name, experiment in EXPERIMENTS.items():
+            if domain == experiment.domain and name != "choosing":
+                return experiment.model
+        raise UserError("no experiment uses this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
+    if stage not in MODELS:
+        raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}, run.")
+    return model_of(stage)

@@ -10,25 +10,11 @@ from hypogoal.core.config import DOMAIN, MODELS, STAGES, assigned, described, mo
 from hypogoal.core.config import preset as read_preset
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import allow
-from hypogoal.domains.base import layers_of, load_domain, settings_of
+from hypogoal.domains.base import layers_of, settings_of
 from hypogoal.experiments import slurm
-from hypogoal.experiments.named import EXPERIMENTS, find_experiment
+from hypogoal.experiments.named import find_experiment
 from hypogoal.experiments.results import write_results
 from hypogoal.experiments.sweep import Cell, begin, cells_of, read_plan, run_local
-
-
-def config_class_of(stage: str, domain: str = DOMAIN) -> Any:
-    """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
-    if stage == "collect":
-        return load_domain(domain).config_class
-    if stage == "run":
-        for name, experiment in EXPERIMENTS.items():
-            if domain == experiment.domain and name != "choosing":
-                return experiment.model
-        raise UserError("no experiment uses this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
-    if stage not in MODELS:
-        raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}, run.")
-    return model_of(stage)
 
 
 def plan(

@@ -28,7 +28,7 @@ from hypogoal.core.config import (
 )
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import defaults_of, layers_of, settings_of
-from hypogoal.experiments.run import config_class_of
+from hypogoal.experiments.named import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 

@@ -13,8 +13,8 @@ from hypogoal.core import own_code
 from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.experiment import read_toml
-from hypogoal.experiments.named import EXPERIMENTS
-from hypogoal.experiments.run import config_class_of, plan
+from hypogoal.experiments.named import EXPERIMENTS, config_class_of
+from hypogoal.experiments.run import plan
 from hypogoal.experiments.sweep import Cell
 
 ROOT = Path(__file__).resolve().parents[2]
