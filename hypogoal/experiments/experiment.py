@@ -177,8 +177,8 @@ def read_toml(path: Path) -> Experiment:
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
         fields: dict[str, Any] = {"workers": (int, file.workers), "evaluate": (bool, file.evaluate)}
-        for name, values in file.axes.items():
-            values = integers(values) if isinstance(values, str) else values
+        for name, axis in file.axes.items():
+            values: Sequence[Value] = integers(axis) if isinstance(axis, str) else axis
             kind: Any = type(values[0])
             fields[name] = (tuple[kind, ...], tuple(values))
         model = _model_of(fields)
