@@ -27,7 +27,7 @@ from hypogoal.core.config import (
     setting,
 )
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import defaults_of, layers_of, settings_of
+from hypogoal.domains.base import defaults_of, settings_of
 from hypogoal.experiments.named import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
@@ -84,13 +84,10 @@ def test_texts_become_values() -> None:
     [
         ({"step": 3}, "example has no setting: step. Did you mean 'steps'? See 'hypogoal config example'."),
         ({"steps": 0}, "value out of range: steps=0 in example. Allowed: 1 .. 1000."),
-        ({"steps": 1001}, "steps=1001 in example"),
         ({"steps": "many"}, "valid integer, unable to parse string as an integer: steps='many' in example"),
-        ({"steps": "2.5"}, "valid integer"),
         ({"steps": "1e400"}, "steps=inf"),
         ({"steps": True}, "must be a number: steps=True"),
         ({"rate": "nan"}, "finite number: rate='nan' in example. Allowed: 0.0 .."),
-        ({"rate": False}, "must be a number"),
         ({"kind": "c"}, "kind='c' in example. Allowed: a|b."),
         ({"code": "c"}, "Allowed: a|b|module:object."),
         ({"on": "perhaps"}, "valid boolean"),
@@ -98,8 +95,6 @@ def test_texts_become_values() -> None:
         ({"seeds": "1,x"}, "seeds='1,x'"),
         ({"seeds": "0-999999999"}, "at most 10000 integers"),
         ({"seeds": 3}, "valid tuple"),
-        ({"names": "x,z"}, "Allowed: x|y."),
-        ({"kind": 3}, "valid string"),
         ({"kind": "c\n" * 300}, "kind="),
     ],
 )
@@ -150,12 +145,8 @@ def test_a_part_has_its_settings_where_it_is_chosen() -> None:
         resolve(Staged, {"patients": 5}, {}, stage="staged")
     with pytest.raises(UserError, match=r"code='c' in staged. Allowed: a\|b\|module:object"):
         resolve(Staged, {"code": "c", "patience": 5}, {}, stage="staged")
-
-
-def test_a_manifest_may_have_more() -> None:
-    """Settings of an earlier version, and of parts that were not chosen, are ignored."""
-    written = {"steps": 7, "gone": 1, "speed": 9.0, "patience": 2}
-    read = resolve(Staged, known(Staged, written), {}, stage="staged")
+    of_a_manifest = known(Staged, {"steps": 7, "gone": 1, "speed": 9.0, "patience": 2})
+    read = resolve(Staged, of_a_manifest, {}, stage="staged")
     assert (read.steps, read.patience) == (7, 2) and not hasattr(read, "speed")
 
 
@@ -183,7 +174,6 @@ def test_settings_are_described_with_their_parts() -> None:
         ("[train_ensemble]\nsteps = 3", "no such table in a preset: train_ensemble in .*Did you mean 'train-ensemble'"),
         ("[trane]\nsteps = 3", "A preset has tables for collect, "),
         ("steps = 7\n[train-ensemble]\nmembers = 3", "no such table in a preset: steps in "),
-        ("collect = 7", "no such table"),
         ("[collect\n", "the preset cannot be read"),
         ("[collect]\nx = '\udcff'", "the preset cannot be read"),
         (None, "no such preset: .* Choose one of choosing, demo, figure6, paper, or give a .toml file"),
@@ -219,8 +209,6 @@ def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> N
     model = config_class_of(stage)
     assert all(row["meaning"] for row in described(model))
     assert resolve(model, model().model_dump(mode="json"), {}, stage=stage) == resolve(model, stage=stage)
-    with pytest.raises(UserError, match="no such stage"):
-        config_class_of("no-stage")
 
 
 @pytest.mark.parametrize("stage", ["train-options", "train-meta"])
@@ -230,8 +218,6 @@ def test_what_was_published_keeps_its_settings(stage: str) -> None:
     for name, values in {None: (2_000, 8), "figure6": (2_000, 8), **published}.items():
         config = settings_of(stage, "doorkey", name)
         assert (config.epsilon_steps, config.update_interval) == values
-    rows = {row["name"]: row for row in described(model_of(stage), *layers_of(stage, "doorkey"))}
-    assert (rows["epsilon_steps"]["default"], rows["update_interval"]["default"]) == (2_000, 8)
     assert defaults_of("doorkey", stage) == {"epsilon_steps": 2_000, "update_interval": 8}
 
 
