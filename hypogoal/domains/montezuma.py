@@ -57,7 +57,6 @@ ALONE: Mapping[str, Any] = {
     "mask_reached": False,
     "chooser": "even",
     "steps": 40_000,
-    "steps_for": "each",
 }
 
 
@@ -149,7 +148,7 @@ class MontezumaDomain(Domain):
             },
             "train-options": ALONE,
             "train-meta": LEARNING,
-            "audit": ALONE,
+            "audit": {name: value for name, value in ALONE.items() if name != "steps"},
         }
     )
 

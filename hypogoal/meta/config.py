@@ -74,13 +74,11 @@ class PracticeConfig(PlayConfig):
     """How the options are learned, and for how long."""
 
     steps: int = setting(
-        60_000, "environment steps, all environments together", unit="steps", source="paper: 3e5 for each option", low=1
-    )
-    steps_for: str = setting(
-        "all",
-        "whether 'steps' counts all options together, or each of them",
-        source="paper, policy learning",
-        choices=("all", "each"),
+        60_000,
+        "environment steps, all environments together; of each option, where options are restarted",
+        unit="steps",
+        source="paper: 3e5 for each option",
+        low=1,
     )
     chooser: str = setting(
         "random",

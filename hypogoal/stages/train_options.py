@@ -39,7 +39,7 @@ def train_options(
     domain = load_domain(source.config["domain"])
     training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
     count = training.options_of(source.config, config)
-    steps = config.steps * (count if config.steps_for == "each" else 1)
+    steps = config.steps * (count if config.restart_options else 1)
     settings = training.description(domain, source.config, config, steps=steps)
     inputs = [ensemble, options] if options else [ensemble]
     with call.training("options", settings, inputs, steps, tensorboard) as work:

@@ -57,14 +57,11 @@ def audit(
         "domain_config": target.domain_config,
     }
     training.start_arguments(world, config, 1, call.seed)  # refuse an impossible start before any work
-    steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
-    settings = training.description(
-        world, ensemble_config, config, classifier=classifier, member=member or 0, steps=steps
-    )
+    settings = training.description(world, ensemble_config, config, classifier=classifier, member=member or 0)
     ends = terminations_of(target.classify, np.array(edges), config.termination)
-    with call.training("audit", settings, target.inputs, steps, None) as work:
+    with call.training("audit", settings, target.inputs, config.steps, None) as work:
         loop = training.assemble(world, Path(), ensemble_config, config, call.seed, device, ends, target.standard)
-        training.train(loop, steps, work.log, work.progress, work.draft.checkpoints())
+        training.train(loop, config.steps, work.log, work.progress, work.draft.checkpoints())
         training.write_trained(work.draft.files, loop, world, ensemble_config, config, call.seed)
         report = report_of(loop, edges, world.sub_goals, work.draft.files)
         report["random_play"] = random_play(loop, column, rng_for(call.seed, "random-play"))
