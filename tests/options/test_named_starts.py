@@ -93,8 +93,7 @@ def train(ensemble: Path, out: Path, seed: int = 0, **changes):
 
 def test_options_from_a_named_start(corridor: Path, tmp_path: Path) -> None:
     """Spec A3, D4, F3: the stage writes the last executions with their distance, and says where they began."""
-    numbers = train(corridor, tmp_path / "options", start="middle", n_step=3, chooser="even").metrics
-    assert numbers["step"] == 800 and 0.0 <= numbers["reached"] <= 1.0
+    train(corridor, tmp_path / "options", start="middle", n_step=3, chooser="even")
     artefact = open_artefact(tmp_path / "options", "options")
     assert artefact.config["steps"] == 800 and artefact.config["start"] == "middle"
     assert json.loads((tmp_path / "options" / "layout.json").read_text())["start"] == "middle"
