@@ -179,13 +179,10 @@ def known(model: type[Config], values: Mapping[str, Any]) -> dict[str, Any]:
 def described(model: type[Config], *layers: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
     """Every setting of the model, then of its parts; a layer has values that replace defaults, and their source."""
     every = _with_parts(model)
-    defaults = every().model_dump(mode="json")
+    defaults = resolve(every, *(values for values, _ in layers), {}, stage="").model_dump(mode="json")
     sources: dict[str, str] = {}
     for values, source in layers:
-        resolved = resolve(every, values, {}, stage="").model_dump(mode="json")
-        changed = values.keys() & resolved.keys()
-        defaults |= {name: resolved[name] for name in changed}
-        sources |= dict.fromkeys(changed, source)
+        sources |= dict.fromkeys(values, source)
     rows: dict[str, dict[str, Any]] = {}
     for home in (*model.__mro__, *every.__mro__):
         for name in inspect.get_annotations(home):
