@@ -82,6 +82,7 @@ def write_data(path: Path, groups: int) -> None:
     part = np.flatnonzero(seen == 1)
     unlabelled = States(test.observations[part], test.labels[part], {"room": test.origins["room"][part]})
     collected = Collected(SHAPE, (SUB_GOAL,), labelled, unlabelled, test)
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_dataset(path, collected, domain=DOMAIN.name, config={"groups": groups}, seed=0)
 
 
