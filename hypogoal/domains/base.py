@@ -501,13 +501,13 @@ def settings_of(
     *,
     inherited: Mapping[str, Any] | None = None,
 ) -> Any:
-    """The settings of a stage on a domain: its defaults, those ``inherited``, a preset's, then what the user typed.
+    """The settings of a stage on a domain: its defaults, a preset's, those ``inherited``, then what the user typed.
 
     ``inherited`` are of the options that the stage continues. What is unknown or not allowed is a ``UserError``.
     """
     model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
     *defaults, of_preset = [values for values, _ in layers_of(stage, domain, preset_name)]
-    layers = [*defaults, inherited or {}, of_preset, typed or {}]
+    layers = [*defaults, of_preset, inherited or {}, typed or {}]
     if CORES in os.environ:  # a cell of an experiment, which tells all cells alike, controls among them
         layers.append({})
     return resolve(model, *layers, stage=stage)

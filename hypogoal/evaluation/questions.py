@@ -1,5 +1,6 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
 
+import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
@@ -9,6 +10,9 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
+from hypogoal.core.files import write_table
+from hypogoal.core.processes import cores
+from hypogoal.core.progress import Progress
 from hypogoal.evaluation import (
     choosing,
     curves,
@@ -23,12 +27,13 @@ from hypogoal.evaluation import (
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.judging import Case, Work, judgements
+from hypogoal.evaluation.curves import group_runs, read_run
+from hypogoal.evaluation.judging import Case, Work, judgements, processes_for
 from hypogoal.evaluation.numbers import Metrics, plain
 from hypogoal.evaluation.page import WIDTH, Drawn, Material, Question, draw_page, listed, packaged
 from hypogoal.evaluation.provenance import domains_of, provenance, provenance_section
-from hypogoal.evaluation.run import FORMAT, most_used
-from hypogoal.evaluation.table import Row, compared
+from hypogoal.evaluation.run import FORMAT, Contents, most_used
+from hypogoal.evaluation.table import Row, compared, defined
 from hypogoal.learners.episodes import LAST
 
 # In the order of the page; the numbers of one are there for those below it.
@@ -48,7 +53,13 @@ def agents_last() -> list[Question]:
     return [*QUESTIONS[1:], QUESTIONS[0]]
 
 
-def judge_ensembles(work: Work, cases: Sequence[tuple[int, Case]], workers: int) -> None:
+def work_of(contents: Contents, arrays: Any, progress: Progress, layouts: Sequence[int]) -> Work:
+    """What the questions work with: a run, the file of its arrays, and layouts that agents play without learning."""
+    agents = group_runs([read_run(artefact, contents.name(artefact)) for artefact in contents.agents])
+    return Work(contents, arrays, progress, layouts, agents=agents)
+
+
+def judge_ensembles(work: Work, cases: Sequence[tuple[int, Case]]) -> None:
     """Show the questions every ensemble of the run on its data's held-out and unlabelled states.
 
     Of one ensemble, the first of those with the most members, example states and attributions are kept too; of one,
@@ -58,6 +69,7 @@ def judge_ensembles(work: Work, cases: Sequence[tuple[int, Case]], workers: int)
     work.shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
     work.browsed = most_used(work.contents)
     rows: list[list[Row]] = [[] for _ in configs]
+    workers = processes_for([case for _, case in cases], cores())
     for judgement in judgements(cases, workers, work.progress.advance):
         for question in QUESTIONS:
             rows[judgement.number] += question.look(work, judgement)
@@ -89,6 +101,13 @@ def metrics_of(work: Work, settings: Mapping[str, Any], data: Sequence[Path], mi
             "quantities": meanings(),
         }
     )
+
+
+def write(folder: Path, metrics: Metrics, rows: Sequence[Row]) -> None:
+    """Write ``metrics.json`` and ``numbers.csv``."""
+    write_table(folder / "numbers.csv", Row._fields, defined(rows))
+    text = json.dumps(metrics, indent=1, allow_nan=False)
+    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
 
 
 def missing(work: Work) -> list[str]:

@@ -5,11 +5,11 @@
 arguments, settings and checks. What takes time to import is imported when it is called, so that ``--help`` is quick.
 """
 
+import contextlib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from inspect import Parameter
 from pathlib import Path
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Place = str | os.PathLike[str]
 WIDTH = 100  # of tables
+NO_SETTINGS = ("preset", "set_", "seed", "device")  # options that a stage without settings leaves out
 STAGES: dict[str, "Stage"] = {}  # by command, those that were imported
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
@@ -69,7 +70,16 @@ class Call:
 
         return settings_of(self.stage, domain, self.preset, self.typed, inherited=inherited)
 
-    @contextmanager
+    def draft(
+        self, kind: str, config: Mapping[str, Any], inputs: Sequence[Path] = ()
+    ) -> "contextlib.AbstractContextManager[Draft]":
+        """The output to fill, see :func:`hypogoal.core.artefacts.create`."""
+        from hypogoal.core.artefacts import create
+
+        how: dict[str, Any] = {"seed": self.seed, "force": self.force, "resume": self.resume}
+        return create(self.out, kind=kind, config=config, inputs=inputs, **how)
+
+    @contextlib.contextmanager
     def training(
         self,
         kind: str,
@@ -77,15 +87,14 @@ class Call:
         inputs: Sequence[Path],
         steps: int,
         tensorboard: Path | None = None,
-    ) -> "Iterator[Training]":
-        """The draft of an artefact in training, see :func:`hypogoal.core.artefacts.create`."""
-        from hypogoal.core.artefacts import LOG, create
+    ) -> Iterator["Training"]:
+        """The same for a training of so many steps; TensorBoard's folder gets the numbers of the log, too."""
+        from hypogoal.core.artefacts import LOG
         from hypogoal.core.progress import MetricsLog, Progress
 
-        about: dict[str, Any] = {"kind": kind, "config": config, "seed": self.seed, "inputs": inputs}
         with (
-            create(self.out, **about, force=self.force, resume=self.resume) as draft,
-            closing(MetricsLog(draft.files / LOG, tensorboard)) as log,
+            self.draft(kind, config, inputs) as draft,
+            contextlib.closing(MetricsLog(draft.files / LOG, tensorboard)) as log,
             Progress(self.stage, steps, quiet=self.quiet) as progress,
         ):
             yield Training(draft, log, progress)
@@ -153,7 +162,11 @@ class Stage:
         into: str,
         page: str,
     ):
-        self.function, self.example, self.often, self.into, self.page = function, example, often, into, page
+        self.function = function
+        self.example = example
+        self.often = often
+        self.into = into
+        self.page = page
         self.name = function.__name__.replace("_", "-")
         _, self.source, *self.inputs = inspect.signature(function).parameters.values()
         self.out, *shared = inspect.signature(_shared).parameters.values()
@@ -165,9 +178,10 @@ class Stage:
     @property
     def signature(self) -> inspect.Signature:
         """Of the Python function: settings are further arguments."""
-        keywords = [*self.inputs, *(option for option in self.shared if option.name != "set_")]
+        options = [option for option in self.shared if option.name != "set_"]
+        out = self.out.replace(default=None)
         settings = Parameter("settings", Parameter.VAR_KEYWORD)
-        return inspect.Signature([self.source, self.out.replace(default=None), *keywords, settings])
+        return inspect.Signature([self.source, out, *self.inputs, *options, settings])
 
     def made(self, source: Any, out: Place | None, arguments: Mapping[str, Any]) -> "Made":
         """Run it from Python; ``arguments`` that are no options are settings."""
@@ -189,20 +203,19 @@ class Stage:
         from hypogoal.core.config import assigned
 
         def called(**values: Any) -> None:
-            source, out = values.pop(self.source.name), values.pop("out")
+            source = values.pop(self.source.name)
+            out = values.pop("out")
             chosen = {name: values.pop(name) for name in self.often}
             typed = {name: value for name, value in chosen.items() if value is not None}
             typed |= assigned(values.pop("set_", None) or ())
             call, done = self.run(source, out, values, typed)
             if not call.quiet:
-                for line in done.lines:
-                    say(line)
-                if done.then:
-                    say(f"next: {own_code.command(*done.then)}")
+                _tell(done)
             say(done.path or call.out / self.page)
 
-        parameters = [*map(_keyword, (self.source, *self.inputs, self.out, *self.shared))]
-        called.__signature__ = inspect.Signature([*parameters, *_options(self.name, self.often)])  # type: ignore[attr-defined]
+        own = map(_keyword, (self.source, *self.inputs, self.out))
+        options = _options(self.name, self.often) if self.often else []
+        called.__signature__ = inspect.Signature([*own, *self.shared, *options])  # type: ignore[attr-defined]
         called.__doc__ = inspect.cleandoc(self.function.__doc__ or "").partition("\n\n")[0]
         alone = typer.Typer(add_completion=False)
         alone.command(self.name, epilog=f"Example:\n\n[bold]hypogoal {self.example}[/bold]")(called)
@@ -213,7 +226,10 @@ class Stage:
     ) -> tuple[Call, Done]:
         """Call the function with the ``values`` of options. What is complete already, with ``resume``, is kept."""
         inputs = {each.name: values.pop(each.name) for each in self.inputs if each.name in values}
-        call = Call(self.name, Path(out) if out else Path(source, self.into), typed=typed, **values)
+        if typed and not any(option.name == "preset" for option in self.shared):
+            raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
+        place = Path(out) if out else Path(source, self.into)
+        call = Call(self.name, place, typed=typed, **values)
         try:
             return call, self.function(call, source, **inputs)
         except Complete as complete:
@@ -240,8 +256,6 @@ def _keyword(parameter: Parameter) -> Parameter:
 
 def _options(stage: str, often: Sequence[str]) -> list[Parameter]:
     """Options that are short for ``--set``. Values stay text, read as those of ``--set``."""
-    if not often:
-        return []
     from hypogoal.core.config import described, model_of
 
     rows = {row["name"]: row for row in described(model_of(stage))}
@@ -249,22 +263,36 @@ def _options(stage: str, often: Sequence[str]) -> list[Parameter]:
     options = []
     for name in often:
         row = rows[name]
+        meaning = row["meaning"][0].upper() + row["meaning"][1:]
         choices = f" ({row['allowed']})" if "|" in row["allowed"] else ""
-        text = f"{row['meaning'][0].upper()}{row['meaning'][1:]}{choices}. [dim]\\[default: {row['default']}][/dim]"
+        text = f"{meaning}{choices}. [dim]\\[default: {row['default']}][/dim]"
         option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
-        options.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option]))
+        annotation = Annotated[str | None, option]
+        options.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation))
     return options
+
+
+def _tell(done: Done) -> None:
+    """Print the result and the next command."""
+    for line in done.lines:
+        say(line)
+    if done.then:
+        say(f"next: {own_code.command(*done.then)}")
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:
     """What Python gives for a path: a text, a path or what a stage made; or several."""
     if value is None or "Path" not in str(parameter.annotation):
         return value
-    return [*map(Path, value)] if isinstance(value, list | tuple) else Path(value)
+    several = isinstance(value, Iterable) and not isinstance(value, str)
+    return [*map(Path, value)] if several else Path(value)
 
 
 def outcome_of(numbers: Mapping[str, Any]) -> list[str]:
     """The results of training as a line. NaN (no episode has ended) is left out: the number of episodes says it too."""
-    texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in numbers.items()}
-    told = ", ".join(f"{name} {text}" for name, text in texts.items() if text != "nan")
-    return [told] if told else []
+    told = []
+    for name, value in numbers.items():
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        if text != "nan":
+            told.append(f"{name} {text}")
+    return [", ".join(told)] if told else []

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from typer import Argument
 
-from hypogoal.core.artefacts import DATA, create
+from hypogoal.core.artefacts import DATA
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
@@ -30,25 +30,26 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     require_names(played.sub_goals)  # before play, not when the file is written
     config = call.settings(name)
     settings = config.model_dump(mode="json")
-    with create(
-        call.out,
-        kind=DATA,
-        config=settings | {"domain": name},
-        seed=call.seed,
-        force=call.force,
-        resume=call.resume,
-    ) as draft:
+    with call.draft(DATA, settings | {"domain": name}) as draft:
         if played.doubt:
             say(f"hypogoal: {played.doubt}", err=True)
         kept = {"kept": draft.checkpoints} if played.resumes else {}
         with Progress(f"collect {name}", total=1, quiet=call.quiet) as progress:
             collected = played.collect(config, call.seed, progress, **kept)
-        write_dataset(draft.files / call.out.name, collected, domain=name, config=settings, seed=call.seed)
+        write_dataset(
+            draft.files / call.out.name,
+            collected,
+            domain=name,
+            config=settings,
+            seed=call.seed,
+        )
     if name not in BUILT_IN:
         for line in _doubts(played, collected, call.quiet):
             say(f"hypogoal: {line}", err=True)
     run = call.out.parent if call.out.name == "data.h5" else Path("runs", call.out.stem)
-    return Done(count_lines(open_dataset(call.out).counts()), ("train-ensemble", call.out, "--out", run / "ensemble"))
+    counts = open_dataset(call.out).counts()
+    then = ("train-ensemble", call.out, "--out", run / "ensemble")
+    return Done(count_lines(counts), then)
 
 
 def _name_of(domain: Any) -> str:
@@ -70,12 +71,15 @@ def _doubts(domain: Any, collected: Any, quiet: bool) -> list[str]:
     from hypogoal.data import GET_MORE, hard_to_judge, hard_to_learn
     from hypogoal.options.config import OptionConfig
 
-    lines = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
+    labelled = collected.labelled
+    few = hard_to_learn(labelled.labels, collected.sub_goals)
+    lines = [f"{line}. {GET_MORE}" for line in few]
     lines += hard_to_judge(collected.heldout.labels, collected.sub_goals)
-    steps = collected.labelled.origins.get("step")
-    if quiet or steps is None or "option_timeout" in domain.defaults.get("train-options", {}):
+    steps = labelled.origins.get("step")
+    own = domain.defaults.get("train-options", {})
+    if quiet or steps is None or "option_timeout" in own:
         return lines
-    soonest = [steps[holds].min() for holds in collected.labelled.labels.T]
+    soonest = [steps[holds].min() for holds in labelled.labels.T]
     apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
     if 2 * apart > OptionConfig().option_timeout:
         lines.append(

@@ -1,14 +1,14 @@
 """Spec A5, F7: draw an evaluated run as one self-contained HTML page, and its figures as files."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Argument, Option
 
-from hypogoal.core.artefacts import create, versions
+from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import say
-from hypogoal.stages import Call, Done, stage
+from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 MOST_BYTES = 2_000_000  # of a film on the page
 FILMS = "Films of the policy over options, in the report's videos/*.gif; the page shows one. Default: one, if possible."
@@ -16,7 +16,7 @@ FILMS = "Films of the policy over options, in the report's videos/*.gif; the pag
 
 @stage(
     "report runs/mine --videos 3",
-    leaves_out=["preset", "set_", "seed", "device"],
+    leaves_out=NO_SETTINGS,
     into="report",
     page="index.html",
 )
@@ -53,8 +53,7 @@ def report(
     agents = films.agents_to_play(run, videos)
     config = {"videos": len(agents) if videos is None else videos}
     inputs = [source.path, *(agent.path for agent in agents)]
-    about: dict[str, Any] = {"kind": "report", "config": config, "seed": 0, "inputs": inputs}
-    with create(call.out, **about, force=call.force, resume=call.resume) as draft:
+    with call.draft("report", config, inputs) as draft:
         evaluation = read_evaluation(run)
         played, missing = films.films_of(agents, run, videos)
         metrics = {**evaluation.metrics, "missing": [*evaluation.metrics["missing"], *missing]}

@@ -41,14 +41,21 @@ def train_baseline(
     config = call.settings(domain)
     played = load_domain(domain)
     dataset = _states_of(domain, data) if data else None
-    world = played_world(played, played.world(dataset.config) if dataset else {}, config.world)
+    collected = played.world(dataset.config) if dataset else {}
+    world = played_world(played, collected, config.world)
     begins = {"start": config.start} if config.start else {}
     if config.start:
         check_start(played, config.start)
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = chosen.model_copy(update={"environments": config.environments})
-    engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world, **begins)
+    engine = played.make_engine(
+        config.layout_seed,
+        chosen.environments,
+        config.max_episode_steps,
+        **world,
+        **begins,
+    )
     cut(engine, config.cap)
     require_one_kind(engine)
     if dataset and engine.observation_dtype != PICTURE:
@@ -59,14 +66,32 @@ def train_baseline(
         "environments": chosen.environments,
         "hyperparameters": chosen.model_dump(mode="json"),
     }
-    with call.training("baseline", settings, [data] if data else [], config.steps, tensorboard) as work:
+    inputs = [data] if data else []
+    with call.training("baseline", settings, inputs, config.steps, tensorboard) as work:
         env = EngineEnv(engine)
-        agent = train(env, chosen, config.steps, call.seed, work.log, work.progress, work.draft.checkpoints(), device)
+        agent = train(
+            env,
+            chosen,
+            config.steps,
+            call.seed,
+            work.log,
+            work.progress,
+            work.draft.checkpoints(),
+            device,
+        )
         work.progress.update(config.steps)
         Episodes.of_rows(env.episodes).write(work.draft.files)
         save_tensors(work.draft.files / "policy.safetensors", weights(agent))
-        write_layout(work.draft.files, engine, config.layout_seed, config.random_episodes, call.seed, **begins)
-    return Done(outcome_of(env.episodes.counts() | env.episodes.recent()), ("evaluate", call.out.parent))
+        write_layout(
+            work.draft.files,
+            engine,
+            config.layout_seed,
+            config.random_episodes,
+            call.seed,
+            **begins,
+        )
+    numbers = env.episodes.counts() | env.episodes.recent()
+    return Done(outcome_of(numbers), ("evaluate", call.out.parent))
 
 
 def _states_of(domain: str, data: Path) -> Any:

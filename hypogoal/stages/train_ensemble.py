@@ -10,6 +10,11 @@ from typer import Argument, Option
 from hypogoal.core.artefacts import LOG
 from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
 
+TITLES = {
+    "best": "held-out balanced accuracy: best member",
+    "mean": "mean",
+    "worst": "worst",
+}
 ELSEWHERE = "Take unlabelled states from a data file, or options or a meta-policy with save_visited; repeatable."
 
 
@@ -39,21 +44,38 @@ def train_ensemble(
     config, sub_goals = checked(call.settings(dataset.domain), dataset)
     others = [unlabelled_file(path, dataset) for path in unlabelled or ()]
     settings = _described(config, sub_goals, dataset)
-    steps = len(sub_goals) * config.steps * (config.members if config.schedule == "sequential" else 1)
-    with call.training("ensemble", settings, [data, *others], steps, None) as work:
+    steps = len(sub_goals) * config.steps
+    if config.schedule == "sequential":
+        steps *= config.members
+    with call.training("ensemble", settings, [data, *others], steps) as work:
         logs = [log_of(work.draft, sub_goal) for sub_goal in sub_goals]
         jobs = []
         for sub_goal in sub_goals:
-            board = Path(tensorboard, sub_goal) if tensorboard else None
-            jobs.append(partial(train_sub_goal, work.draft, data, others, sub_goal, config, call.seed, device, board))
+            board = None
+            if tensorboard:
+                board = Path(tensorboard, sub_goal)
+            job = partial(
+                train_sub_goal,
+                work.draft,
+                data,
+                others,
+                sub_goal,
+                config,
+                call.seed,
+                device,
+                board,
+            )
+            jobs.append(job)
         accuracies: list[dict[str, float]] = [{} for _ in jobs]
         work.draft.checkpoint.mkdir(exist_ok=True)
         work.progress.resume(steps_in(logs))
         with work.progress.following(partial(steps_in, logs)):
-            in_processes(jobs, min(allowed(config.workers), len(jobs)), accuracies.__setitem__)
+            workers = min(allowed(config.workers), len(jobs))
+            in_processes(jobs, workers, accuracies.__setitem__)
         texts = [log.read_text(encoding="utf-8") for log in logs]
         (work.draft.files / LOG).write_text("".join(texts), encoding="utf-8")
-    return Done(_outcome(accuracies, call.out), _next(call.out, dataset.domain))
+    lines = _outcome(accuracies, call.out)
+    return Done(lines, _next(call.out, dataset.domain))
 
 
 def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str, Any]:
@@ -76,8 +98,11 @@ def _outcome(accuracies: Sequence[dict[str, float]], out: Path) -> list[str]:
     judged = [each for each in accuracies if each["best"] == each["best"]]
     if not judged:
         return outcome_of(numbers_of(out))
-    titles = {"best": "held-out balanced accuracy: best member", "mean": "mean", "worst": "worst"}
-    return outcome_of({title: sum(each[key] for each in judged) / len(judged) for key, title in titles.items()})
+    numbers = {}
+    for name, title in TITLES.items():
+        values = [each[name] for each in judged]
+        numbers[title] = sum(values) / len(values)
+    return outcome_of(numbers)
 
 
 def _next(out: Path, domain: str) -> tuple[object, ...]:
@@ -87,6 +112,7 @@ def _next(out: Path, domain: str) -> tuple[object, ...]:
     installed = installed_domain(domain)
     if installed is None:
         return "evaluate", out.parent
-    if "train-meta" in installed.defaults and "train-options" not in installed.defaults:
+    practised = "train-options" in installed.defaults
+    if "train-meta" in installed.defaults and not practised:
         return "train-meta", out, "--out", out.parent / "meta"
     return "train-options", out, "--out", out.parent / "options"

@@ -48,19 +48,53 @@ def train_meta(
         training.check_fit(practice, source, config, FIXED)
     domain = load_domain(source.config["domain"])
     training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
-    settings = training.description(domain, source.config, config, **_steps_spent(practice))
+    settings = training.description(
+        domain,
+        source.config,
+        config,
+        **_steps_spent(practice),
+    )
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training("meta", settings, inputs, config.steps, tensorboard) as work:
-        loop = training.assemble(domain, source.path, source.config, config, call.seed, device)
+    with call.training(
+        "meta",
+        settings,
+        inputs,
+        config.steps,
+        tensorboard,
+    ) as work:
+        loop = training.assemble(
+            domain,
+            source.path,
+            source.config,
+            config,
+            call.seed,
+            device,
+        )
         if practice:
             training.continue_with(loop, practice)
-            loop.recorder.start_at(practice.config.get("ended_at", practice.config["steps"]))
+            begun_at = practice.config.get("ended_at", practice.config["steps"])
+            loop.recorder.start_at(begun_at)
             if all(practice.config[key] == settings[key] for key in WORLD):
-                loop.recorder.episodes.extend(Episodes.read(practice.path / Episodes.FILE).rows())
-        training.train(loop, config.steps, work.log, work.progress, work.draft.checkpoints())
-        training.write_trained(work.draft.files, loop, domain, source.config, config, call.seed)
+                practised = Episodes.read(practice.path / Episodes.FILE)
+                loop.recorder.episodes.extend(practised.rows())
+        training.train(
+            loop,
+            config.steps,
+            work.log,
+            work.progress,
+            work.draft.checkpoints(),
+        )
+        training.write_trained(
+            work.draft.files,
+            loop,
+            domain,
+            source.config,
+            config,
+            call.seed,
+        )
     episodes = loop.recorder.episodes
-    return Done(outcome_of(episodes.counts() | episodes.recent()), ("evaluate", call.out.parent))
+    numbers = episodes.counts() | episodes.recent()
+    return Done(outcome_of(numbers), ("evaluate", call.out.parent))
 
 
 def _steps_spent(practice: Artefact | None) -> dict[str, Any]:

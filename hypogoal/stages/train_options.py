@@ -39,22 +39,53 @@ def train_options(
     domain = load_domain(source.config["domain"])
     training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
     count = training.options_of(source.config, config)
-    steps = config.steps * (count if config.restart_options else 1)
+    steps = config.steps
+    if config.restart_options:
+        steps *= count
     settings = training.description(domain, source.config, config, steps=steps)
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training("options", settings, inputs, steps, tensorboard) as work:
-        loop = training.assemble(domain, source.path, source.config, config, call.seed, device)
+    with call.training(
+        "options",
+        settings,
+        inputs,
+        steps,
+        tensorboard,
+    ) as work:
+        loop = training.assemble(
+            domain,
+            source.path,
+            source.config,
+            config,
+            call.seed,
+            device,
+        )
         if practice:
             training.continue_with(loop, practice)
-        solved = training.train(loop, steps, work.log, work.progress, work.draft.checkpoints(), config.until)
+        solved = training.train(
+            loop,
+            steps,
+            work.log,
+            work.progress,
+            work.draft.checkpoints(),
+            config.until,
+        )
         if domain.measures and loop.engine.position_names:
             sub_goals = source.config["sub_goals"]
             away = training.distances_of(domain, sub_goals, count // len(sub_goals))
             loop.recorder.write_executions(work.draft.files, away)
-        training.write_trained(work.draft.files, loop, domain, source.config, config, call.seed)
+        training.write_trained(
+            work.draft.files,
+            loop,
+            domain,
+            source.config,
+            config,
+            call.seed,
+        )
         if config.until:
-            settings |= {"ended_at": loop.recorder.steps, "until_reached": solved}  # for the manifest, which comes last
-    return Done(outcome_of(_numbers(loop.recorder, config, solved)), _next(call, ensemble, config))
+            settings["ended_at"] = loop.recorder.steps  # for the manifest, which comes last
+            settings["until_reached"] = solved
+    numbers = _numbers(loop.recorder, config, solved)
+    return Done(outcome_of(numbers), _next(call, ensemble, config))
 
 
 def _numbers(recorder: Any, config: Any, solved: bool) -> dict[str, Any]:
@@ -62,8 +93,11 @@ def _numbers(recorder: Any, config: Any, solved: bool) -> dict[str, Any]:
 
     Where each option begins an episode, instead of these two the shares of ``recorder.recent``.
     """
-    recent = recorder.recent(restarted=True) if config.restart_options else recorder.episodes.recent()
-    numbers: dict[str, Any] = {**recorder.episodes.counts(), **recent}
+    numbers: dict[str, Any] = dict(recorder.episodes.counts())
+    if config.restart_options:
+        numbers |= recorder.recent(restarted=True)
+    else:
+        numbers |= recorder.episodes.recent()
     if config.until:
         goal = f"until={config.until:g}"
         numbers["ended"] = f"by {goal}" if solved else f"by the limit, {goal} not reached"
@@ -76,4 +110,5 @@ def _next(call: Call, ensemble: Path, config: Any) -> tuple[object, ...]:
     if config.restart_options:
         return "evaluate", run
     preset = ["--preset", call.preset] if call.preset else []
-    return "train-meta", ensemble, "--options", call.out, *preset, "--out", run / "meta"
+    inputs = [ensemble, "--options", call.out]
+    return "train-meta", *inputs, *preset, "--out", run / "meta"

@@ -59,13 +59,27 @@ def audit(
     training.start_arguments(world, config, 1, call.seed)  # refuse an impossible start before any work
     settings = training.description(world, ensemble_config, config, classifier=classifier, member=member or 0)
     ends = terminations_of(target.classify, np.array(edges), config.termination)
-    with call.training("audit", settings, target.inputs, config.steps, None) as work:
+    with call.training("audit", settings, target.inputs, config.steps) as work:
         loop = training.assemble(world, Path(), ensemble_config, config, call.seed, device, ends, target.standard)
-        training.train(loop, config.steps, work.log, work.progress, work.draft.checkpoints())
-        training.write_trained(work.draft.files, loop, world, ensemble_config, config, call.seed)
+        training.train(
+            loop,
+            config.steps,
+            work.log,
+            work.progress,
+            work.draft.checkpoints(),
+        )
+        training.write_trained(
+            work.draft.files,
+            loop,
+            world,
+            ensemble_config,
+            config,
+            call.seed,
+        )
         report = report_of(loop, edges, world.sub_goals, work.draft.files)
         report["random_play"] = random_play(loop, column, rng_for(call.seed, "random-play"))
-        (work.draft.files / "audit.json").write_text(json.dumps(plain(report), indent=1) + "\n", encoding="utf-8")
+        text = json.dumps(plain(report), indent=1)
+        (work.draft.files / "audit.json").write_text(text + "\n", encoding="utf-8")
     return Done([*lines_of(report)])
 
 
@@ -100,5 +114,6 @@ def _on_recorded_data(call: Call, source: str, sub_goal: str | None, member: int
     if len(goals) == 1:  # 'import' takes labels of a data file's only sub-goal
         table = call.out / "next" / goals[0] / TO_FILL_IN
         lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
-        then = ("import", data, "--label", f"{goals[0]}={table}", "--out", data.with_name(f"{data.stem}-more.h5"))
+        more = data.with_name(f"{data.stem}-more.h5")
+        then = ("import", data, "--label", f"{goals[0]}={table}", "--out", more)
     return Done(lines, then, path=call.out / "index.html")

@@ -18,30 +18,46 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
     Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
     where = " ".join(map(str, runs))
-    if len({run.resolve() for run in runs}) < max(2, len(runs)):
+    places = {run.resolve() for run in runs}
+    if len(places) < max(2, len(runs)):
         raise UserError("a comparison takes two or more different runs", where, "Name each run once.")
     inputs = [evaluation_of(run).path for run in runs]
-    with create(out, kind="comparison", config={}, seed=0, inputs=inputs, force=force) as draft:
+    with create(
+        out,
+        kind="comparison",
+        config={},
+        seed=0,
+        inputs=inputs,
+        force=force,
+    ) as draft:
         labels = beside.labels_of([run.resolve().as_posix() for run in runs])
-        evaluations = [read_evaluation(run, "curves/") for run in runs]
-        metrics = {label: each.metrics for label, each in zip(labels, evaluations, strict=True)}
-        arrays = {label: each.arrays for label, each in zip(labels, evaluations, strict=True)}
-        tables = [read_rows(each.source.path / "numbers.csv") for each in evaluations]
+        metrics, arrays, rows = {}, {}, {}
+        for label, run in zip(labels, runs, strict=True):
+            evaluation = read_evaluation(run, "curves/")
+            metrics[label] = evaluation.metrics
+            arrays[label] = evaluation.arrays
+            rows[label] = read_rows(evaluation.source.path / "numbers.csv")
         with fitting(where):
             reason = beside.why_not(metrics)
             if reason is not None:
                 do = "Choose runs of one experiment, evaluated alike."
                 raise UserError("these runs cannot be compared", reason, do)
-            comparison = beside.comparison_of(runs, metrics, dict(zip(labels, tables, strict=True)))
+            comparison = beside.comparison_of(runs, metrics, rows)
             material = Material(comparison, {})
-            sections = beside.compared_sections(metrics, arrays, comparison, material)
+            sections = beside.compared_sections(
+                metrics,
+                arrays,
+                comparison,
+                material,
+            )
             version = versions().get("hypogoal", "unknown")
             subtitle = f"{', '.join(labels)}; hypogoal {version}"
             page = draw_page(f"hypogoal: {len(runs)} runs compared", subtitle, sections, version)
         text = json.dumps(comparison, indent=1, allow_nan=False)
         (draft.files / "index.html").write_text(page, encoding="utf-8")
         (draft.files / "metrics.json").write_text(text + "\n", encoding="utf-8")
-        (draft.files / "figures").mkdir()
+        figures = draft.files / "figures"
+        figures.mkdir()
         for name, drawing in material.drawings.items():
-            (draft.files / "figures" / f"{name}.svg").write_text(drawing, encoding="utf-8")
+            (figures / f"{name}.svg").write_text(drawing, encoding="utf-8")
     return out / "index.html"
