@@ -27,7 +27,6 @@ from hypogoal import stages
 from hypogoal.core import own_code, processes
 from hypogoal.core.errors import UserError, printable
 from hypogoal.core.terminal import say
-from hypogoal.stages import WIDTH, Device, Force, Out, Preset, Quiet, Seed, Set
 
 MAKE, LOOK, OWN = "Make", "Look", "Own data and code"  # groups of commands
 STAGES = {  # in their order; a command is loaded when it is called
@@ -45,7 +44,6 @@ EXPERIMENTS = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
     "module:function."
 )
-LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
 
 
 class Commands(TyperGroup):
@@ -204,11 +202,11 @@ def echo(value: Any, as_json: bool, text: Iterable[str]) -> None:
 def run(
     experiment: Annotated[str, Argument(help=EXPERIMENTS)],
     out: Annotated[Path | None, Option(help="What to write. Default: runs/EXPERIMENT.")] = None,
-    preset: Preset = None,
-    set_: Set = None,
+    preset: stages.Preset = None,
+    set_: stages.Set = None,
     seed: Annotated[str | None, Option(help="The run seeds, instead of the experiment's: 3, or 0-9.")] = None,
-    device: Device = "auto",
-    force: Force = False,
+    device: stages.Device = "auto",
+    force: stages.Force = False,
     resume: Annotated[
         bool, Option("--resume", metavar="", help="Keep what is complete, continue with the rest.")
     ] = False,
@@ -218,16 +216,15 @@ def run(
     only: Annotated[str | None, Option(metavar="STAGE", help="Make this stage again and run no other.")] = None,
     engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     sbatch: Annotated[str, Option(help="Options for sbatch, as typed: '--time=4:00:00 --mem=8G'.")] = "",
-    quiet: Quiet = False,
+    quiet: stages.Quiet = False,
     dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands; run none.")] = False,
 ) -> None:
     """Run all cells of an experiment: from nothing to a report.
 
     --set takes settings of the experiment, and STAGE.KEY=VALUE.
     """
-    from hypogoal.core.processes import prepare
+    from hypogoal import look
     from hypogoal.experiments import run as experiments
-    from hypogoal.look import describe, outcome
 
     out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
     if engine not in ("local", "slurm"):
@@ -238,7 +235,7 @@ def run(
             say(shlex.join(["hypogoal", *cell.command(out)]))
         return
     if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
-        prepare(device)
+        processes.prepare(device)
     experiments.run(
         cells,
         out,
@@ -253,7 +250,7 @@ def run(
     if engine == "slurm" or only or not (out / "report").is_dir():
         say(out)
         return
-    for line in outcome(describe(out / "evaluation")):
+    for line in look.outcome(look.describe(out / "evaluation")):
         say(line)
     say(out / "report" / "index.html")
 
@@ -273,10 +270,10 @@ def show(
     pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
     """Describe a file or folder: kind, result, settings, inputs."""
-    from hypogoal.look import describe, lines, outcome
+    from hypogoal import look
 
-    details = describe(path)
-    echo(details, as_json, [] if as_json else [*outcome(details), *lines(details)])
+    details = look.describe(path)
+    echo(details, as_json, [] if as_json else [*look.outcome(details), *look.lines(details)])
     if pictures is not None:
         from hypogoal.evaluation.pictures import write_contact_sheets
 
@@ -290,12 +287,12 @@ def verify(path: Made, as_json: Json = False) -> None:
 
     Reads every file, and those inputs that lie within PATH. What is still being made is named, not checked.
     """
+    from hypogoal import look
     from hypogoal.experiments.sweep import in_the_making
-    from hypogoal.look import faults, parts_of
 
-    found, notes = faults(path), in_the_making(path)
+    found, notes = look.faults(path), in_the_making(path)
     state = "whole so far" if notes else "whole"
-    verdict = f"{path}: {state if parts_of(path) else 'nothing is complete yet'}"
+    verdict = f"{path}: {state if look.parts_of(path) else 'nothing is complete yet'}"
     echo({"path": str(path), "faults": found, "notes": notes}, as_json, [*(found or [verdict]), *notes])
     if found:
         raise typer.Exit(2)
@@ -304,18 +301,18 @@ def verify(path: Made, as_json: Json = False) -> None:
 @command(LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
     """Say what is stale or unfinished, why, and which commands renew it."""
+    from hypogoal import look
     from hypogoal.experiments.sweep import in_the_making
-    from hypogoal.look import stale, stale_lines
 
-    rows = stale(path)
-    echo(rows, as_json, [*in_the_making(path), *stale_lines(rows)])
+    rows = look.stale(path)
+    echo(rows, as_json, [*in_the_making(path), *look.stale_lines(rows)])
 
 
 @command(LOOK, "config train-ensemble --domain montezuma")
 def config(
     stage: Annotated[str | None, Argument(help="For example train-meta; without it, the list of stages.")] = None,
     domain: Annotated[str, Option(help=f"Settings for: {DOMAINS}")] = "doorkey",
-    preset: Preset = None,
+    preset: stages.Preset = None,
     write: Annotated[Path | None, Option(help="Write them as a preset to edit: a new .toml file for --preset.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -343,7 +340,7 @@ def config(
 
 def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
     """Settings under the parts that they belong to; a range such as 0-9 or a command stays in one piece."""
-    width = min(shutil.get_terminal_size().columns, WIDTH)
+    width = min(shutil.get_terminal_size().columns, stages.WIDTH)
     wrapped = textwrap.TextWrapper(width, " " * 6, " " * 6, break_on_hyphens=False, break_long_words=False)
     for part, settings in itertools.groupby(rows, lambda row: row["part"]):
         yield f"{part.replace('`', '')}:"
@@ -365,16 +362,16 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
 def compare(
     runs: Annotated[list[Path], Argument(metavar="RUN...", help="Evaluated; each is compared with the first.")],
     out: Annotated[Path | None, Option(help="Where to write a page; else who wins is printed.")] = None,
-    force: Force = False,
+    force: stages.Force = False,
 ) -> None:
     """Put evaluated runs side by side: what differs, who wins."""
-    from hypogoal.look import describe, outcome
+    from hypogoal import look
     from hypogoal.tools.compare import compare as compared
 
     with tempfile.TemporaryDirectory() as folder:
         place = out or Path(folder, "comparison")
         page = compared(runs, place, force=force)
-        for line in outcome(describe(place)):
+        for line in look.outcome(look.describe(place)):
             say(line)
     if out is not None:
         say(page)
@@ -383,7 +380,7 @@ def compare(
 @command(OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
     source: Annotated[Path, Argument(help="Arrays, pictures, or episodes (Minari, LeRobot, robomimic, films).")],
-    out: Out,
+    out: stages.Out,
     sub_goal: Annotated[
         list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
     ] = None,
@@ -403,17 +400,17 @@ def import_(
     group: Annotated[str, Option(help="Arrays: which one says what states belong together; held out whole.")] = "",
     stack: Annotated[bool, Option("--stack", metavar="", help="Axes of frames and colours become channels.")] = False,
     domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
-    seed: Seed = 0,
-    force: Force = False,
-    quiet: Quiet = False,
+    seed: stages.Seed = 0,
+    force: stages.Force = False,
+    quiet: stages.Quiet = False,
 ) -> None:
     """Make a data file of your arrays, pictures or recorded episodes."""
+    from hypogoal import look
     from hypogoal.data import open_dataset
-    from hypogoal.importing.data_file import import_data
-    from hypogoal.look import count_lines
+    from hypogoal.importing import data_file, taken
 
     sides = _sides(resize or ())
-    said = import_data(
+    said = data_file.import_data(
         source,
         out,
         sub_goals=sub_goal or (),
@@ -432,7 +429,7 @@ def import_(
         say(f"hypogoal: {line}", err=True)
     if not quiet:
         dataset = open_dataset(out)
-        for line in (*_reading(dataset, resized=bool(sides)), *count_lines(dataset.counts())):
+        for line in (*taken.told(dataset, resized=bool(sides)), *look.count_lines(dataset.counts())):
             say(line)
         run_folder = out.parent if out.name == "data.h5" else Path("runs", out.stem)
         say(f"next: {own_code.command('train-ensemble', out, '--out', run_folder / 'ensemble')}")
@@ -461,26 +458,14 @@ def _sides(texts: Iterable[str]) -> dict[str, int]:
     return sides
 
 
-def _reading(dataset: Any, resized: bool) -> Iterable[str]:
-    """How states were read, as pictures or numbers; of large pictures, how to import them smaller."""
-    from hypogoal.observations import PICTURE, fields_of
-
-    for key, (dtype, shape) in fields_of(dataset.observation_shape, dataset.observation_dtype).items():
-        sizes = " x ".join(map(str, shape))
-        kind = "pictures" if dtype == PICTURE else "numbers"
-        yield f"{key or 'states'}: taken for {kind}, {sizes} {dtype}"
-        if dtype == PICTURE and max(shape[:2]) > LARGE and not resized:
-            yield f"pictures of {sizes} need much memory and time; add --resize {LARGE} --force"
-
-
 @command(OWN, "export data/doorkey.h5 --out states.npz")
 def export(
     source: Annotated[Path, Argument(help="A data file, or the folder of a meta or an ensemble artefact.")],
     out: Annotated[Path, Option(help="The .npz file, or the folder; a Minari dataset's is NAME-v0.")],
     episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
     seed: Annotated[int, Option(min=0, help="Seed of the agent's choices.")] = 0,
-    force: Force = False,
-    quiet: Quiet = False,
+    force: stages.Force = False,
+    quiet: stages.Quiet = False,
 ) -> None:
     """Write states, an agent's episodes or an ensemble for other software.
 
@@ -500,8 +485,8 @@ def check(
     domain: Annotated[str | None, Argument(help=DOMAINS)] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
-    set_: Set = None,
-    seed: Seed = 0,
+    set_: stages.Set = None,
+    seed: stages.Seed = 0,
     layout_seed: Annotated[int, Option(min=0, help="The layout to play.")] = 0,
 ) -> None:
     """Check that your domain, objective or network keeps its contract.
@@ -509,7 +494,7 @@ def check(
     Exit code 2 if not. It collects a few states of the domain twice; --set
     changes how, as for 'collect'.
     """
-    from hypogoal.check import check_domain, check_network, check_objective
+    from hypogoal import check as contracts
     from hypogoal.core.config import assigned
     from hypogoal.diversity import load_objective
     from hypogoal.domains.base import load_domain, settings_of
@@ -521,12 +506,12 @@ def check(
     if domain is not None:
         loaded = load_domain(domain)
         settings = settings_of("collect", domain, typed=assigned(set_ or ()))
-        verdicts.append(check_domain(loaded, settings, layout_seed=layout_seed, seed=seed))
+        verdicts.append(contracts.check_domain(loaded, settings, layout_seed=layout_seed, seed=seed))
         observations = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
-        verdicts.append(check_objective(load_objective(diversity)))
+        verdicts.append(contracts.check_objective(load_objective(diversity)))
     if network is not None:
-        verdicts.append(check_network(network, *observations))
+        verdicts.append(contracts.check_network(network, *observations))
     broken = False
     for verdict in itertools.chain(*verdicts):
         broken |= not verdict.ok

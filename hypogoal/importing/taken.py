@@ -10,11 +10,21 @@ from hypogoal.core.errors import UserError
 from hypogoal.data import Labels
 from hypogoal.domains.observations import CLEARLY, Reading, reading_of, shrunk_picture
 from hypogoal.importing.parts import Array
-from hypogoal.observations import NUMBERS, PICTURE, DType, Observations, Shape, packed, spread_rows, type_text
+from hypogoal.observations import (
+    NUMBERS,
+    PICTURE,
+    DType,
+    Observations,
+    Shape,
+    packed,
+    spread_rows,
+    type_text,
+)
 
 STACKED = "'import --stack' puts stacked frames among the channels."
 MOST_COMPARED = 2_000  # rows of numbers that are compared before and after the cast to float32, spread evenly
 LEFT = 0.9  # the share of a column's distinct values that float32 must keep
+LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
 NAMED = 4  # columns that a message names
 
 
