@@ -98,7 +98,7 @@ def test_what_is_complete_is_kept(tiny_run: Path) -> None:
     }
     for out, words in commands.items():
         said = run(*words)
-        assert said.out == f"{out}\n" and f"{out} is complete already" in said.err
+        assert said.out == f"{out}\n" and " is complete already" in said.err
 
 
 def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
@@ -159,8 +159,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("evaluate {ensemble} --out {ensemble} --force", "would replace an input"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
         ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
-        ("train-ensemble {data} --out {out} --seed 9007199254740992", "--seed"),
-        ("collect doorkey --out {out} --seed 36893488147419103232", "--seed"),
+        ("collect doorkey --out {out} --seed -1", "a seed is 0 or more"),
         ("collect chess --out {out}", "unknown domain: chess"),
         ("collect nosuchmodule:DOMAIN --out {out}", "cannot be loaded"),
         ("run doorkey --out {out} --preset turbo", "no such preset: turbo"),

@@ -88,7 +88,7 @@ def test_what_would_end_a_command_is_an_error(run: Path, tmp_path: Path) -> None
         ({"diversity": "none:such"}, "cannot be loaded"),
         ({"preset": "none-such"}, "no such preset"),
         ({"device": "tpu"}, "unknown device"),
-        ({"seed": -1}, "'seed'"),
+        ({"seed": -1}, "a seed is 0 or more"),
     ]
     for given, words in cases:
         with pytest.raises(UserError, match=words):
