@@ -150,10 +150,10 @@ def _commands() -> Any:
 
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
-    group = _commands()
+    found = {name: command for name, command in _commands().commands.items() if not command.hidden}
     for name in STAGES:
-        group.add_command(stage_command(name))
-    return dict(group.commands)
+        found[name] = stage_command(name)
+    return found
 
 
 def _called(words: list[str]) -> int:

@@ -14,7 +14,7 @@ WHERE = "Where to play; without it, look at the data that the members were train
 
 
 @stage(
-    "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out runs/audit",
+    "audit ensemble --domain doorkey --sub-goal go-to-goal --out audit",
     often=["steps", "layout_seed", "option_timeout", "mend"],
 )
 def audit(
