@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from hypogoal.evaluation.run import Contents
 SAID_ELSEWHERE = ("layout_seed", "start", "domain_config")  # settings that alone do not make another list
 
 
-def provenance(contents: Contents, data: list[Path]) -> dict[str, Any]:
+def provenance(contents: Contents, data: Sequence[Path]) -> dict[str, Any]:
     """Spec A8: what everything was made from and with."""
     artefacts = [
         {

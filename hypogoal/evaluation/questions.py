@@ -53,7 +53,7 @@ def agents_last() -> list[Question]:
     return [*QUESTIONS[1:], QUESTIONS[0]]
 
 
-def work_of(contents: Contents, arrays: Any, progress: Progress, layouts: Sequence[int]) -> Work:
+def work_of(contents: Contents, arrays: Any, progress: Progress, layouts: tuple[int, ...]) -> Work:
     """What the questions work with: a run, the file of its arrays, and layouts that agents play without learning."""
     agents = group_runs([read_run(artefact, contents.name(artefact)) for artefact in contents.agents])
     return Work(contents, arrays, progress, layouts, agents=agents)

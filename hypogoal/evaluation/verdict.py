@@ -154,7 +154,7 @@ def tasks(work: Work) -> list[str]:
 
 def scenes(work: Work) -> list[dict[str, Any]]:
     """The domain's scenes of the first agent's task, their pictures put into the arrays as ``scenes/<i>``."""
-    first = next((work.artefact(runs[0].path).config for runs in work.agents.values()), {})
+    first: Mapping[str, Any] = next((work.artefact(runs[0].path).config for runs in work.agents.values()), {})
     domain = installed_domain(first["domain"]) if first.get("domain") else None
     shown = domain.scenes(domain.world(first.get("domain_config") or {})) if domain else ()
     for index, scene in enumerate(shown):

@@ -1,13 +1,13 @@
 """What is taken for what: states as read become pictures or numbers, key by key (the table in docs/own-domain.md)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import Labels
+from hypogoal.data import Dataset, Labels
 from hypogoal.domains.observations import CLEARLY, Reading, reading_of, shrunk_picture
 from hypogoal.importing.parts import Array
 from hypogoal.observations import (
@@ -16,6 +16,7 @@ from hypogoal.observations import (
     DType,
     Observations,
     Shape,
+    fields_of,
     packed,
     spread_rows,
     type_text,
@@ -94,6 +95,17 @@ class Taking:
         if reading.fault and not (self.stack and stackable):
             raise UserError(f"{where} {reading.fault}", actual, f"{CLEARLY} {STACKED}" if stackable else CLEARLY)
         return reading
+
+
+def told(dataset: Dataset, *, resized: bool) -> Iterator[str]:
+    """How the states of a data file were read, a line a key; of large pictures, how to import them smaller."""
+    fields = fields_of(dataset.observation_shape, dataset.observation_dtype)
+    for key, (dtype, shape) in fields.items():
+        sizes = " x ".join(map(str, shape))
+        kind = "pictures" if dtype == PICTURE else "numbers"
+        yield f"{key or 'states'}: taken for {kind}, {sizes} {dtype}"
+        if dtype == PICTURE and max(shape[:2]) > LARGE and not resized:
+            yield f"pictures of {sizes} need much memory and time; add --resize {LARGE} --force"
 
 
 def channels_of(value: Array, key: str) -> dict[str, tuple[int, int]]:

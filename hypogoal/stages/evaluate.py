@@ -1,7 +1,7 @@
 """Spec A5, F: every number of the report, from whatever artefacts a run has; what is missing is named."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -34,7 +34,7 @@ def evaluate(
 
     prepare()
     played = tuple(layout_seeds(layouts)) if layouts else ()
-    settings = dict(questions.SETTINGS)
+    settings: dict[str, Any] = dict(questions.SETTINGS)
     if layouts:
         settings["layouts"] = layouts
     contents = find(run)

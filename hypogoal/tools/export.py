@@ -187,7 +187,7 @@ def export_episodes(
 def _observation_space(engine: Engine) -> spaces.Space[Any]:
     """The space of an engine's observations, a ``Dict`` of those with keys."""
     fields = fields_of(engine.observation_shape, engine.observation_dtype)
-    boxes = {key: _box(shape, dtype) for key, (dtype, shape) in fields.items()}
+    boxes: dict[str, spaces.Space[Any]] = {key: _box(shape, dtype) for key, (dtype, shape) in fields.items()}
     return boxes[""] if "" in boxes else spaces.Dict(boxes)
 
 
