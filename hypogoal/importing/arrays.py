@@ -29,7 +29,7 @@ def read_arrays(path: Path, group: str = "") -> Parts:
                 arrays[file.relative_to(path).with_suffix("").as_posix()] = np.load(file, allow_pickle=False)
     else:
         # NumPy leaves a cut archive open.
-        with reading(path, DO), path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        with reading(path, DO), path.open("rb") as raw, np.load(raw, allow_pickle=False) as stored:
             arrays.update(stored)
     return parts_of(arrays, path, group)
 

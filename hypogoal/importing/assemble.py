@@ -64,9 +64,11 @@ def assemble(
     contradictions(labelled, goals, of_labelled)
     said += near_duplicates(labelled, heldout, goals, (of_labelled, [test_names[row] for row in heldout.origins[ROW]]))
     said += hard_to_learn(labelled.labels, goals) + hard_to_judge(heldout.labels, goals)
-    sets = [replace(states, origins=_rows(states)) for states in (labelled, unlabelled, heldout)]
+    sets = labelled, unlabelled, heldout
+    labelled, unlabelled, heldout = [replace(states, origins=_rows(states)) for states in sets]
     shape = labelled.observations.shape[1:]
-    return Collected(shape, goals, *sets, tuple(parts.features), parts.channels), said
+    channels = {key.replace("/", "."): meaning for key, meaning in parts.channels.items()}
+    return Collected(shape, goals, labelled, unlabelled, heldout, tuple(parts.features), channels), said
 
 
 def _doubts(given: Given) -> list[str]:
@@ -77,7 +79,8 @@ def _doubts(given: Given) -> list[str]:
 
 def _states(given: Given, kind: str, taking: Taking, like: States | None = None) -> States:
     """Checked states, with their rows as origins; ``like`` are the labelled ones."""
-    observations = taking.observations(given.observations, f"the {kind} observations", like and like.observations)
+    pattern = like.observations if like else None
+    observations = taking.observations(given.observations, f"the {kind} observations", pattern)
     goals = like.labels.shape[1] if like else None
     if given.labels is None:
         labels = np.zeros((len(observations), goals or 0), np.bool_)

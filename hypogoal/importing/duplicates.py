@@ -34,7 +34,7 @@ def contradictions(states: States, goals: Sequence[str], names: Sequence[str]) -
         if not len(both):
             continue
         equal = looks == both[0]
-        pair = f"{names[np.argmax(equal & column)]} and {names[np.argmax(equal & ~column)]}"
+        pair = f"{names[int(np.argmax(equal & column))]} and {names[int(np.argmax(equal & ~column))]}"
         for of_kind, one, other in ((column, "positive", "negative"), (~column, "negative", "positive")):
             if np.isin(looks[of_kind], both).all():
                 do = "Remove the copies whose label is wrong."

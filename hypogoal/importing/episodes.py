@@ -122,8 +122,12 @@ def recorded_parts(
     said = [f"not read: {', '.join(sorted(texts))}, neither pictures nor numbers"] if texts else []
     if empty:
         said.append(f"not read: {empty} of {empty + len(taken.episodes)} episodes, without frames")
-    sets = [taken.given(part) for part in split_episodes(taken.listed, taken.held_out, seed, source)]
-    return Parts(*sets, tuple(rules), channels=taken.channels), said
+    parts = split_episodes(taken.listed, taken.held_out, seed, source)
+    labelled, unlabelled, heldout = [taken.given(part) for part in parts]
+    channels = taken.channels
+    if len(taken.frames) == 1:  # its key is left out
+        channels = dict(zip([""], channels.values(), strict=False))
+    return Parts(labelled, unlabelled, heldout, tuple(rules), channels=channels), said
 
 
 def _chosen(recording: Recording, keys: Sequence[str], where: str) -> list[str]:

@@ -131,7 +131,8 @@ def with_labels(dataset: Dataset, table: Path, sub_goal: str) -> tuple[Collected
     heldout = States(test.observations, test.labels[:, None], test.origins)
     features = tuple(dataset.features()) if dataset.observation_dtype == NUMBERS else ()
     shape = dataset.observation_shape
-    return Collected(shape, (sub_goal,), joined([before, new]), rest, heldout, features), len(labels)
+    sets = joined([before, new]), rest, heldout
+    return Collected(shape, (sub_goal,), *sets, features, dataset.channels), len(labels)
 
 
 def _labels_in(table: Path, observations: Observations) -> dict[int, bool]:

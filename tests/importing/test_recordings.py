@@ -19,6 +19,7 @@ from command_line import refuses, run
 from hypogoal.data import Dataset, open_dataset
 from hypogoal.importing.episodes import kept, split_episodes
 from hypogoal.importing.films import count_frames, frames_at
+from hypogoal.observations import digest
 from tests.importing import robot_data
 from tests.importing.robot_data import LENGTHS, STATE, TOP, WRIST
 from tests.importing.states import SIDE, save_minari
@@ -238,6 +239,20 @@ def test_links_out_of_a_folder_are_followed(datasets: Path, tmp_path: Path) -> N
         link.symlink_to(os.path.relpath(cache / str(number), link.parent))
     plain = imported(datasets / "v3.0-video", tmp_path / "plain.h5", *LABEL)
     np.testing.assert_array_equal(imported(snapshot, tmp_path / "linked.h5", *LABEL).unlabelled(), plain.unlabelled())
+
+
+def test_what_channels_mean_is_kept(tmp_path: Path) -> None:
+    """Spec B6: of a stack of pictures in a recording, and when its states are labelled later."""
+    states = np.random.default_rng(0).integers(0, 255, (5, 6, 4, 24, 28, 3), dtype=np.uint8)
+    with h5py.File(tmp_path / "x.hdf5", "w") as file:
+        for demo, frames in enumerate(states):
+            file[f"data/demo_{demo}/obs/front"] = frames
+            file[f"data/demo_{demo}/rewards"] = np.arange(6) > 2
+    data = imported(tmp_path / "x.hdf5", tmp_path / "data.h5", "--label", "on=rewards", "--stack")
+    assert data.observation_shape == (24, 28, 12) and data.channels == {"": [4, 3]}
+    (tmp_path / "t.csv").write_text(f"row,label,digest\n1,1,{digest(data.unlabelled()[1]).hex()}\n")
+    more = imported(tmp_path / "data.h5", tmp_path / "more.h5", "--label", f"on={tmp_path / 't.csv'}")
+    assert more.channels == data.channels
 
 
 def without(name: str) -> Callable[[Path], None]:
