@@ -8,7 +8,7 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.24.0"
+__version__ = "0.25.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options, report
