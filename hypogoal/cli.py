@@ -150,10 +150,10 @@ def _commands() -> Any:
 
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
-    found = {name: command for name, command in _commands().commands.items() if not command.hidden}
+    every = {name: command for name, command in _commands().commands.items() if not command.hidden}
     for name in STAGES:
-        found[name] = stage_command(name)
-    return found
+        every[name] = stage_command(name)
+    return every
 
 
 def _called(words: list[str]) -> int:
@@ -290,11 +290,11 @@ def verify(path: Made, as_json: Json = False) -> None:
     from hypogoal import look
     from hypogoal.experiments.sweep import in_the_making
 
-    found, notes = look.faults(path), in_the_making(path)
+    faults, notes = look.faults(path), in_the_making(path)
     state = "whole so far" if notes else "whole"
     verdict = f"{path}: {state if look.parts_of(path) else 'nothing is complete yet'}"
-    echo({"path": str(path), "faults": found, "notes": notes}, as_json, [*(found or [verdict]), *notes])
-    if found:
+    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [verdict]), *notes])
+    if faults:
         raise typer.Exit(2)
 
 
@@ -410,7 +410,7 @@ def import_(
     from hypogoal.importing import data_file, taken
 
     sides = _sides(resize or ())
-    said = data_file.import_data(
+    remarks = data_file.import_data(
         source,
         out,
         sub_goals=sub_goal or (),
@@ -425,7 +425,7 @@ def import_(
         seed=seed,
         force=force,
     )
-    for line in said:
+    for line in remarks:
         say(f"hypogoal: {line}", err=True)
     if not quiet:
         dataset = open_dataset(out)

@@ -92,10 +92,10 @@ class Unmet(UserError):
 
 def leave_out(states: States, *training: Observations) -> States:
     """Spec B3: the states without those that look like one of ``training``, observations (M, ...) each."""
-    known: set[bytes] = set()
+    digests: set[bytes] = set()
     for observations in training:
-        known.update(map(digest, observations))
-    return states.where(np.array([digest(observation) not in known for observation in states.observations], np.bool_))
+        digests.update(map(digest, observations))
+    return states.where(np.array([digest(observation) not in digests for observation in states.observations], np.bool_))
 
 
 def joined(parts: Sequence[States]) -> States:
@@ -156,15 +156,15 @@ def reading(path: Path, subject: str = "the data file", do: str = RECOLLECT) -> 
         with h5py.File(path, "r", locking="best-effort") as file:
             yield file
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        what = os.strerror(error.errno or 0).lower()
-        raise UserError(f"{subject} cannot be read: {what}", path, "Is it the right path?") from None
+        cause = os.strerror(error.errno or 0).lower()
+        raise UserError(f"{subject} cannot be read: {cause}", path, "Is it the right path?") from None
     except UNREADABLE as error:
-        what = str(error)
-        if "h5clear" in what:
+        cause = str(error)
+        if "h5clear" in cause:
             do = f"If no program writes it any more, one has crashed: h5clear -s {path}"
-        elif "unable to lock" in what:
+        elif "unable to lock" in cause:
             do = "It is open in another program: close it there first."
-        raise UserError(f"{subject} cannot be read: {what}", path, do) from None
+        raise UserError(f"{subject} cannot be read: {cause}", path, do) from None
 
 
 @contextlib.contextmanager
@@ -388,24 +388,24 @@ def _names_of_fields(dtype: DType) -> list[str]:
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
     with reading(path) as file:
-        found = {name: _plain(value) for name, value in file.attrs.items()}
-        version = found.get("format")
+        attributes = {name: _plain(value) for name, value in file.attrs.items()}
+        version = attributes.get("format")
         if not isinstance(version, int):
             raise UserError("not a hypogoal data file", path, "'hypogoal collect' and 'hypogoal import' make one.")
         if version != DATA_FORMAT:
             do = RECOLLECT if version < DATA_FORMAT else "Upgrade hypogoal."
             raise UserError(f"the data file has format {version}, this hypogoal reads {DATA_FORMAT}", path, do)
-        if not found["complete"]:
+        if not attributes["complete"]:
             raise UserError("the data file is not complete", path, RECOLLECT)
         dataset = Dataset(
             path=path,
-            domain=found["domain"],
-            config=json.loads(found["config"]),
-            seed=found["seed"],
-            sub_goals=tuple(json.loads(found["sub_goals"])),
-            observation_shape=tuple(json.loads(found["observation_shape"])),
-            observation_dtype=type_of(found["observation_dtype"]),
-            channels=json.loads(found.get("channels", "{}")),
+            domain=attributes["domain"],
+            config=json.loads(attributes["config"]),
+            seed=attributes["seed"],
+            sub_goals=tuple(json.loads(attributes["sub_goals"])),
+            observation_shape=tuple(json.loads(attributes["observation_shape"])),
+            observation_dtype=type_of(attributes["observation_dtype"]),
+            channels=json.loads(attributes.get("channels", "{}")),
         )
     require_names(dataset.sub_goals)
     return dataset

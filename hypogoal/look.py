@@ -145,13 +145,13 @@ def _wrapped(line: str) -> list[str]:
 
 def faults(path: Path) -> list[str]:
     """A line for each data file that cannot be read, and each file or input within that is missing or changed."""
-    found = []
+    lines = []
     for part in parts_of(path):
         try:
-            found += [f"{part}: {fault}" for fault in _faults_of(part, path.resolve())]
+            lines += [f"{part}: {fault}" for fault in _faults_of(part, path.resolve())]
         except UserError as error:
-            found.append(str(error))
-    return found
+            lines.append(str(error))
+    return lines
 
 
 def _faults_of(part: Path, within: Path) -> list[str]:
@@ -159,12 +159,12 @@ def _faults_of(part: Path, within: Path) -> list[str]:
         _read_all(part)
         return []
     artefact = Artefact(part)
-    found = [f"{name}: {fault}" for name, fault in artefact.file_faults().items()]
+    lines = [f"{name}: {fault}" for name, fault in artefact.file_faults().items()]
     for entry in artefact.manifest.inputs:
         fault = artefact.input_fault(entry)
         if fault and artefact.place_of(entry).is_relative_to(within):
-            found.append(f"its input {entry.path} ({entry.kind}) is {fault}")
-    return found
+            lines.append(f"its input {entry.path} ({entry.kind}) is {fault}")
+    return lines
 
 
 def _read_all(data: Path) -> None:
@@ -194,19 +194,19 @@ def stale(run: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _find_reasons(place: Path, known: dict[Path, list[str]]) -> list[str]:
+def _find_reasons(place: Path, reasons_of: dict[Path, list[str]]) -> list[str]:
     """Why a data file or an artefact is stale; enters it in ``known``, after its inputs."""
-    if place not in known:
+    if place not in reasons_of:
         reasons = []
         if place.is_dir():
             artefact = Artefact(place)
             reasons = artefact.faults()
             for entry in artefact.manifest.inputs:
                 source = artefact.place_of(entry)
-                if source.exists() and _find_reasons(source, known):
+                if source.exists() and _find_reasons(source, reasons_of):
                     reasons.append(f"its input {entry.path} is stale")
-        known[place] = reasons
-    return known[place]
+        reasons_of[place] = reasons
+    return reasons_of[place]
 
 
 def stale_lines(rows: Rows) -> list[str]:

@@ -183,7 +183,7 @@ def _require_same(first: Engine, second: Engine, actions: NDArray[np.int64], do:
 
 def _require_array(name: str, value: Any, dtype: Any, *shape: int) -> None:
     """Refuse anything but a NumPy array of this type and shape."""
-    found = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
+    actual = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
     wanted = f"{np.dtype(dtype)} {shape}"
-    fits = isinstance(value, np.ndarray) and found == wanted
-    promise(fits, f"{name}: {found} instead of {wanted}", "Give a NumPy array of that type and shape.")
+    fits = isinstance(value, np.ndarray) and actual == wanted
+    promise(fits, f"{name}: {actual} instead of {wanted}", "Give a NumPy array of that type and shape.")

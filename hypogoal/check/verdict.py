@@ -50,13 +50,13 @@ def verdicts(laws: Iterable[Callable[[Any], str]], subject: Any) -> Iterator[Ver
                 ok, text = False, str(error)
             except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code raises
                 ok, text = False, str(of_user(error) or UserError(type(error).__name__, error))
-        told = dict.fromkeys(str(warning.message) for warning in caught)
-        yield Verdict(law.__name__.replace("_", " "), ok, text, tuple(told))
+        texts = dict.fromkeys(str(warning.message) for warning in caught)
+        yield Verdict(law.__name__.replace("_", " "), ok, text, tuple(texts))
         if not ok:
             return
 
 
-def require(found: Iterable[Verdict]) -> None:
+def require(results: Iterable[Verdict]) -> None:
     """For a test suite: raise an ``AssertionError`` that says which law is broken, if one is."""
-    for verdict in found:
+    for verdict in results:
         assert verdict.ok, "\n".join(verdict.lines)

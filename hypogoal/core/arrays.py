@@ -33,11 +33,11 @@ class Columns(Resumable):
     def types(cls) -> dict[str, type[np.generic]]:
         """The NumPy type that each field's annotation says."""
         hints = get_type_hints(cls)
-        found = {}
+        kinds = {}
         for name in cls.names():
             _shape, dtype = get_args(hints[name])
-            found[name] = get_args(dtype)[0]
-        return found
+            kinds[name] = get_args(dtype)[0]
+        return kinds
 
     @classmethod
     def zeros(cls, *shape: int) -> Self:

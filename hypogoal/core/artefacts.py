@@ -238,7 +238,7 @@ class Draft:
         At the end a draft is removed that has neither a checkpoint nor a finished output.
         """
         lock = FileLock(self.lock, timeout=PATIENCE_SECONDS)
-        made = [folder for folder in self.folder.parents if not folder.exists()]
+        missing = [folder for folder in self.folder.parents if not folder.exists()]
         while not lock.is_locked:
             self.folder.mkdir(parents=True, exist_ok=True)
             try:
@@ -255,7 +255,7 @@ class Draft:
                 self._clear()
                 shutil.rmtree(self.folder, ignore_errors=True)  # the lock last
                 with contextlib.suppress(OSError):
-                    for folder in made:
+                    for folder in missing:
                         folder.rmdir()
             lock.release()
 
@@ -335,21 +335,21 @@ def _input(path: Path, out: Path) -> Input:
 
 def _begun(draft: Draft, wanted: Manifest, out: Path, *, force: bool, resume: bool) -> Manifest | None:
     """How the draft to continue was begun; None: begin anew. May I write here? If not, a ``UserError``."""
-    there = kind_of(out)
-    if there not in (None, wanted.kind):
-        what = f"of kind {there!r}" if there else "none of hypogoal's"
-        raise UserError(f"what is there is not of kind {wanted.kind!r} but {what}", out, AWAY)
+    kind = kind_of(out)
+    if kind not in (None, wanted.kind):
+        description = f"of kind {kind!r}" if kind else "none of hypogoal's"
+        raise UserError(f"what is there is not of kind {wanted.kind!r} but {description}", out, AWAY)
     if draft.is_resumable and resume:
         begun = _read_manifest(draft.begun, ANEW)
         _refuse_other(begun, wanted, "the unfinished output was begun", out)
         return begun
     if draft.is_resumable and not force:
         raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
-    if there and resume:
-        made = _made(out).model_copy(update={"versions": {}})  # nothing is continued
-        _refuse_other(made, wanted, "the complete output was made", out)
+    if kind and resume:
+        complete = _made(out).model_copy(update={"versions": {}})  # nothing is continued
+        _refuse_other(complete, wanted, "the complete output was made", out)
         raise Complete(out)
-    if there and not force:
+    if kind and not force:
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
     return None
 

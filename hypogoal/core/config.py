@@ -157,9 +157,9 @@ def resolve(model: type[C], *layers: Mapping[str, Any], stage: str) -> C:
     values: dict[str, Any] = {}
     typed: set[str] = set()
     for layer in layers:
-        given = {name: value for name, value in layer.items() if value is not None}
-        typed = set(given)
-        values |= given
+        entries = {name: value for name, value in layer.items() if value is not None}
+        typed = set(entries)
+        values |= entries
     chosen = _with_parts(model, values)
     for name in [*values]:
         if name not in typed and name not in chosen.model_fields and _choices_with(model, name):
@@ -252,8 +252,8 @@ def _allowed(field: FieldInfo) -> str:
     """The values that a setting may have, in a few words; empty if all of its type."""
     details = _details(field)
     if details.get("choices") is not None:
-        own = [OWN] if details["own"] else []
-        return "|".join([*map(str, details["choices"]), *own])
+        others = [OWN] if details["own"] else []
+        return "|".join([*map(str, details["choices"]), *others])
     low, high = ("" if details.get(bound) is None else details[bound] for bound in ("low", "high"))
     return "" if low == high == "" else f"{low} .. {high}".strip()
 
@@ -280,10 +280,10 @@ def _joined(model: type[C], *parts: type[Config]) -> Any:
 
 def _choices_with(model: type[Config], name: str) -> list[str]:
     """The choices, SETTING=VALUE, that bring the setting ``name``."""
-    found = []
+    choices = []
     for setting_name, models in model.PARTS.items():
-        found += [f"{setting_name}={value}" for value, part in models.items() if name in part.model_fields]
-    return found
+        choices += [f"{setting_name}={value}" for value, part in models.items() if name in part.model_fields]
+    return choices
 
 
 def _refusal(model: type[Config], values: Mapping[str, Any], error: ValidationError, stage: str) -> UserError:

@@ -113,5 +113,5 @@ def plain_names(names: object) -> bool:
 
 def visible(folder: Path, pattern: str) -> list[Path]:
     """The paths below a folder that match a pattern, sorted; hidden ones, such as drafts, are left out."""
-    found = [path for path in folder.rglob(pattern) if "/." not in f"/{path.relative_to(folder).as_posix()}"]
-    return sorted(found)
+    paths = [path for path in folder.rglob(pattern) if "/." not in f"/{path.relative_to(folder).as_posix()}"]
+    return sorted(paths)

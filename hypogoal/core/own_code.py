@@ -71,14 +71,14 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
     Modules in the current folder can be loaded too; installed ones come first. An unknown name, one that cannot be
     loaded, and code that the user did not allow are a ``UserError``, whose message calls it by its ``role``.
     """
-    known = dict(built_in)
-    if name not in known:
-        known.update({entry.name: entry.value for entry in metadata.entry_points(group=group)})
-    target = known.get(name, name)
-    if name not in known and ":" not in name:
-        names = ", ".join(sorted(known))
+    places = dict(built_in)
+    if name not in places:
+        places.update({entry.name: entry.value for entry in metadata.entry_points(group=group)})
+    target = places.get(name, name)
+    if name not in places and ":" not in name:
+        names = ", ".join(sorted(places))
         raise UserError(f"unknown {role}", name, f"Choose one of {names}, or give module:object.")
-    if name not in known:
+    if name not in places:
         require_trust(name, role)
         if os.getcwd() not in sys.path:
             sys.path.append(os.getcwd())

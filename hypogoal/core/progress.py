@@ -60,8 +60,8 @@ class Progress:
         """``done`` units are done in total."""
         self.done = done
         if numbers:
-            known = [f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value)]
-            self._task.fields["numbers"] = " ".join(known)
+            texts = [f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value)]
+            self._task.fields["numbers"] = " ".join(texts)
         self._bar.update(self._task.id, completed=done, total=self.total)
         overdue = time.monotonic() - self._said >= LINE_SECONDS
         if overdue and done < self.total and not self.quiet and not self._terminal:

@@ -69,5 +69,5 @@ def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: st
 
     with torch.device("cpu" if custom else "meta"):
         module = make()
-    own = {name: tensor.clone() for name, tensor in weights.items()}
-    return load_into(module, own, where, assign=not custom)
+    copies = {name: tensor.clone() for name, tensor in weights.items()}
+    return load_into(module, copies, where, assign=not custom)

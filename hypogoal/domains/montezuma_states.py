@@ -158,8 +158,8 @@ def gather(
     """
     rng = rng_for(seed, *stream, room)
     left_out = set() if unclear else {(goal.name, place) for goal in sub_goals for place in goal.unclear}
-    here = {(goal.name, place) for goal in sub_goals for place, at in enumerate(goal.places) if at.room == room}
-    positives = dict.fromkeys(here - left_out, 0)
+    present = {(goal.name, place) for goal in sub_goals for place, at in enumerate(goal.places) if at.room == room}
+    positives = dict.fromkeys(present - left_out, 0)
 
     def enough() -> bool:
         if len(pool) < SPARE * wanted:

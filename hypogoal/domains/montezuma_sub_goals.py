@@ -62,8 +62,8 @@ class Enemy:
     def beyond(self, side: str, facts: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether agents, facts (n, ``FACTS``), stand on its floor and are past it on a side, bool (n,)."""
         away = facts[:, X] - (facts[:, FACTS.index(self.fact)] if self.fact else 0)
-        there = (facts[:, ROOM] == self.room) & (np.abs(facts[:, Y] - self.y) <= REACH)
-        return there & (away < self.left if side == "left" else away > self.right)
+        near = (facts[:, ROOM] == self.room) & (np.abs(facts[:, Y] - self.y) <= REACH)
+        return near & (away < self.left if side == "left" else away > self.right)
 
 
 ENEMIES = (

@@ -69,8 +69,8 @@ def comparison_of(paths: Sequence[Path], runs: Runs, rows: Mapping[str, Sequence
         artefacts = metrics["provenance"]["artefacts"]
         layouts = {artefact["config"]["layout_seed"] for artefact in artefacts if "layout_seed" in artefact["config"]}
         seeds = {artefact["seed"] for artefact in artefacts}
-        about = {"artefacts": len(artefacts), "seeds": sorted(seeds), "layout_seeds": sorted(layouts)}
-        described.append({"label": label, "path": str(path), **about})
+        counts = {"artefacts": len(artefacts), "seeds": sorted(seeds), "layout_seeds": sorted(layouts)}
+        described.append({"label": label, "path": str(path), **counts})
     comparison = {
         "runs": described,
         "domains": domains_of(next(iter(runs.values()))),

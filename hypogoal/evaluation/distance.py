@@ -244,12 +244,12 @@ def view(work: Work) -> dict[str, Any]:
 
 def _named(work: Work) -> Iterator[tuple[Artefact, str, dict[str, Any]]]:
     """Each ladder's options, the path of their ensemble, empty where it is not the run's, and its method and N."""
-    known = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
+    methods_of = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
     paths, methods, groups = [], [], []
     for artefact in work.contents.ladders:
         source = Artefact(artefact.input("ensemble"))
         paths.append(within(work.contents, source) or "")
-        methods.append(known.get(paths[-1], ensemble_name(source.config)) if takes(artefact) else ORACLE)
+        methods.append(methods_of.get(paths[-1], ensemble_name(source.config)) if takes(artefact) else ORACLE)
         groups.append(groups_of(source.config) if takes(artefact) else None)
     names = ladder_names(methods, groups, [artefact.config for artefact in work.contents.ladders])
     for artefact, path, name, number in zip(work.contents.ladders, paths, names, groups, strict=True):

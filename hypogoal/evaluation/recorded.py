@@ -157,11 +157,11 @@ def picture_of(state: Observations, turned: Turned | None = None) -> NDArray[np.
 
 
 def member_findings(
-    known: States, known_scores: NDArray[np.floating], scores: NDArray[np.floating], thresholds: Sequence[float]
+    labelled: States, known_scores: NDArray[np.floating], scores: NDArray[np.floating], thresholds: Sequence[float]
 ) -> list[dict[str, Any]]:
     """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
     positive, rows = scores > np.asarray(thresholds), []
-    negatives = ~known.labels
+    negatives = ~labelled.labels
     for member, threshold in enumerate(thresholds):
         wrong = known_scores[negatives, member] > threshold
         others = np.delete(positive, member, axis=1).any(1)

@@ -46,12 +46,12 @@ def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
     dataset = open_dataset(data)
     ensemble = read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
     splits = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    known = joined([States(split.observations, split.labels) for split in splits])
+    labelled = joined([States(split.observations, split.labels) for split in splits])
     unlabelled = dataset.unlabelled()
     if not len(unlabelled):
         raise UserError("there are no unlabelled states to audit on", data, "Import or collect some.")
-    known_scores, scores = ensemble.predict(known.observations), ensemble.predict(unlabelled)
-    return Look(sub_goal, ensemble, known, known_scores, unlabelled, scores)
+    known_scores, scores = ensemble.predict(labelled.observations), ensemble.predict(unlabelled)
+    return Look(sub_goal, ensemble, labelled, known_scores, unlabelled, scores)
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ def _section(
         "policy would be drawn to first. Alone: unlabelled states that no other member predicts positive."
     )
     blocks: list[Block] = [page.table(columns, numbers["members"], caption=caption, heading="Members")]
-    what = "disagreement" if len(look.ensemble) > 1 else "prediction"
-    titles = [f"state {rows[row]}, {what} {disputed[row]:.2f}" for row in proposed[:CARDS]]
+    measure = "disagreement" if len(look.ensemble) > 1 else "prediction"
+    titles = [f"state {rows[row]}, {measure} {disputed[row]:.2f}" for row in proposed[:CARDS]]
     shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in proposed[:CARDS]]
     blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
     for member in range(len(look.ensemble)):

@@ -220,8 +220,8 @@ def _never(rows: Sequence[Entry]) -> str:
     }
     texts = []
     for (sub_goal, groups), accuracy in sorted(accuracies.items(), key=str):
-        of = ", ".join([sub_goal] * several + [f"N={groups}"] * (groups is not None))
-        texts.append(f"{accuracy:.2f}{of and f' ({of})'}")
+        scope = ", ".join([sub_goal] * several + [f"N={groups}"] * (groups is not None))
+        texts.append(f"{accuracy:.2f}{scope and f' ({scope})'}")
     text = f"A member that is never positive has accuracy {page.listed(texts)}. " if texts else ""
     bare = sorted({entry["groups"] for entry in rows if entry["positives"]["unseen"] == 0 and entry["groups"]})
     if not bare:

@@ -164,8 +164,8 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     with reading(source.path / "arrays.h5", "the evaluation's arrays", EVALUATE_AGAIN) as file:
         names: list[str] = []
         file.visit(names.append)
-        found = {name: file[name] for name in names if name.startswith(start)}
-        arrays = {name: np.asarray(item) for name, item in found.items() if hasattr(item, "shape")}
+        items = {name: file[name] for name in names if name.startswith(start)}
+        arrays = {name: np.asarray(item) for name, item in items.items() if hasattr(item, "shape")}
     return Evaluated(source, metrics, arrays)
 
 

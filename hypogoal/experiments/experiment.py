@@ -200,11 +200,11 @@ def _commands(file: _File, axes: Mapping[str, Sequence[Value]]) -> Iterator[Comm
     for row in file.cells:
         for values in product(*(axes[axis] for axis in row.axes)):
             point = dict(zip(row.axes, values, strict=True))
-            known: dict[str, Value] = {}
+            outputs: dict[str, Value] = {}
             for other in file.cells:
                 if point.keys() >= {*other.axes}:
-                    known[other.name] = f"@{other.at(point)}"
-            words = [word.format_map({**known, **point}) for word in shlex.split(row.command)]
-            for own in names_in(",".join(words)):
-                require_trust(own, "setting")
+                    outputs[other.name] = f"@{other.at(point)}"
+            words = [word.format_map({**outputs, **point}) for word in shlex.split(row.command)]
+            for name in names_in(",".join(words)):
+                require_trust(name, "setting")
             yield Command(row.at(point), shlex.join(words), {"group": row.name, **point})

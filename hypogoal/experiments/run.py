@@ -60,9 +60,9 @@ def plan(
         more = ["--preset", preset] if preset else []
         if device != "auto" and words[0] in MODELS:
             more += ["--device", device]
-        known = _known(words, domain, preset, of_stage[words[0]])
+        names = _known(words, domain, preset, of_stage[words[0]])
         for key, value in of_stage[words[0]].items():
-            if key in known and f"--{key.replace('_', '-')}" not in words:
+            if key in names and f"--{key.replace('_', '-')}" not in words:
                 more += ["--set", f"{key}={value}"]
         return more
 
@@ -78,8 +78,8 @@ def _known(words: Sequence[str], domain: str, preset: str | None, shared: Mappin
     if stage not in MODELS:
         return shared
     layers = [values for values, _ in layers_of(stage, domain, preset)]
-    _, own = _given(words)
-    return type(resolve(model_of(stage), *layers, shared, own, {}, stage=stage)).model_fields
+    _, typed = _given(words)
+    return type(resolve(model_of(stage), *layers, shared, typed, {}, stage=stage)).model_fields
 
 
 @cache
@@ -90,7 +90,7 @@ def _names_of(stage: str) -> frozenset[str]:
 
 def _given(words: Sequence[str]) -> tuple[str | None, dict[str, str]]:
     """The preset and the settings in the words of a command; ``--set`` wins over options."""
-    known = _names_of(words[0])
+    names = _names_of(words[0])
     preset, options, assignments = None, {}, []
     for option, value in pairwise(words):
         name = option.removeprefix("--").replace("-", "_")
@@ -98,7 +98,7 @@ def _given(words: Sequence[str]) -> tuple[str | None, dict[str, str]]:
             assignments.append(value)
         elif option == "--preset":
             preset = value
-        elif option.startswith("--") and name in known:
+        elif option.startswith("--") and name in names:
             options[name] = value
     return preset, options | assigned(assignments)
 
@@ -115,8 +115,8 @@ def _check_settings(cells: Sequence[Cell]) -> None:
         try:
             if cell.stage in MODELS:
                 allow(cell.words)  # a TOML file's are allowed already, the others are of code that the user gave
-                preset, given = _given(cell.words)
-                settings_of(cell.stage, domain, preset, given)
+                preset, typed = _given(cell.words)
+                settings_of(cell.stage, domain, preset, typed)
             elif cell.stage not in (*STAGES, "evaluate", "report"):
                 raise UserError("this is no stage", cell.stage, f"Choose one of {', '.join(STAGES)}.")
         except UserError as error:

@@ -223,8 +223,8 @@ def run_local(
     try:
         while True:
             todo = [cell for cell in todo if not cell.is_done(run)]
-            made = {name for name, cell in needed.items() if cell.is_done(run)}
-            makeable = [cell for cell in todo if made.issuperset(cell.needs)]
+            done = {name for name, cell in needed.items() if cell.is_done(run)}
+            makeable = [cell for cell in todo if done.issuperset(cell.needs)]
             ready = [cell for cell in makeable if not cell.draft(run).is_locked]
             free = (workers or cores()) - sum(each.cores for each in running)
             while ready and free > 0:
@@ -257,10 +257,10 @@ def run_local(
 
 def _ended(cell: Cell, run: Path, code: int) -> str:
     """Write down how an attempt ended; why it failed, empty if it did not."""
-    made = cell.is_done(run)
-    replace_text(cell.log(run, "code"), f"{code if code or made else 1}\n")
+    done = cell.is_done(run)
+    replace_text(cell.log(run, "code"), f"{code if code or done else 1}\n")
     if code == 0:
-        return "" if made else f"it ended as if all were well, but made nothing ({cell.log(run)})"
+        return "" if done else f"it ended as if all were well, but made nothing ({cell.log(run)})"
     last = f"ended by signal {-code}" if code < 0 else last_line(cell.log(run))
     return f"{last} ({cell.log(run)})"
 
@@ -276,10 +276,10 @@ def _starter(cells: Sequence[Cell], run: Path, forked: bool | None) -> Callable[
 
     def start(cell: Cell, cores: int) -> Any:
         before = dict(os.environ)
-        own = {**dict.fromkeys(THREADS, "1"), **before, **environment(), CORES: str(cores)}
+        variables = {**dict.fromkeys(THREADS, "1"), **before, **environment(), CORES: str(cores)}
         words = [*cell.command(run), "--resume"]
-        process = context.Process(target=_run_cell, args=(words, str(cell.log(run)), own))
-        os.environ.update(own, PYTHONSAFEPATH="1")  # a process that starts others imports no random.py from here
+        process = context.Process(target=_run_cell, args=(words, str(cell.log(run)), variables))
+        os.environ.update(variables, PYTHONSAFEPATH="1")  # a process that starts others imports no random.py from here
         try:
             process.start()
         finally:

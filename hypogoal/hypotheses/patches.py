@@ -96,7 +96,7 @@ def make_tables(observations: Sequence[NDArray[Any]], network: nn.Sequential) ->
     spread = np.linspace(0, total - 1, count).astype(np.int64)
     firsts = np.cumsum([0, *map(len, observations)])
     rows = [spread[(spread >= first) & (spread < end)] - first for first, end in pairwise(firsts)]
-    sample = _tables(np.concatenate([some[of] for some, of in zip(observations, rows, strict=True)]), windows)
+    sample = _tables(np.concatenate([some[which] for some, which in zip(observations, rows, strict=True)]), windows)
     spatial = [layer for layer in network if isinstance(layer, (nn.Conv2d, nn.MaxPool2d))]
     work = [  # multiplications, or comparisons, of each layer at one place
         layer.weight.numel() if isinstance(layer, nn.Conv2d) else kernel**2

@@ -146,10 +146,10 @@ def own_view(name: str, settings: Sequence[str], observation_shape: tuple[int, .
     if not (inspect.isclass(kind) and issubclass(kind, View)):
         raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
     values = assigned(settings)
-    known = kind.Settings.model_fields
+    fields = kind.Settings.model_fields
     for key in values:
-        if key not in known:
-            raise UserError("the view has no such setting", f"view.{key}", f"It has {', '.join(known) or 'none'}.")
+        if key not in fields:
+            raise UserError("the view has no such setting", f"view.{key}", f"It has {', '.join(fields) or 'none'}.")
     view: View = kind(observation_shape, resolve(kind.Settings, values, stage=name))
     return view
 

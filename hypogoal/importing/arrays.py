@@ -42,38 +42,38 @@ def parts_of(arrays: Mapping[str, Array], path: Path, group: str = "") -> Parts:
     misspelt names are a ``UserError``.
     """
     groups = (group, f"unlabelled_{group}") if group else ()
-    found: dict[str, dict[str, Array]] = {}
+    by_name: dict[str, dict[str, Array]] = {}
     for name, values in arrays.items():
         base, _, key = name.partition("/")
         if name not in (*KNOWN, *groups) and not (key and base in STATES):
             do = near(name, KNOWN) or f"Known are {', '.join(KNOWN)}; leave it out, or is it for --group?"
             raise UserError(f"unknown array {name!r}", path, do)
-        found.setdefault(base, {})[key] = values
+        by_name.setdefault(base, {})[key] = values
     for name in (*NEEDED, *groups[:1]):
-        if name not in found:
+        if name not in by_name:
             do = f"There are {', '.join(arrays)}; needed are {', '.join(NEEDED)}."
             raise UserError(f"no array {name!r}", path, do)
-    for name, by_key in found.items():
+    for name, by_key in by_name.items():
         if "" in by_key and len(by_key) > 1:
             raise UserError(f"{name!r} is one array and several by key", path, "Give either.")
         if name in ("sub_goals", "features") and by_key[""].dtype.kind != "U":
             raise UserError(f"{name} are {by_key[''].dtype}, not texts", path, "Give numpy.array of str.")
-    if ("heldout_observations" in found) != ("heldout_labels" in found):
+    if ("heldout_observations" in by_name) != ("heldout_labels" in by_name):
         do = "Give heldout_observations and heldout_labels."
         raise UserError("held-out states need observations and labels", path, do)
-    plain = {name: by_key.get("") for name, by_key in found.items()}
+    plain = {name: by_key.get("") for name, by_key in by_name.items()}
 
     def given(name: str, labels: str, group: str) -> Given:
-        count = len(next(iter(found[name].values())))
-        return Given(found[name], [f"{name}[{row}]" for row in range(count)], plain.get(labels), plain.get(group))
+        count = len(next(iter(by_name[name].values())))
+        return Given(by_name[name], [f"{name}[{row}]" for row in range(count)], plain.get(labels), plain.get(group))
 
     channels = {}
-    for key, values in found["observations"].items():
+    for key, values in by_name["observations"].items():
         channels.update(channels_of(values[0], key) if len(values) else {})
     return Parts(
         given("observations", "labels", group),
         given("unlabelled", "", f"unlabelled_{group}"),
-        given("heldout_observations", "heldout_labels", "") if "heldout_labels" in found else None,
+        given("heldout_observations", "heldout_labels", "") if "heldout_labels" in by_name else None,
         _texts(plain.get("sub_goals")),
         _texts(plain.get("features")),
         channels,

@@ -38,7 +38,7 @@ def assemble(
     or of their groups, is held out by ``seed``. Unusable states, and a class that is missing or only has pictures that
     the other class has too, are a ``UserError``.
     """
-    said = _doubts(parts.labelled)
+    remarks = _doubts(parts.labelled)
     labelled = _states(parts.labelled, "labelled", taking)
     unlabelled = _states(parts.unlabelled, "unlabelled", taking, labelled)
     goals = _named(sub_goals or parts.sub_goals, labelled.labels.shape[1])
@@ -48,44 +48,46 @@ def assemble(
         raise UserError("the number of feature names is wrong", counts, "Give one for each.")
     if parts.heldout:
         heldout, test_names = _states(parts.heldout, "held-out", taking, labelled), parts.heldout.names
-        said += contradictions(joined([labelled, heldout]), goals, [*names, *test_names])
-        heldout = _apart(heldout, [labelled, unlabelled], "held-out", "to learn from", said)
+        remarks += contradictions(joined([labelled, heldout]), goals, [*names, *test_names])
+        heldout = _apart(heldout, [labelled, unlabelled], "held-out", "to learn from", remarks)
     else:
-        said += contradictions(labelled, goals, names)
+        remarks += contradictions(labelled, goals, names)
         chosen = _held_out(labelled, parts.labelled.groups, share, seed)
-        unlabelled = _without_groups(unlabelled, parts, chosen, said)
+        unlabelled = _without_groups(unlabelled, parts, chosen, remarks)
         heldout, labelled = labelled.where(chosen), labelled.where(~chosen)
-        heldout = _apart(heldout, [labelled], "held-out", "to learn from", said)
-        unlabelled = _apart(unlabelled, [heldout], "unlabelled", "held out", said)
-        told = "no held-out states were given: {} of the labelled ones are held out, which says nothing about {}"
-        said.append(told.format(int(chosen.sum()), "other contexts"))
+        heldout = _apart(heldout, [labelled], "held-out", "to learn from", remarks)
+        unlabelled = _apart(unlabelled, [heldout], "unlabelled", "held out", remarks)
+        remark = "no held-out states were given: {} of the labelled ones are held out, which says nothing about {}"
+        remarks.append(remark.format(int(chosen.sum()), "other contexts"))
     require_classes(labelled.labels, goals, None, "Give states of both kinds.")
     of_labelled = [names[row] for row in labelled.origins[ROW]]
     contradictions(labelled, goals, of_labelled)
-    said += near_duplicates(labelled, heldout, goals, (of_labelled, [test_names[row] for row in heldout.origins[ROW]]))
-    said += hard_to_learn(labelled.labels, goals) + hard_to_judge(heldout.labels, goals)
+    remarks += near_duplicates(
+        labelled, heldout, goals, (of_labelled, [test_names[row] for row in heldout.origins[ROW]])
+    )
+    remarks += hard_to_learn(labelled.labels, goals) + hard_to_judge(heldout.labels, goals)
     sets = labelled, unlabelled, heldout
     labelled, unlabelled, heldout = [replace(states, origins=_rows(states)) for states in sets]
     shape = labelled.observations.shape[1:]
     channels = {key.replace("/", "."): meaning for key, meaning in parts.channels.items()}
-    return Collected(shape, goals, labelled, unlabelled, heldout, tuple(parts.features), channels), said
+    return Collected(shape, goals, labelled, unlabelled, heldout, tuple(parts.features), channels), remarks
 
 
-def _doubts(given: Given) -> list[str]:
+def _doubts(part: Given) -> list[str]:
     """Why values may be something else than they are taken for."""
-    readings = [reading_of(values.shape[1:], values.dtype) for values in given.observations.values()]
+    readings = [reading_of(values.shape[1:], values.dtype) for values in part.observations.values()]
     return [reading.doubt for reading in readings if reading.doubt]
 
 
-def _states(given: Given, kind: str, taking: Taking, like: States | None = None) -> States:
+def _states(part: Given, kind: str, taking: Taking, like: States | None = None) -> States:
     """Checked states, with their rows as origins; ``like`` are the labelled ones."""
     pattern = like.observations if like else None
-    observations = taking.observations(given.observations, f"the {kind} observations", pattern)
+    observations = taking.observations(part.observations, f"the {kind} observations", pattern)
     goals = like.labels.shape[1] if like else None
-    if given.labels is None:
+    if part.labels is None:
         labels = np.zeros((len(observations), goals or 0), np.bool_)
     else:
-        labels = _labels(given.labels, len(observations), kind, goals)
+        labels = _labels(part.labels, len(observations), kind, goals)
     states = States(observations, labels)
     return replace(states, origins=_rows(states))
 
@@ -104,18 +106,18 @@ def _rows(states: States) -> dict[str, Integers]:
     return {ROW: np.arange(len(states.labels), dtype=np.int64)}
 
 
-def _apart(states: States, others: Sequence[States], kind: str, role: str, said: list[str]) -> States:
+def _apart(states: States, others: Sequence[States], kind: str, role: str, remarks: list[str]) -> States:
     """The states of a ``kind`` that equal none of the others, whose ``role`` is for messages; none: a ``UserError``."""
     kept = leave_out(states, *[other.observations for other in others])
     count, left = len(states.labels), len(kept.labels)
     if left < count:
-        said.append(f"{count - left} of {count} {kind} states look like one {role}: they are left out")
+        remarks.append(f"{count - left} of {count} {kind} states look like one {role}: they are left out")
     if not left:
         raise UserError(f"every {kind} state looks like one {role}", None, OTHERS)
     return kept
 
 
-def _without_groups(unlabelled: States, parts: Parts, chosen: Labels, said: list[str]) -> States:
+def _without_groups(unlabelled: States, parts: Parts, chosen: Labels, remarks: list[str]) -> States:
     """The unlabelled states that are of no held-out group."""
     if parts.labelled.groups is None or parts.unlabelled.groups is None:
         return unlabelled
@@ -123,7 +125,7 @@ def _without_groups(unlabelled: States, parts: Parts, chosen: Labels, said: list
     if not kept.any():
         raise UserError("every unlabelled state is of a held-out group", None, OTHERS)
     if not kept.all():
-        said.append(f"{(~kept).sum()} of {len(kept)} unlabelled states are of held-out groups: they are left out")
+        remarks.append(f"{(~kept).sum()} of {len(kept)} unlabelled states are of held-out groups: they are left out")
     return unlabelled.where(kept)
 
 
@@ -148,8 +150,8 @@ def _held_out(states: States, groups: Array | None, share: float, seed: int) -> 
     _, first, unit = np.unique(by, return_index=True, return_inverse=True)
     kinds = labels[first]
     if groups is not None:  # which labels a group has
-        own = [labels[unit == group] for group in range(len(first))]
-        kinds = np.array([[*some.any(0), *some.all(0)] for some in own])
+        of_groups = [labels[unit == group] for group in range(len(first))]
+        kinds = np.array([[*some.any(0), *some.all(0)] for some in of_groups])
     order = np.argsort(first)  # each once, in the original order
     held = np.zeros(len(first), np.bool_)
     held[order[held_out(kinds[order], share, seed)]] = True

@@ -73,29 +73,29 @@ def import_data(
         if group and (reader or of_pictures):
             do = "Episodes, and folders within positive/ and negative/, are groups already."
             raise UserError("--group is for arrays", source, do)
-        said: list[str] = []
+        remarks: list[str] = []
         if reader:
             by_goal = {goal: rule_of(rule) for goal, rule in rules.items()}
             recordings = reader(source, keys, left)
-            parts, said = recorded_parts(source, recordings, by_goal, taking, keys=keys, every=every, seed=seed)
+            parts, remarks = recorded_parts(source, recordings, by_goal, taking, keys=keys, every=every, seed=seed)
         elif of_pictures:
             parts = read_pictures(source, taking, left)
             sub_goals = sub_goals or (source.resolve().name,)
         else:
             parts = read_arrays(source, group)
         if left:
-            said.append(f"not read: {', '.join(f'{count} {suffix}' for suffix, count in sorted(left.items()))}")
+            remarks.append(f"not read: {', '.join(f'{count} {suffix}' for suffix, count in sorted(left.items()))}")
         collected, more = assemble(parts, sub_goals, taking, share=share, seed=seed)
-        given = {
+        arguments = {
             "labels": dict(rules),
             "resize": dict(taking.sides),
             "every": every if every > 1 else 0,
             "group": group,
         }
         config: dict[str, Any] = {"source": source.name}
-        config |= {name: value for name, value in given.items() if value}
+        config |= {name: value for name, value in arguments.items() if value}
         write_dataset(file, collected, domain=domain, config=config, seed=seed)
-        return said + more
+        return remarks + more
 
 
 def _label(source: Path, file: Path, rules: Mapping[str, str], seed: int) -> list[str]:

@@ -35,10 +35,10 @@ def contradictions(states: States, goals: Sequence[str], names: Sequence[str]) -
             continue
         equal = looks == both[0]
         pair = f"{names[int(np.argmax(equal & column))]} and {names[int(np.argmax(equal & ~column))]}"
-        for of_kind, one, other in ((column, "positive", "negative"), (~column, "negative", "positive")):
+        for of_kind, side, other in ((column, "positive", "negative"), (~column, "negative", "positive")):
             if np.isin(looks[of_kind], both).all():
                 do = "Remove the copies whose label is wrong."
-                raise UserError(f"every {one} of {goal} is also a {other}", f"for example {pair}", do)
+                raise UserError(f"every {side} of {goal} is also a {other}", f"for example {pair}", do)
         carry = f"{amount(len(both), kind)} {'carries' if len(both) == 1 else 'carry'}"
         lines.append(f"{carry} both labels of {goal}, such as {pair}: no member can be right about both")
     return lines
@@ -68,17 +68,17 @@ def near_duplicates(
     """
     if labelled.observations.dtype != PICTURE:
         return []
-    known, tests = _Sketched(labelled, names[0]), _Sketched(heldout, names[1])
-    every = np.arange(len(tests.names)), np.arange(len(known.names))
-    said = [
-        _near(tests, known, *every, "held-out pictures", "labelled one", "scores on them say little about new ones")
+    learned, tests = _Sketched(labelled, names[0]), _Sketched(heldout, names[1])
+    every = np.arange(len(tests.names)), np.arange(len(learned.names))
+    remarks = [
+        _near(tests, learned, *every, "held-out pictures", "labelled one", "scores on them say little about new ones")
     ]
-    for goal, column in zip(goals, known.labels.T, strict=True):
-        equal = np.isin(known.looks, np.intersect1d(known.looks[column], known.looks[~column]))
+    for goal, column in zip(goals, learned.labels.T, strict=True):
+        equal = np.isin(learned.looks, np.intersect1d(learned.looks[column], learned.looks[~column]))
         positives, negatives = np.flatnonzero(column & ~equal), np.flatnonzero(~column & ~equal)
         of_goal = f"positives of {goal}", "negative", "are their labels right?"
-        said.append(_near(known, known, positives, negatives, *of_goal))
-    return [line for line in said if line]
+        remarks.append(_near(learned, learned, positives, negatives, *of_goal))
+    return [line for line in remarks if line]
 
 
 def _near(

@@ -55,13 +55,13 @@ class Rule(NamedTuple):
 
 def recording_of(name: str, observations: Any, columns: Mapping[str, Any], *, held_out: bool = False) -> Recording:
     """An episode whose observations are arrays (T, ...) in nested dictionaries, HDF5 groups or tuples."""
-    found = _leaves(observations, "")
-    arrays = {key: part for key, part in found.items() if getattr(part, "dtype", np.dtype(object)).kind in "iufb"}
+    leaves = _leaves(observations, "")
+    arrays = {key: part for key, part in leaves.items() if getattr(part, "dtype", np.dtype(object)).kind in "iufb"}
     lengths = {len(values) for values in arrays.values()}
     if len(lengths) > 1:
         raise ValueError(f"the observations of {name} have different lengths, {sorted(lengths)}")
     rows = {key: partial(_rows, values) for key, values in arrays.items()}
-    return Recording(name, max(lengths, default=0), rows, columns, sorted(found.keys() - arrays.keys()), held_out)
+    return Recording(name, max(lengths, default=0), rows, columns, sorted(leaves.keys() - arrays.keys()), held_out)
 
 
 def _leaves(values: Any, place: str) -> dict[str, Any]:
@@ -69,10 +69,10 @@ def _leaves(values: Any, place: str) -> dict[str, Any]:
     parts = dict(enumerate(values)) if isinstance(values, tuple) else values
     if not hasattr(parts, "items"):
         return {place: values}
-    found = {}
+    leaves = {}
     for key, part in parts.items():
-        found.update(_leaves(part, f"{place}/{key}" if place else str(key)))
-    return found
+        leaves.update(_leaves(part, f"{place}/{key}" if place else str(key)))
+    return leaves
 
 
 def _rows(values: Any, rows: Integers) -> Iterable[Any]:
@@ -117,28 +117,28 @@ def recorded_parts(
         taken.add(recording, frames, [rule.marks(recording) for rule in rules.values()])
     for rule in rules.values():
         for name in rule.listed.keys() - taken.episodes.keys():
-            known = f"There are {', '.join([*taken.episodes][:3])} ..."
-            raise UserError(f"a label is of an unknown episode, {name!r}", rule.listed[name], known)
-    said = [f"not read: {', '.join(sorted(texts))}, neither pictures nor numbers"] if texts else []
+            examples = f"There are {', '.join([*taken.episodes][:3])} ..."
+            raise UserError(f"a label is of an unknown episode, {name!r}", rule.listed[name], examples)
+    remarks = [f"not read: {', '.join(sorted(texts))}, neither pictures nor numbers"] if texts else []
     if empty:
-        said.append(f"not read: {empty} of {empty + len(taken.episodes)} episodes, without frames")
+        remarks.append(f"not read: {empty} of {empty + len(taken.episodes)} episodes, without frames")
     parts = split_episodes(taken.listed, taken.held_out, seed, source)
     labelled, unlabelled, heldout = [taken.given(part) for part in parts]
     channels = taken.channels
     if len(taken.frames) == 1:  # its key is left out
         channels = dict(zip([""], channels.values(), strict=False))
-    return Parts(labelled, unlabelled, heldout, tuple(rules), channels=channels), said
+    return Parts(labelled, unlabelled, heldout, tuple(rules), channels=channels), remarks
 
 
 def _chosen(recording: Recording, keys: Sequence[str], where: str) -> list[str]:
     """The keys to read, all if none are given; an unknown one is a ``UserError``."""
-    known = sorted(recording.observations)
+    present = sorted(recording.observations)
     for key in keys:
-        if key not in known:
-            raise UserError(f"no observation {key!r}", where, near(key, known) or f"It has {', '.join(known)}.")
-    if not known:
+        if key not in present:
+            raise UserError(f"no observation {key!r}", where, near(key, present) or f"It has {', '.join(present)}.")
+    if not present:
         raise UserError("it has no observations", where, "Give a recording with some.")
-    return sorted(set(keys)) or known
+    return sorted(set(keys)) or present
 
 
 def _frames(recording: Recording, keys: Sequence[str], rows: Integers, source: Path) -> Iterator[tuple[int, Any]]:
@@ -203,10 +203,10 @@ def split_episodes(
 
     Those that the recording holds out are, and no others then.
     """
-    known, fixed = np.array(listed, np.bool_), np.array(held_out, np.bool_)
-    others, given, free = (np.flatnonzero(some) for some in (~known, known & fixed, known & ~fixed))
+    is_listed, fixed = np.array(listed, np.bool_), np.array(held_out, np.bool_)
+    others, fixed_rows, free = (np.flatnonzero(some) for some in (~is_listed, is_listed & fixed, is_listed & ~fixed))
     order = free[rng_for(seed, "minari").permutation(len(free))]
-    wanted = np.array([1, not len(others), not len(given)])
+    wanted = np.array([1, not len(others), not len(fixed_rows)])
     if len(order) < wanted.sum():
         roles = [role for role, want in zip(("labelled", "unlabelled", "held out"), wanted, strict=True) if want]
         fault = f"{len(order)} episodes cannot be {', '.join(roles)}"
@@ -215,4 +215,4 @@ def split_episodes(
     ends = np.round(shares[:2] / shares[2] * len(order)).astype(int)
     ends = np.clip(ends, wanted.cumsum()[:2], len(order) - wanted[::-1].cumsum()[1::-1])
     labelled, unlabelled, heldout = np.split(order, ends)
-    return labelled, np.concatenate([unlabelled, others]), np.concatenate([heldout, given])
+    return labelled, np.concatenate([unlabelled, others]), np.concatenate([heldout, fixed_rows])

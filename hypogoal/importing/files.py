@@ -49,7 +49,7 @@ def reading(path: Path, do: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise UserError("no such file", error.filename or path, do) from None
     except Exception as error:  # noqa: BLE001 - libraries raise what they like
-        what = f"this cannot be read ({type(error).__name__}: {error})"[:200]
+        fault = f"this cannot be read ({type(error).__name__}: {error})"[:200]
         if path.is_file() and path.read_bytes().startswith(POINTER):
-            what, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
-        raise UserError(what, path, do) from None
+            fault, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
+        raise UserError(fault, path, do) from None

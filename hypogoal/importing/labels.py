@@ -99,12 +99,12 @@ def read_table(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     do = f"Give a CSV file, with commas, whose first line names {', '.join(columns)}."
     with reading(path, do):
         reader = csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines(), restval="")
-        found = [*reader]
+        records = [*reader]
     missing = [name for name in columns if name not in (reader.fieldnames or ())]
     if missing:
         raise UserError(f"the table of labels has no column {missing[0]!r}", path, do)
     rows = []
-    for number, cells in enumerate(found, 2):
+    for number, cells in enumerate(records, 2):
         row = {name: cells[name].strip() for name in columns}
         rows.append({**row, "line": f"{path}, line {number}"})
     return rows
@@ -121,18 +121,18 @@ def with_labels(dataset: Dataset, table: Path, sub_goal: str) -> tuple[Collected
         raise UserError("a table labels data of one sub-goal, its own", f"{sub_goal}={table}", do)
     observations, origins = dataset.unlabelled(), dataset.unlabelled_origins()
     labels = _labels_in(table, observations)
-    known, test = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    shared = known.origins.keys() & origins.keys()
+    labelled, test = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
+    shared = labelled.origins.keys() & origins.keys()
     chosen = States(observations, np.zeros((len(observations), 1), np.bool_), origins)
     new = chosen.where(np.array([*labels]))
     new = States(new.observations, np.array([*labels.values()])[:, None], new.origins)
-    before = States(known.observations, known.labels[:, None], {name: known.origins[name] for name in shared})
+    before = States(labelled.observations, labelled.labels[:, None], {name: labelled.origins[name] for name in shared})
     rest = chosen.where(~np.isin(np.arange(len(observations)), [*labels]))
     heldout = States(test.observations, test.labels[:, None], test.origins)
     features = tuple(dataset.features()) if dataset.observation_dtype == NUMBERS else ()
     shape = dataset.observation_shape
     sets = joined([before, new]), rest, heldout
-    return Collected(shape, (sub_goal,), *sets, features, dataset.channels), len(labels)
+    return Collected(shape, (sub_goal,), *sets, features=features, channels=dataset.channels), len(labels)
 
 
 def _labels_in(table: Path, observations: Observations) -> dict[int, bool]:

@@ -46,21 +46,21 @@ def read_lerobot(source: Path, keys: Sequence[str], left: Counter[str]) -> Itera
             places = _Places(source, info, row)
             file = places.file("data_path", "data", "")
             table = table_of(file)
-            own = table.filter(np.array(table[OWNER]) == row[OWNER])
-            if len(own) != row["length"]:
-                fault = f"episode {row[OWNER]} has {len(own)} frames, {row['length']} are listed"
+            frames = table.filter(np.array(table[OWNER]) == row[OWNER])
+            if len(frames) != row["length"]:
+                fault = f"episode {row[OWNER]} has {len(frames)} frames, {row['length']} are listed"
                 raise UserError(fault, file, AGAIN)
             values = {}
             for key in numbers:
-                values[key] = np.array(own[key].to_pylist()).reshape(len(own), *info["features"][key]["shape"])
+                values[key] = np.array(frames[key].to_pylist()).reshape(len(frames), *info["features"][key]["shape"])
             read: dict[str, Any] = {key: values[key].__getitem__ for key in seen if key in values}
             for key in seen:
                 if kinds[key] == VIDEO:
                     read[key] = partial(places.film, key, values[TIME].ravel())
                 if kinds[key] == IMAGE:
-                    read[key] = partial(_cells, file, own, key)
+                    read[key] = partial(_cells, file, frames, key)
             texts = [key for key in seen if key not in read]
-            yield Recording(str(row[OWNER]), len(own), read, values, texts)
+            yield Recording(str(row[OWNER]), len(frames), read, values, texts)
 
 
 def _listed(source: Path, version: str) -> list[dict[str, Any]]:

@@ -43,9 +43,9 @@ def read_minari(source: Path, keys: Sequence[str], left: Counter[str]) -> Iterat
     minari = needed("minari", "minari")
     with reading(source, DATASET):
         facts = json.loads((source / MINARI).read_text(encoding="utf-8"))
-        for one in minari.MinariDataset(source / MINARI.parent).iterate_episodes():
-            columns = {name: np.append(0, getattr(one, name)) for name in ("rewards", "terminations")}
-            recording = recording_of(f"episode_{one.id}", one.observations, columns)
+        for episode in minari.MinariDataset(source / MINARI.parent).iterate_episodes():
+            columns = {name: np.append(0, getattr(episode, name)) for name in ("rewards", "terminations")}
+            recording = recording_of(f"episode_{episode.id}", episode.observations, columns)
             for key in (keys or recording.observations) if facts.get("jpeg_encoding", True) else ():
                 _refuse_jpeg(recording, key, source)
             yield recording
@@ -64,10 +64,10 @@ def read_robomimic(source: Path, keys: Sequence[str], left: Counter[str]) -> Ite
     with reading(source, DEMOS), reading_hdf5(source, "the recording", DEMOS) as file:
         demos = file.get("data", {})
         valid = file["mask/valid"][()].tolist() if "mask/valid" in file else []
-        found = [name for name in demos if "obs" in demos[name]]
-        if not found:
+        names = [name for name in demos if "obs" in demos[name]]
+        if not names:
             raise UserError(f"it has no data/demo_0/obs but {', '.join(file) or 'nothing'}", source, DEMOS)
-        for name in sorted(found, key=lambda name: (len(name), name)):
+        for name in sorted(names, key=lambda name: (len(name), name)):
             demo = demos[name]
             columns = {key: part[()] for key, part in demo.items() if getattr(part, "ndim", 0) == 1}
             yield recording_of(name, demo["obs"], columns, held_out=name.encode() in valid)

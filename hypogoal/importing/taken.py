@@ -67,10 +67,10 @@ class Taking:
             raise UserError("only pictures can be resized", actual, "Leave out --resize.")
         return as_numbers(values, subject)
 
-    def observations(self, given: Mapping[str, Array], subject: str, like: Observations | None = None) -> Observations:
+    def observations(self, arrays: Mapping[str, Array], subject: str, like: Observations | None = None) -> Observations:
         """Observations (N, *shape) from arrays by key; of the shape and type of ``like``, if that is given."""
         parts = {}
-        for key, values in given.items():
+        for key, values in arrays.items():
             parts[key.replace("/", ".")] = self.all(values, key, f"{subject} {key!r}" if key else subject)
         try:
             observations = parts[""] if "" in parts else packed(parts)

@@ -213,9 +213,9 @@ class Stage:
                 _tell(done)
             say(done.path or call.out / self.page)
 
-        own = map(_keyword, (self.source, *self.inputs, self.out))
+        parameters = map(_keyword, (self.source, *self.inputs, self.out))
         options = _options(self.name, self.often) if self.often else []
-        called.__signature__ = inspect.Signature([*own, *self.shared, *options])  # type: ignore[attr-defined]
+        called.__signature__ = inspect.Signature([*parameters, *self.shared, *options])  # type: ignore[attr-defined]
         called.__doc__ = inspect.cleandoc(self.function.__doc__ or "").partition("\n\n")[0]
         alone = typer.Typer(add_completion=False)
         alone.command(self.name, epilog=f"Example:\n\n[bold]hypogoal {self.example}[/bold]")(called)
@@ -290,9 +290,9 @@ def _as_path(parameter: Parameter, value: Any) -> Any:
 
 def outcome_of(numbers: Mapping[str, Any]) -> list[str]:
     """The results of training as a line. NaN (no episode has ended) is left out: the number of episodes says it too."""
-    told = []
+    texts = []
     for name, value in numbers.items():
         text = f"{value:.4g}" if isinstance(value, float) else str(value)
         if text != "nan":
-            told.append(f"{name} {text}")
-    return [", ".join(told)] if told else []
+            texts.append(f"{name} {text}")
+    return [", ".join(texts)] if texts else []

@@ -76,8 +76,8 @@ def _doubts(domain: Any, collected: Any, quiet: bool) -> list[str]:
     lines = [f"{line}. {GET_MORE}" for line in few]
     lines += hard_to_judge(collected.heldout.labels, collected.sub_goals)
     steps = labelled.origins.get("step")
-    own = domain.defaults.get("train-options", {})
-    if quiet or steps is None or "option_timeout" in own:
+    defaults = domain.defaults.get("train-options", {})
+    if quiet or steps is None or "option_timeout" in defaults:
         return lines
     soonest = [steps[holds].min() for holds in labelled.labels.T]
     apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one

@@ -55,10 +55,10 @@ def evaluate(
             missing = [*questions.missing(work), *_unmade(run)]
             metrics = questions.metrics_of(work, settings, data, missing)
         questions.write(draft.files, metrics, work.rows)
-    told = drawn(questions.summary_table(metrics), WIDTH).splitlines()
+    table = drawn(questions.summary_table(metrics), WIDTH).splitlines()
     if call.out == run / "evaluation":
-        return Done(told, ("report", run))
-    return Done(told, ("show", call.out))
+        return Done(table, ("report", run))
+    return Done(table, ("show", call.out))
 
 
 def _unmade(run: Path) -> list[str]:

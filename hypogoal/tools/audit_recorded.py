@@ -35,17 +35,19 @@ def audit_recorded(
     data = artefact.input("data")
     parts: list[dict[str, Any]] = []
     sections: list[Block] = []
-    about: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": goals}, "seed": 0}
+    manifest: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": goals}, "seed": 0}
     with (
-        create(out, **about, inputs=[source, data], force=force) as draft,
+        create(out, **manifest, inputs=[source, data], force=force) as draft,
         Progress("audit", len(goals), quiet=quiet) as progress,
     ):
         for goal in goals:
             look = look_at(artefact, data, goal, device)
-            found = findings_of(look)
-            parts.append(found.numbers)
-            sections.append(found.section)
-            write_next(draft.files / "next" / goal, COLUMNS, look.unlabelled[found.rows], found.rows, found.disputed)
+            findings = findings_of(look)
+            parts.append(findings.numbers)
+            sections.append(findings.section)
+            write_next(
+                draft.files / "next" / goal, COLUMNS, look.unlabelled[findings.rows], findings.rows, findings.disputed
+            )
             progress.advance()
         text = json.dumps(plain({"sub_goals": parts}), indent=1)
         (draft.files / "audit.json").write_text(text + "\n", encoding="utf-8")

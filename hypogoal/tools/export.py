@@ -162,7 +162,7 @@ def export_episodes(
     source = open_artefact(meta, "meta")
     where = source.config["layouts"] or source.config["layout_seed"]
     options = len(source.config["sub_goals"]) * source.config["members"]
-    about = {
+    description = {
         "dataset_id": dataset_id(out),
         "minari_version": __version__,
         "algorithm_name": "hypogoal",
@@ -178,7 +178,7 @@ def export_episodes(
             action_space=spaces.Discrete(loop.engine.n_actions),
             jpeg_encoding=False,
         )
-        storage.update_metadata(about)
+        storage.update_metadata(description)
         with Progress("export", total=episodes, quiet=quiet) as progress:
             storage.update_episodes(_buffers(play_episodes(loop, episodes), progress))
         return int(storage.total_steps)

@@ -69,9 +69,9 @@ def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Gener
     rows = np.arange(count)
     x, y = rng.integers(INNER // 2, size=count) + place * (INNER // 2), rng.integers(INNER, size=count)
     up = np.where(y == 0, False, (y == INNER - 1) | (rng.random(count) < 0.5))
-    here, beside = y * INNER + x, np.where(up, y - 1, y + 1) * INNER + x
+    cell, beside = y * INNER + x, np.where(up, y - 1, y + 1) * INNER + x
     order = rng.random((count, CELLS))
-    order[rows, here], order[rows, beside] = -1.0, 2.0  # nothing else stands where the object is, nor on one side
+    order[rows, cell], order[rows, beside] = -1.0, 2.0  # nothing else stands where the object is, nor on one side
     cells = order.argsort(axis=1)
     contents = np.full((count, CELLS), FLOOR)
     contents[:, 0] = OBJECT + 2 * shape + colour
