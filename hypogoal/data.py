@@ -273,7 +273,7 @@ class Dataset:
     sub_goals: tuple[str, ...]
     observation_shape: Shape
     observation_dtype: DType
-    channels: Mapping[str, list[int]] = field(default_factory=dict)  # see :class:`Collected`
+    channels: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # see :class:`Collected`
 
     @property
     def observation_bytes(self) -> int:
@@ -385,6 +385,11 @@ def _names_of_fields(dtype: DType) -> list[str]:
     return names
 
 
+def _channels_in(text: str) -> dict[str, tuple[int, int]]:
+    """Frames and colours of stacks by key, from an attribute."""
+    return {key: (frames, colours) for key, (frames, colours) in json.loads(text).items()}
+
+
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
     with reading(path) as file:
@@ -405,7 +410,7 @@ def open_dataset(path: Path) -> Dataset:
             sub_goals=tuple(json.loads(attributes["sub_goals"])),
             observation_shape=tuple(json.loads(attributes["observation_shape"])),
             observation_dtype=type_of(attributes["observation_dtype"]),
-            channels=json.loads(attributes.get("channels", "{}")),
+            channels=_channels_in(attributes.get("channels", "{}")),
         )
     require_names(dataset.sub_goals)
     return dataset
