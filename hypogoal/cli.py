@@ -304,8 +304,9 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
     from hypogoal import look
     from hypogoal.experiments.sweep import in_the_making
 
+    notes = in_the_making(path)
     rows = look.stale(path)
-    echo(rows, as_json, [*in_the_making(path), *look.stale_lines(rows)])
+    echo(rows, as_json, [*notes, *look.stale_lines(rows)])
 
 
 @command(LOOK, "config train-ensemble --domain montezuma")

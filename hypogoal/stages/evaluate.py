@@ -52,7 +52,7 @@ def evaluate(
             work = questions.work_of(contents, arrays, progress, played)
             questions.judge_ensembles(work, cases)
             questions.answer(work)
-            missing = [*questions.missing(work), *_unmade(run)]
+            missing = [*questions.missing(work), *unmade_cells(run)]
             metrics = questions.metrics_of(work, settings, data, missing)
         questions.write(draft.files, metrics, work.rows)
     table = drawn(questions.summary_table(metrics), WIDTH).splitlines()
@@ -61,7 +61,7 @@ def evaluate(
     return Done(table, ("show", call.out))
 
 
-def _unmade(run: Path) -> list[str]:
+def unmade_cells(run: Path) -> list[str]:
     """The cells that the run was to have and has not: failed, or not run yet."""
     from hypogoal.experiments.sweep import unmade
 

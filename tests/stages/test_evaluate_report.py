@@ -17,7 +17,7 @@ from openings import agrees
 from rich.console import Console
 from toy_data import reseal
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.figure_files import draw_figures
@@ -26,7 +26,7 @@ from hypogoal.evaluation.questions import missing, summary_table
 from hypogoal.evaluation.run import find, read_evaluation
 from hypogoal.experiments.sweep import Cell, begin
 from hypogoal.look import outcome
-from hypogoal.stages.evaluate import evaluate
+from hypogoal.stages.evaluate import evaluate, unmade_cells
 from hypogoal.stages.report import report
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_meta import train_meta
@@ -92,8 +92,7 @@ def test_cells_of_a_sweep_that_are_not_done_are_said(tiny_run, tmp_path):
     """Spec A5, G4: a mean over nine of ten seeds says that it is one."""
     shutil.copytree(tiny_run / "ensemble", tmp_path / "ensemble")
     begin([Cell(name=name, words=["train-ensemble", "d"]) for name in ("ensemble", "other")], tmp_path)
-    nothing = {"agents": [], "rooms": [], "selection": [], "distance": {"options": []}}
-    assert "1 of the run's cells are not done: other" in missing(Work(find(tmp_path), None, None, metrics=nothing))
+    assert unmade_cells(tmp_path) == ["1 of the run's cells are not done: other"]
 
 
 def test_members_are_judged_on_heldout_states(tiny_run, metrics):
@@ -141,7 +140,7 @@ def test_thresholds_are_those_of_members_and_of_options(tiny_run, metrics, tmp_p
     weights = load_tensors(tmp_path / "meta" / "options.safetensors")
     weights["thresholds"][3] = -np.log(3.0)
     save_tensors(tmp_path / "meta" / "options.safetensors", weights)
-    assert thresholds_of(open_artefact(tmp_path / "meta")) == pytest.approx([0.5] * 3 + [0.25])
+    assert thresholds_of(Artefact(tmp_path / "meta")) == pytest.approx([0.5] * 3 + [0.25])
     assert np.isnan(thresholds_of(open_artefact(tiny_run / "meta-oracle"))).all()
 
 
@@ -313,6 +312,20 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
     assert not re.search(r"fetch\(|XMLHttpRequest|import\(|https?://(?!www\.w3\.org/)", "".join(found.scripts))
     assert not re.search(r"url\((?!#)|@import", page)
     assert all(target in inside for target in re.findall(r"url\((#[^)]*)\)", page))
+
+
+def test_texts_of_a_page_are_escaped(tiny_copy):
+    """A run's folder may be called like mark-up."""
+    evaluation = tiny_copy / "evaluation"
+    file = evaluation / "metrics.json"
+    metrics = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(json.dumps(metrics | {"run": "a&b<b>"}), encoding="utf-8")
+    listed = Artefact(evaluation).manifest.files
+    reseal(evaluation, files={**listed, file.name: sha256_of(file)})
+    report(tiny_copy, force=True, **QUIET)
+    page = (tiny_copy / "report" / "index.html").read_text(encoding="utf-8")
+    assert "a&amp;b&lt;b&gt;" in page
+    assert "a&b<b>" not in page
 
 
 def test_the_page_shows_all_of_it(tiny_run, page):
