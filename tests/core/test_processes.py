@@ -72,12 +72,14 @@ except Exception as error:
 """
 POOL = """
 import multiprocessing, os
-from functools import partial
 from hypogoal.core.processes import in_processes
+
+def kind():
+    return type(multiprocessing.current_process()).__name__
 
 def work():
     results = {}
-    in_processes([partial(multiprocessing.get_start_method, True), os.getpid], 2, results.__setitem__)
+    in_processes([kind, os.getpid], 2, results.__setitem__)
     print(results[0], results[1] == os.getpid(), flush=True)
 
 if __name__ == "__main__":
@@ -88,7 +90,7 @@ if __name__ == "__main__":
 UNGUARDED = "could not start. In a script call hypogoal below 'if __name__ == \"__main__\":'"
 
 
-@pytest.mark.parametrize(("code", "said"), [(NO_GUARD, UNGUARDED), (POOL, "spawn False\nspawn True")])
+@pytest.mark.parametrize(("code", "said"), [(NO_GUARD, UNGUARDED), (POOL, "SpawnProcess False\nSpawnProcess True")])
 def test_scripts_without_a_guard_and_pools(tmp_path: Path, code: str, said: str) -> None:
     """The first is told in a line. Processes are spawned; those of a pool may have none: tasks come in turn."""
     (tmp_path / "script.py").write_text(code)

@@ -339,7 +339,7 @@ def test_the_domain_interface() -> None:
     for stage in ("train-ensemble", "train-options"):
         config, plain = settings_of(stage, "montezuma"), model_of(stage)()
         own = defaults_of("montezuma", stage)
-        assert all(getattr(config, key) == value != getattr(plain, key) for key, value in own.items())
+        assert all(getattr(config, key) == value != getattr(plain, key, None) for key, value in own.items())
 
 
 def test_engine_and_environment_agree() -> None:

@@ -60,7 +60,7 @@ def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
         ("STACKED", "observations have their channels, or stacked frames, first: uint8 (4, 48, 48)"),
         ("FRAMES", "observations are stacks of pictures: uint8 (4, 48, 48, 3). Give pictures as uint8 (H, W, C), "),
         ("TURNED", "the environment gave an observation that does not fit its space: uint8 (48, 48, 3)"),
-        ("RAISING", "a sub-goal's function raised AttributeError: "),
+        ("RAISING", "your code raised AttributeError: "),
     ],
 )
 def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str, tmp_path: Path) -> None:
