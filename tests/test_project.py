@@ -301,6 +301,7 @@ def test_formats_are_readable_without_hypogoal(
     collected = Collected((8, 8, 3), goals, states(7), states(5), states(3))
     monkeypatch.chdir(tmp_path)
     data, ensemble = Path("data/doorkey.h5"), Path("runs/demo/ensemble")
+    data.parent.mkdir()
     write_dataset(data, collected, domain="doorkey", config={}, seed=0)
     config = {"sub_goals": list(goals)}
     with create(ensemble, kind="ensemble", config=config, seed=0, inputs=[data]) as draft:

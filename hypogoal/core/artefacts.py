@@ -94,6 +94,8 @@ class Artefact:
 
     def __init__(self, path: Path):
         self.path = path
+        if not path.exists():
+            raise UserError("no such artefact", path, "Check the path, or run the stage that makes it.")
         if not (path / MANIFEST).is_file():
             raise UserError(f"no artefact here (no {MANIFEST})", path, "Give the folder that a stage wrote.")
         self.manifest = _read_manifest(path / MANIFEST, AGAIN)

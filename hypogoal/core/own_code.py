@@ -77,7 +77,8 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
     target = places.get(name, name)
     if name not in places and ":" not in name:
         names = ", ".join(sorted(places))
-        raise UserError(f"unknown {role}", name, f"Choose one of {names}, or give module:object.")
+        do = f"Choose one of {names}, or give module:object." if places else "Give module:object."
+        raise UserError(f"unknown {role}", name, do)
     if name not in places:
         require_trust(name, role)
         if os.getcwd() not in sys.path:

@@ -80,9 +80,19 @@ def assemble(
         GAMMA if isinstance(config, TrainMetaConfig) else 1.0,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
+    _check_labels(engine, domain)
     if near := nearness(domain, engine, ensemble_config, config):
         near(np.repeat(engine.ids[:1], options), np.arange(options))  # so that a user's labels fail before training
     return loop
+
+
+def _check_labels(engine: Engine, domain: Domain) -> None:
+    """Refuse (``UserError``) labels of another form than bool (n, G), before any training."""
+    labels = engine.labels(engine.ids[:1])
+    shape = (1, len(domain.sub_goals))
+    if labels.shape != shape or labels.dtype != np.bool_:
+        fault = f"the engine's labels of one state are {labels.dtype} {labels.shape}, not bool {shape}"
+        raise UserError(fault, type(engine).__name__, "Give a truth value for each state and sub-goal.")
 
 
 def terminations_for(

@@ -71,15 +71,14 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str,
 
 
 def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6, F5: in training's numbers, the table of episodes, the evaluation; by reward it would be another."""
+    """Spec B6, F5: in the table of episodes, the evaluation; by reward it would be another."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     few = {"steps": 2_048, "max_episode_steps": 20}
-    numbers = train_baseline("corridor_env:SWIFT", tmp_path / "ppo", quiet=True, **few).metrics
+    train_baseline("corridor_env:SWIFT", tmp_path / "ppo", quiet=True, **few)
     episodes = Episodes.read(tmp_path / "ppo" / "episodes.csv")
     succeeded, cut = episodes.succeeded, ~episodes.terminated
     assert (succeeded == (episodes.length <= 5))[~cut].all() and succeeded[cut].any()
     assert (~succeeded & (episodes.reward > 0)).any()
-    assert numbers["success"] == pytest.approx(succeeded[-100:].mean())
     run("evaluate", tmp_path)
     agent = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())["agents"][0]
     assert agent["success"]["mean"] == pytest.approx(succeeded[-100:].mean())

@@ -22,6 +22,7 @@ from hypogoal.evaluation.selection import rows_of_choices, selection_of
 from hypogoal.options.tables import Choices, Episodes
 
 META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_steps": 200, "option_gamma": 0.95}
+DOORS = {"door_label": "unlocked"}
 
 
 def made(layout_seed=100, seed=0, kind="meta", episodes=120, success=1, shortest=10, **config):
@@ -29,7 +30,12 @@ def made(layout_seed=100, seed=0, kind="meta", episodes=120, success=1, shortest
     done = np.full(episodes, bool(success))
     run = Episodes(np.arange(1, episodes + 1) * 10, length, done.astype(float), done, done)
     layout = {"layout_seed": layout_seed, "shortest_path": shortest, "random_success": 0.1, "random_episodes": 10}
-    about = {**(META if kind == "meta" else {"steps": 1_000}), "layout_seed": layout_seed, **config}
+    about = {
+        **(META if kind == "meta" else {"steps": 1_000}),
+        "domain_config": DOORS,
+        "layout_seed": layout_seed,
+        **config,
+    }
     return Run(kind, f"{kind}/{layout_seed}-{seed}", seed, about, run, layout)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import sys
 from pathlib import Path
@@ -114,7 +113,7 @@ def test_large_networks_are_members(network: str, tmp_path: Path) -> None:
     assert weights > (2e5 if network.endswith("vit") else 1.1e7)
 
     write_ensemble(tmp_path, "goal", ensemble)
-    about = {**dataclasses.asdict(config), "observation_shape": list(images.shape[1:]), "sub_goals": ["goal"]}
+    about = {**config.model_dump(), "observation_shape": list(images.shape[1:]), "sub_goals": ["goal"]}
     about["observation_dtype"] = "uint8"
     back = read_ensemble(tmp_path, about, "goal")
     np.testing.assert_array_equal(back.logits(images), ensemble.logits(images))

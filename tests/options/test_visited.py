@@ -126,7 +126,7 @@ def test_states_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     toy_data.write(other, domain="another")
     (tmp_path / "empty").mkdir()
     for wrong, words in (
-        (other, "the domain another"), (tmp_path / "empty", "not an artefact"), (tmp_path / "no.h5", "no such"),
+        (other, "the domain another"), (tmp_path / "empty", "no artefact here"), (tmp_path / "no.h5", "no such"),
     ):  # fmt: skip
         command = ["train-ensemble", str(data), "--unlabelled", str(wrong), "--out", str(tmp_path / "out"), "-q"]
         refuses(words, *command)

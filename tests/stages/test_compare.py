@@ -8,7 +8,7 @@ import pytest
 from command_line import refuses, run
 from toy_data import fill, reseal
 
-from hypogoal.core.artefacts import create, open_artefact, sha256_of
+from hypogoal.core.artefacts import Artefact, create, open_artefact, sha256_of
 from hypogoal.core.files import write_table
 from hypogoal.evaluation.compare import labels_of
 from hypogoal.stages.evaluate import evaluate
@@ -120,7 +120,7 @@ def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, change, words):
     metrics = json.loads(path.read_text(encoding="utf-8"))
     change(metrics)
     path.write_text(json.dumps(metrics), encoding="utf-8")
-    reseal(path.parent, files={**open_artefact(path.parent).manifest.files, path.name: sha256_of(path)})
+    reseal(path.parent, files={**Artefact(path.parent).manifest.files, path.name: sha256_of(path)})
     refuses(words, "compare", runs / "slow", tmp_path / "other", "--out", tmp_path / "out")
 
 

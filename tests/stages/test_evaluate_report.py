@@ -21,9 +21,8 @@ from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.figure_files import draw_figures
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.questions import missing, summary_table
-from hypogoal.evaluation.run import find, read_evaluation
+from hypogoal.evaluation.questions import summary_table
+from hypogoal.evaluation.run import read_evaluation
 from hypogoal.experiments.sweep import Cell, begin
 from hypogoal.look import outcome
 from hypogoal.stages.evaluate import evaluate, unmade_cells

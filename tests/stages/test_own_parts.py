@@ -101,7 +101,6 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
         (["chooser={}:Straight"], "this is no chooser"),
         (["chooser={}:Missing"], "the chooser cannot be loaded"),
         (["termination={}:AtLeast"], "unknown termination"),
-        (["network={}:Straight", "embedding=mlp"], ":Straight needs embedding=auto"),
     ],
 )
 def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_run: Path, tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_true_sub_goals_that_the_domain_does_not_have_are_refused(own_run: Path)
 def test_oracles_of_some_sub_goals_are_of_those(own_run: Path) -> None:
     """Spec E6: one option for each of the ensemble's sub-goals, in its order, and no other."""
     about = {**open_artefact(own_run / "ensemble").config, "sub_goals": ["go-to-goal", "collect-red-key"]}
-    config = TrainOptionsConfig(termination="oracle")
+    config = TrainOptionsConfig.of(termination="oracle")
     loop = assemble(DOMAIN, own_run / "ensemble", about, config, seed=0)
     ids = loop.engine.reachable()
     assert ids is not None and loop.terminations.options == 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hypogoal.core.artefacts import create, open_artefact
+from hypogoal.core.artefacts import Artefact, create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.evaluation.films import agents_of, play_films
@@ -76,7 +76,7 @@ def test_weights_of_another_policy_are_one_line(tiny_run, tmp_path):
     copied = shutil.copytree(artefact.path, tmp_path / "meta")
     save_tensors(copied / "meta.safetensors", dict(list(meta.items())[1:]))
     with pytest.raises(UserError, match="do not fit"):
-        agent_of(replace(artefact, path=copied), seed=0)
+        agent_of(Artefact(copied), seed=0)
 
 
 def test_a_run_without_such_an_agent_is_one_line(tmp_path):
