@@ -51,7 +51,7 @@ class Commands(TyperGroup):
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
         if words[0] in STAGES:
-            self.add_command(stage_command(words[0]))
+            return words[0], stage_command(words[0]), words[1:]
         return super().resolve_command(context, words)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout, lock_descriptor
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ValidationError, field_validator
 
 from hypogoal.core.checkpoints import ANEW, Checkpoints
 from hypogoal.core.errors import Complete, UserError
@@ -52,6 +52,9 @@ GONE = {
     "policy_view": "full",
 }
 
+# Settings that other stages read as text.
+TEXTS = frozenset({"agent", "chooser", "diversity", "domain", "layouts", "network", "setting", "termination", "view"})
+
 
 class Input(BaseModel):
     """What an artefact was made from: an artefact or a file, and its :func:`sha256_of`."""
@@ -74,6 +77,14 @@ class Manifest(BaseModel):
     versions: dict[str, str] = {}
     command: list[str] = []
     took: dict[str, Any] = {}  # seconds and bytes of memory, in which alone two runs of a command differ
+
+    @field_validator("config")
+    @classmethod
+    def _has_texts(cls, config: dict[str, Any]) -> dict[str, Any]:
+        for name in TEXTS & config.keys():
+            if not isinstance(config[name], str):
+                raise ValueError(f"the setting {name} is no text")
+        return config
 
 
 class Settings(dict[str, Any]):

@@ -160,7 +160,7 @@ def run(
         raise
     left = [cell.name for cell in todo if not cell.is_done(out)]
     if left:
-        first = next(iter(failed), left[0])
+        first = next((cell.name for cell in todo if cell.name in failed), left[0])
         problem = f"{len(failed)} of {len(cells)} cells failed, {len(left)} are not made"
         do = "Mend it, then give the same command with --resume: what is done is kept."
         raise UserError(f"{problem}; {first}", failed.get(first, "it needs what is not made"), do)

@@ -120,7 +120,7 @@ def test_what_is_not_what_is_needed(tmp_path: Path) -> None:
     finish(tmp_path / "meta")
     (tmp_path / "other").mkdir()
     cases: list[tuple[Callable[[], object], str]] = [
-        (lambda: open_artefact(tmp_path / "none"), "no artefact here"),
+        (lambda: open_artefact(tmp_path / "none"), "no such artefact"),
         (lambda: open_artefact(tmp_path / "other"), "no artefact here"),
         (lambda: open_artefact(tmp_path / "meta", "ensemble", "options"), "but ensemble or options is needed"),
         (lambda: find_artefacts(tmp_path / "none", "meta"), "no such run"),
