@@ -27,6 +27,7 @@ NOT_OURS = (
     ".venv/bin/pip",
     "pip",
     "make",
+    "scancel",
     "export",
     "source",
     "uv",
