@@ -195,7 +195,7 @@ def stale(run: Path) -> list[dict[str, Any]]:
 
 
 def _find_reasons(place: Path, reasons_of: dict[Path, list[str]]) -> list[str]:
-    """Why a data file or an artefact is stale; enters it in ``known``, after its inputs."""
+    """Why a data file or an artefact is stale; enters it in ``reasons_of``, after its inputs."""
     if place not in reasons_of:
         reasons = []
         if place.is_dir():
