@@ -39,7 +39,6 @@ STAGES = {  # in their order; a command is loaded when it is called
     "report": "Draw the report of an evaluated run: one HTML file.",
     "audit": "How often, and where, do policies fool a success classifier?",
 }
-DOMAINS = "doorkey, montezuma, rooms, or module:object."
 EXPERIMENTS = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
     "module:function."
@@ -312,7 +311,7 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
 @command(LOOK, "config train-ensemble --domain montezuma")
 def config(
     stage: Annotated[str | None, Argument(help="For example train-meta; without it, the list of stages.")] = None,
-    domain: Annotated[str, Option(help=f"Settings for: {DOMAINS}")] = "doorkey",
+    domain: Annotated[str, Option(help=f"Settings for: {stages.DOMAINS}")] = "doorkey",
     preset: stages.Preset = None,
     write: Annotated[Path | None, Option(help="Write them as a preset to edit: a new .toml file for --preset.")] = None,
     as_json: Json = False,
@@ -483,7 +482,7 @@ def export(
 
 @command(OWN, "check mine:DOMAIN")
 def check(
-    domain: Annotated[str | None, Argument(help=DOMAINS)] = None,
+    domain: Annotated[str | None, Argument(help=stages.DOMAINS)] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
     set_: stages.Set = None,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from hypogoal.made import Made
 
 Place = str | os.PathLike[str]
+DOMAINS = "doorkey, montezuma, rooms, or module:object."
 WIDTH = 100  # of tables
 NO_SETTINGS = ("preset", "set_", "seed", "device")  # options that a stage without settings leaves out
 STAGES: dict[str, "Stage"] = {}  # by command, those that were imported

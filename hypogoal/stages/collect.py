@@ -9,9 +9,7 @@ from hypogoal.core.artefacts import DATA
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
-from hypogoal.stages import Call, Done, stage
-
-DOMAINS = "doorkey, montezuma, rooms, or module:object."
+from hypogoal.stages import DOMAINS, Call, Done, stage
 
 
 @stage("collect doorkey --out data/doorkey.h5", leaves_out=["device"])

@@ -6,9 +6,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.errors import UserError
-from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
-
-DOMAINS = "doorkey, montezuma, rooms, or module:object."
+from hypogoal.stages import DOMAINS, Call, Done, Tensorboard, outcome_of, stage
 
 
 @stage(
