@@ -429,7 +429,7 @@ def import_(
         say(f"hypogoal: {line}", err=True)
     if not quiet:
         dataset = open_dataset(out)
-        for line in (*taken.told(dataset, resized=bool(sides)), *look.count_lines(dataset.counts())):
+        for line in (*taken.describe(dataset, resized=bool(sides)), *look.count_lines(dataset.counts())):
             say(line)
         run_folder = out.parent if out.name == "data.h5" else Path("runs", out.stem)
         say(f"next: {own_code.command('train-ensemble', out, '--out', run_folder / 'ensemble')}")

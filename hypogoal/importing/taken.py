@@ -97,7 +97,7 @@ class Taking:
         return reading
 
 
-def told(dataset: Dataset, *, resized: bool) -> Iterator[str]:
+def describe(dataset: Dataset, *, resized: bool) -> Iterator[str]:
     """How the states of a data file were read, a line a key; of large pictures, how to import them smaller."""
     fields = fields_of(dataset.observation_shape, dataset.observation_dtype)
     for key, (dtype, shape) in fields.items():
