@@ -146,10 +146,13 @@ class Artefact:
 
 
 def _fault(path: Path, digest: str) -> str:
+    """What is wrong with a file or an artefact that had this sha256; empty if nothing is."""
+    if not path.exists():
+        return "missing"
     try:
         return "" if sha256_of(path) == digest else "changed since it was written"
-    except (OSError, UserError):
-        return "missing"
+    except (OSError, UserError) as error:
+        return f"unreadable ({error})"
 
 
 def _read_manifest(path: Path, do: str) -> Manifest:
