@@ -20,8 +20,8 @@ from minigrid.envs import DoorKeyEnv as DoorKeyOfMiniGrid
 from minigrid.wrappers import RGBImgObsWrapper
 
 from benchmarks import timing
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.domains.doorkey_env import DoorKeyGrid
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
+from hypogoal.domains.doorkey.env import DoorKeyGrid
 
 WANTED_RATIO = 300
 MANY = 64

@@ -55,7 +55,7 @@ def baseline(algorithm: str, steps: int) -> float:
     """Stable-baselines3's own, learning."""
     from stable_baselines3 import DQN, PPO
 
-    from hypogoal.domains.doorkey_env import DoorKeyGrid
+    from hypogoal.domains.doorkey.env import DoorKeyGrid
 
     env = ImgObsWrapper(RGBImgObsWrapper(DoorKeyGrid(layout_seed=LAYOUT), tile_size=8))
     if algorithm == "ppo":
@@ -120,8 +120,8 @@ def ceiling(steps: int) -> float:
     """CPU seconds of an agent step of the emulator itself: random actions, a stack at each, often a state restored."""
     import numpy as np
 
-    from hypogoal.domains.montezuma_emulator import N_ACTIONS, Emulator
-    from hypogoal.domains.montezuma_ladders import LADDERS
+    from hypogoal.domains.montezuma.emulator import N_ACTIONS, Emulator
+    from hypogoal.domains.montezuma.ladders import LADDERS
 
     actions = np.random.default_rng(0).integers(N_ACTIONS, size=steps).tolist()
     emulator = Emulator(0)

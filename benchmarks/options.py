@@ -29,7 +29,7 @@ from hypogoal.core.config import assigned, resolve  # noqa: E402
 from hypogoal.core.config import preset as read_preset  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
-from hypogoal.domains.doorkey_engine import DoorKeyEngine  # noqa: E402
+from hypogoal.domains.doorkey.engine import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
 from hypogoal.meta.config import TrainOptionsConfig  # noqa: E402
 from hypogoal.options.choosers import RandomChooser  # noqa: E402

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 
 
 def played(layouts: range, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

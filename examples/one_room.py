@@ -19,7 +19,7 @@ from torch.nn import functional
 from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for
-from hypogoal.domains.montezuma_emulator import observed_pixel
+from hypogoal.domains.montezuma.emulator import observed_pixel
 from hypogoal.hypotheses.networks import folded
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
 from hypogoal.options.termination import Terminations

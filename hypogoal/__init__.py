@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options, report
     from hypogoal.api import train_baseline, train_ensemble, train_meta, train_options  # isort: skip
     from hypogoal.core.errors import UserError
-    from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+    from hypogoal.domains.gymnasium.domain import GymnasiumDomain
     from hypogoal.hypotheses.wrappers import SubgoalReward
 
 _LAZY = {
-    "GymnasiumDomain": "hypogoal.domains.gymnasium_domain",
+    "GymnasiumDomain": "hypogoal.domains.gymnasium.domain",
     "UserError": "hypogoal.core.errors",
 }
 __all__ = [

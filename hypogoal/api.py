@@ -10,7 +10,7 @@ from pathlib import Path
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.processes import own_settings
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, ensemble_at
 from hypogoal.made import Made

@@ -6,5 +6,5 @@ environment imports a package, or names a module before the id.
 
 from gymnasium import register
 
-register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
-register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
+register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey.env:DoorKeyEnv")
+register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma.env:MontezumaLadder")

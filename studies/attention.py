@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.processes import prepare
 from hypogoal.core.seeding import seed_for
-from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE
-from hypogoal.domains.montezuma_emulator import observed_pixel
-from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
+from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE
+from hypogoal.domains.montezuma.emulator import observed_pixel
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import attributed, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble

@@ -18,7 +18,7 @@ from examples.figure6 import LAYOUTS, SEEDS, STEPS
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.processes import prepare
 from hypogoal.domains.base import Engine, Step
-from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.evaluation.curves import Run
 from hypogoal.learners.baselines.agents import train
 from hypogoal.learners.baselines.engine_env import EngineEnv

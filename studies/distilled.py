@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.domains.doorkey.domain import DOMAIN
 from studies.cells import difference, interval, read_rows, table
 
 METHODS = {

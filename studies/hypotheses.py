@@ -29,7 +29,7 @@ from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
-from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation.numbers import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma import DOMAIN
+from hypogoal.domains.montezuma.domain import DOMAIN
 from hypogoal.evaluation.distance import BEGAN_INSIDE, HIT, counted, fates, rooms_shown, stops_over_rooms
 from hypogoal.options.tables import Executions
 from studies.cells import table

@@ -23,8 +23,8 @@ from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
-from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
-from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
+from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE, MontezumaConfig
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.evaluation.numbers import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble

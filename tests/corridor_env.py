@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hypogoal.core.config import setting
-from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 
 LENGTH, SHAPE = 6, (48, 48, 3)
 

@@ -23,7 +23,7 @@ from hypogoal.core import own_code
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import Step
-from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 
 NAME = f"{__name__}:OWN"
 COLLECT = ["collect", NAME, *settings("steps=20", "heldout_seeds=4"), "-q"]

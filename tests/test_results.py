@@ -13,7 +13,7 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
-from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig
 from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders, one_room
 from studies.cells import collect_once, difference, interval, read_rows, run_cells
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import gymnasium
 
 BUILT_IN = {
-    "doorkey": "hypogoal.domains.doorkey:DOMAIN",
-    "montezuma": "hypogoal.domains.montezuma:DOMAIN",
+    "doorkey": "hypogoal.domains.doorkey.domain:DOMAIN",
+    "montezuma": "hypogoal.domains.montezuma.domain:DOMAIN",
     "rooms": "hypogoal.domains.rooms.domain:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
@@ -228,7 +228,7 @@ class TurnEngine(Engine):
     """An engine that steps its environments one after the other, and keeps what it saw in the newest states.
 
     Subclasses begin an episode and play a step. In plain Python, because NumPy's operations slow down an emulator's
-    next frames, see ``montezuma_emulator``.
+    next frames, see ``montezuma.emulator``.
 
     Attributes:
         room: the number of states, besides start states, of which it keeps what it saw.

@@ -23,7 +23,7 @@ from hypogoal.data import Collected
 from hypogoal.diversity import OBJECTIVES as OURS
 from hypogoal.diversity import Objective, dbat, load_objective, none
 from hypogoal.domains.base import Step
-from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.hypotheses.networks import NETWORKS
 from hypogoal.observations import mixed_type
 

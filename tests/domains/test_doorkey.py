@@ -14,9 +14,9 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
-from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
-from hypogoal.domains.doorkey_engine import DROP, FORWARD, LEFT, PICKUP, TOGGLE, DoorKeyEngine
-from hypogoal.domains.doorkey_env import SUB_GOALS, DoorKeyEnv, DoorKeyGrid, layout_of
+from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig
+from hypogoal.domains.doorkey.engine import DROP, FORWARD, LEFT, PICKUP, TOGGLE, DoorKeyEngine
+from hypogoal.domains.doorkey.env import SUB_GOALS, DoorKeyEnv, DoorKeyGrid, layout_of
 
 SAME_GRID = (90, 103)  # layout seeds whose grids are the same
 

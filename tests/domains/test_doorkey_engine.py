@@ -11,8 +11,8 @@ import pytest
 from minigrid.core.world_object import Key
 from numpy.typing import NDArray
 
-from hypogoal.domains.doorkey_engine import DROP, FORWARD, N_ACTIONS, PICKUP, START, TOGGLE, DoorKeyEngine
-from hypogoal.domains.doorkey_env import DOOR_LABELS, SUB_GOALS, DoorKeyEnv, Layout
+from hypogoal.domains.doorkey.engine import DROP, FORWARD, N_ACTIONS, PICKUP, START, TOGGLE, DoorKeyEngine
+from hypogoal.domains.doorkey.env import DOOR_LABELS, SUB_GOALS, DoorKeyEnv, Layout
 
 LAYOUTS = range(100, 140)
 STEPS = 110

@@ -16,8 +16,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain
-from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
-from hypogoal.domains.gymnasium_engine import GymnasiumEngine
+from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium.engine import GymnasiumEngine
 from hypogoal.domains.observations import channels_first
 from hypogoal.stages.collect import collect
 

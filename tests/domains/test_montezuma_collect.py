@@ -17,10 +17,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, States
-from hypogoal.domains import montezuma_states
 from hypogoal.domains.base import Domain, defaults_of, load_domain, settings_of
-from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
-from hypogoal.domains.montezuma_emulator import (
+from hypogoal.domains.montezuma import states as montezuma_states
+from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
+from hypogoal.domains.montezuma.emulator import (
     DOWN,
     FRAME_SKIP,
     NOOP,
@@ -33,8 +33,8 @@ from hypogoal.domains.montezuma_emulator import (
     picture,
     pixel,
 )
-from hypogoal.domains.montezuma_ladders import LADDERS
-from hypogoal.domains.montezuma_states import (
+from hypogoal.domains.montezuma.ladders import LADDERS
+from hypogoal.domains.montezuma.states import (
     KINDS,
     POSITIVE,
     RoomStates,
@@ -48,7 +48,7 @@ from hypogoal.domains.montezuma_states import (
     origins_of,
     standing_places,
 )
-from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN, SUB_GOALS
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, SUB_GOALS
 from hypogoal.observations import digest
 
 pytestmark = pytest.mark.atari

@@ -13,7 +13,7 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.montezuma_emulator import (
+from hypogoal.domains.montezuma.emulator import (
     DOWN,
     FIRE,
     LEFT,

@@ -11,10 +11,10 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains import montezuma_env
 from hypogoal.domains.base import Engine
-from hypogoal.domains.montezuma import DOMAIN
-from hypogoal.domains.montezuma_emulator import (
+from hypogoal.domains.montezuma import env as montezuma_env
+from hypogoal.domains.montezuma.domain import DOMAIN
+from hypogoal.domains.montezuma.emulator import (
     DOWN,
     FIRE,
     LEFT,
@@ -25,10 +25,10 @@ from hypogoal.domains.montezuma_emulator import (
     UP,
     Emulator,
 )
-from hypogoal.domains.montezuma_engine import MontezumaEngine
-from hypogoal.domains.montezuma_env import BEGINNINGS, MontezumaLadder, arrives, make_starts
-from hypogoal.domains.montezuma_ladders import at_base, distance_to_base
-from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN
+from hypogoal.domains.montezuma.engine import MontezumaEngine
+from hypogoal.domains.montezuma.env import BEGINNINGS, MontezumaLadder, arrives, make_starts
+from hypogoal.domains.montezuma.ladders import at_base, distance_to_base
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 
 pytestmark = pytest.mark.atari
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma_emulator import (
+from hypogoal.domains.montezuma.emulator import (
     DOWN,
     FIRST_ROOM_OF_ROW,
     LEFT,
@@ -17,7 +17,7 @@ from hypogoal.domains.montezuma_emulator import (
     Position,
     row_of,
 )
-from hypogoal.domains.montezuma_ladders import (
+from hypogoal.domains.montezuma.ladders import (
     GROUPS,
     LADDERS,
     ROOM_HEIGHT,

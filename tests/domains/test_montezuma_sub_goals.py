@@ -11,12 +11,12 @@ from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
-from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
-from hypogoal.domains.montezuma_emulator import DOWN, LEFT, NOOP, SPRITE_TOP, UP, Emulator
-from hypogoal.domains.montezuma_engine import MontezumaEngine
-from hypogoal.domains.montezuma_env import BEGINNINGS, CLIMBED_UP, arrives, labels_of, make_starts
-from hypogoal.domains.montezuma_ladders import LADDERS, TOPS, Ladder
-from hypogoal.domains.montezuma_sub_goals import ENEMIES, FACT_BYTES, GATES, LASER_Y, SUB_GOALS, Enemy
+from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig, labelled_rooms, unlabelled_rooms
+from hypogoal.domains.montezuma.emulator import DOWN, LEFT, NOOP, SPRITE_TOP, UP, Emulator
+from hypogoal.domains.montezuma.engine import MontezumaEngine
+from hypogoal.domains.montezuma.env import BEGINNINGS, CLIMBED_UP, arrives, labels_of, make_starts
+from hypogoal.domains.montezuma.ladders import LADDERS, TOPS, Ladder
+from hypogoal.domains.montezuma.sub_goals import ENEMIES, FACT_BYTES, GATES, LASER_Y, SUB_GOALS, Enemy
 from hypogoal.meta.training import distances_of
 
 pytestmark = pytest.mark.atari

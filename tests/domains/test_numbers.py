@@ -15,8 +15,8 @@ from gymnasium import spaces
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import open_dataset, write_dataset
-from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
-from hypogoal.domains.gymnasium_engine import reader_of
+from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium.engine import reader_of
 from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised
 
 NAMES = (*(f"layout[{number}]" for number in range(8)), "noise", "place[0]", "place[1]")

@@ -20,7 +20,7 @@ from test_numbers import Says
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains.gymnasium_engine import reader_of
+from hypogoal.domains.gymnasium.engine import reader_of
 from hypogoal.importing.arrays import parts_of
 from hypogoal.importing.assemble import assemble
 from hypogoal.importing.taken import Taking

@@ -11,7 +11,7 @@ from hypogoal.core.files import write_table
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.domains.base import Domain
-from hypogoal.domains.doorkey import DOMAIN as DOORKEY
+from hypogoal.domains.doorkey.domain import DOMAIN as DOORKEY
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 SUB_GOAL = "climb-down-ladder"

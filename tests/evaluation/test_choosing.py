@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from planted import harsh, planted
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import judge, qualities, rank_correlation
 from hypogoal.evaluation.frozen import Choices, play
 from hypogoal.meta.config import GAMMA, TrainMetaConfig

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from planted import harsh, planted
 from scipy.stats import binom
 
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import play
 from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.options.choosers import Chooser, RandomChooser

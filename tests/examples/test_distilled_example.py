@@ -23,7 +23,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import qualities
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.episodes import agent_of

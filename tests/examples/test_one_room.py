@@ -20,7 +20,7 @@ from hypogoal.core.config import known, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected, States, open_dataset, write_dataset
-from hypogoal.domains.montezuma_emulator import observed_pixel
+from hypogoal.domains.montezuma.emulator import observed_pixel
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import ranking

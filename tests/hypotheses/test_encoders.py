@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.diversity import OBJECTIVES
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import INTEGRATED, attributed, mean_state, method_of
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble

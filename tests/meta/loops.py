@@ -8,9 +8,9 @@ import corridor_env
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains import doorkey
 from hypogoal.domains.base import Layouts
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.domain import DOMAIN
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
@@ -47,7 +47,7 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
     "light, own, n steps, even": (LongCorridor, "light", FAR, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
-    "DoorKey, many layouts, random": (partial(many, doorkey.DOMAIN.make_engine), "light", {}, "random"),
+    "DoorKey, many layouts, random": (partial(many, DOMAIN.make_engine), "light", {}, "random"),
     "Gymnasium, many layouts, random": (partial(many, corridor_env.SWIFT.make_engine), "light", {}, "random"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
     "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),

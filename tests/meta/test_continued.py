@@ -12,7 +12,7 @@ import torch
 from command_line import refuses, run, settings
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import make_agent
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.networks import apply_to_states

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Outcome, RandomChooser

@@ -14,7 +14,7 @@ from corridor import Corridor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, Layouts
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import play
 from hypogoal.evaluation.zero_shot import alone, shortest_ways
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds

@@ -137,7 +137,7 @@ def test_a_start_must_be_one_of_the_domains(corridor: Path, tmp_path: Path, caps
 
 def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
     """Spec D4, G2: DoorKey's layouts begin where they begin."""
-    from hypogoal.domains.doorkey import DOMAIN as doorkey
+    from hypogoal.domains.doorkey.domain import DOMAIN as doorkey
 
     ensemble = ensemble_of(tmp_path / "ensemble", doorkey, 1, "doorkey")
     with pytest.raises(UserError, match="doorkey has no named starts"):
@@ -153,7 +153,7 @@ def test_the_papers_number_of_steps_is_told() -> None:
 @pytest.mark.atari
 def test_options_on_a_ladder(tmp_path: Path) -> None:
     """Spec A3, B4, D4, F3: learned members and the oracle on the emulator, from an ensemble to executions and stops."""
-    from hypogoal.domains.montezuma import DOMAIN as montezuma
+    from hypogoal.domains.montezuma.domain import DOMAIN as montezuma
 
     ensemble = ensemble_of(tmp_path / "ensemble", montezuma, members=2)
     few = {"start": "1L", "option_timeout": 25, "steps": 320, "n_step": 3, "exploration": "persistent", "replay": 500}

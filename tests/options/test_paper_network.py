@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses import patches
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig

@@ -5,7 +5,7 @@ import pytest
 from corridor import Corridor
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.doorkey_engine import START, DoorKeyEngine
+from hypogoal.domains.doorkey.engine import START, DoorKeyEngine
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.planned import FAR, PlannedLearner, distances
 from hypogoal.options.termination import Terminations, oracle_terminations

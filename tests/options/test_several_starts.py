@@ -11,8 +11,8 @@ import hypogoal
 from hypogoal.core.artefacts import create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.montezuma import DOMAIN
-from hypogoal.domains.montezuma_engine import MontezumaEngine
+from hypogoal.domains.montezuma.domain import DOMAIN
+from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.stages.train_options import train_options
 

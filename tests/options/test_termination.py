@@ -12,7 +12,7 @@ from uneven import Uneven
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import NETWORKS
 from hypogoal.options.termination import Terminations, learned_terminations, rule_of

@@ -9,7 +9,7 @@ from corridor import Corridor, LongCorridor
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.data import joined_unlabelled, open_dataset
 from hypogoal.domains.base import Layouts
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options.visited import Visited
 
 

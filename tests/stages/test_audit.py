@@ -20,7 +20,7 @@ from toy_data import files_of, reseal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints, State
-from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
+from hypogoal.domains.doorkey.engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS, lines_of
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.options.termination import Terminations

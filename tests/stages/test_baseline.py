@@ -14,7 +14,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Step
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
@@ -113,7 +113,7 @@ def test_reaching_the_goal_is_a_terminal_state():
 @pytest.mark.parametrize("network", list(NETWORKS))
 def test_tile_codes_say_what_the_image_says(network):
     """Spec E7: with a table of tiles the network gives what the same weights give for the RGB image itself."""
-    from hypogoal.domains.doorkey_engine import DoorKeyEngine
+    from hypogoal.domains.doorkey.engine import DoorKeyEngine
 
     engine = DoorKeyEngine(3, 4)
     ids = engine.reachable()[::37]

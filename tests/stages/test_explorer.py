@@ -9,7 +9,7 @@ import pytest
 from browser import document_of, needs_browser, title_of
 
 from hypogoal.data import open_dataset
-from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.evaluation.explorer import MOST_EXPLAINED, MOST_STATES
 
 MEMBERS = 2

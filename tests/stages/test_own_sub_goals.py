@@ -14,9 +14,9 @@ from corridor_env import SUB_GOALS as SUB_GOALS_OF_CORRIDOR
 from corridor_env import CorridorEnv
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.domains.doorkey import DOMAIN
-from hypogoal.domains.doorkey_env import SUB_GOALS
-from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+from hypogoal.domains.doorkey.domain import DOMAIN
+from hypogoal.domains.doorkey.env import SUB_GOALS
+from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 from hypogoal.evaluation.selection import practised
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import assemble

@@ -20,7 +20,7 @@ from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.typing import NDArray
 
 from hypogoal.domains.base import Engine, Layouts, Plan, Step
-from hypogoal.domains.doorkey_env import (
+from hypogoal.domains.doorkey.env import (
     DOOR_COLOUR,
     KEY_COLOURS,
     MAX_STEPS,

@@ -1,6 +1,6 @@
 """Spec B4, D4: Montezuma's Revenge from the top of a ladder or elsewhere, a Gymnasium environment; its start states.
 
-This is the reference: tests compare the training engine (``montezuma_engine.py``) with it.
+This is the reference: tests compare the training engine (``engine.py``) with it.
 """
 
 from collections.abc import Iterator
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains import montezuma_emulator as game
-from hypogoal.domains.montezuma_emulator import Position
-from hypogoal.domains.montezuma_ladders import LADDERS, REACH, within
-from hypogoal.domains.montezuma_sub_goals import CROSSINGS, FACT_BYTES, SUB_GOALS
+from hypogoal.domains.montezuma import emulator as game
+from hypogoal.domains.montezuma.emulator import Position
+from hypogoal.domains.montezuma.ladders import LADDERS, REACH, within
+from hypogoal.domains.montezuma.sub_goals import CROSSINGS, FACT_BYTES, SUB_GOALS
 
 MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
 START_STATES = 32

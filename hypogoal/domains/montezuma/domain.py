@@ -1,8 +1,8 @@
 """Sub-goals in Montezuma's Revenge (Spec B4, B5): the domain, and how its states are collected.
 
-See also ``montezuma_emulator`` (the game, with the agent placed anywhere), ``montezuma_ladders`` (the ladders'
-positions), ``montezuma_sub_goals`` (climbing, passing enemies), ``montezuma_states`` (the states of a room),
-``montezuma_env`` and ``montezuma_engine`` (one game and many, from the top of a ladder).
+See also ``emulator`` (the game, with the agent placed anywhere), ``ladders`` (the ladders'
+positions), ``sub_goals`` (climbing, passing enemies), ``states`` (the states of a room),
+``env`` and ``engine`` (one game and many, from the top of a ladder).
 """
 
 from collections.abc import Callable, Mapping
@@ -20,11 +20,11 @@ from hypogoal.core.config import Config, setting
 from hypogoal.core.processes import allowed, in_processes
 from hypogoal.data import Collected, States, joined
 from hypogoal.domains.base import Domain
-from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, picture, pixel
-from hypogoal.domains.montezuma_engine import MontezumaEngine
-from hypogoal.domains.montezuma_env import BEGINNINGS, MAX_STEPS, beginning_named
-from hypogoal.domains.montezuma_ladders import GROUPS, distance_to, distance_to_base
-from hypogoal.domains.montezuma_states import (
+from hypogoal.domains.montezuma.emulator import OBSERVATION_SHAPE, ROOMS, picture, pixel
+from hypogoal.domains.montezuma.engine import MontezumaEngine
+from hypogoal.domains.montezuma.env import BEGINNINGS, MAX_STEPS, beginning_named
+from hypogoal.domains.montezuma.ladders import GROUPS, distance_to, distance_to_base
+from hypogoal.domains.montezuma.states import (
     KINDS,
     RoomStates,
     emulator_of_process,
@@ -32,7 +32,7 @@ from hypogoal.domains.montezuma_states import (
     labels_of,
     origins_of,
 )
-from hypogoal.domains.montezuma_sub_goals import CLIMB_DOWN, SUB_GOALS, SubGoal
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, SUB_GOALS, SubGoal
 
 SEEN_NOWHERE, SEEN_UNLABELLED, SEEN_LABELLED = range(3)
 
@@ -164,7 +164,7 @@ class MontezumaDomain(Domain):
 
         ``seed`` seeds the rollouts; each room of each set has its own stream. ``kept`` returns by name the checkpoints
         that keep each room's states until all rooms are complete; a room kept there is not gathered again. All three
-        sets have labels (the unlabelled states' are for tests only). Origins: see ``montezuma_states.origins_of``;
+        sets have labels (the unlabelled states' are for tests only). Origins: see ``states.origins_of``;
         held-out states also have ``seen``: 0 the room is in no training set, 1 it is an unlabelled room, 2 a labelled
         one. No emulator, or a room with too few different states is a ``UserError``.
         """

@@ -1,6 +1,6 @@
 """Three-key DoorKey (Spec B1-B3): the domain, and how its states are collected.
 
-See also ``doorkey_env`` (the Gymnasium environment and the sub-goals) and ``doorkey_engine`` (many environments, fast).
+See also ``env`` (the Gymnasium environment and the sub-goals) and ``engine`` (many environments, fast).
 """
 
 import itertools
@@ -12,9 +12,9 @@ import numpy as np
 
 from hypogoal.core.config import Config, setting
 from hypogoal.data import Collected, States, joined, leave_out, require_classes
-from hypogoal.domains import doorkey_env as env
 from hypogoal.domains.base import Domain
-from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.domains.doorkey import env
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
 
 # So that options behind other options learn in time.
 LEARNING: Mapping[str, Any] = MappingProxyType({"epsilon_steps": 2_000, "update_interval": 8})

@@ -1,6 +1,6 @@
 """Spec B1, B2: three-key DoorKey on minigrid's own classes, its layouts and its five sub-goals.
 
-This is the reference: the fast engine (``doorkey_engine.py``) is tested to be pixel- and step-exact with it.
+This is the reference: the fast engine (``engine.py``) is tested to be pixel- and step-exact with it.
 """
 
 from dataclasses import dataclass

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains import montezuma_emulator as game
-from hypogoal.domains.montezuma_emulator import RAM, Emulator, Position
-from hypogoal.domains.montezuma_ladders import (
+from hypogoal.domains.montezuma import emulator as game
+from hypogoal.domains.montezuma.emulator import RAM, Emulator, Position
+from hypogoal.domains.montezuma.ladders import (
     BASES,
     GROUPS,
     LADDERS,
@@ -26,7 +26,7 @@ from hypogoal.domains.montezuma_ladders import (
     at_base,
     within,
 )
-from hypogoal.domains.montezuma_sub_goals import FACT_BYTES, SubGoal
+from hypogoal.domains.montezuma.sub_goals import FACT_BYTES, SubGoal
 from hypogoal.observations import digest
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")

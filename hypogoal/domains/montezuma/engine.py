@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.base import TurnEngine
-from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, beginning_named, labels_of, make_starts
-from hypogoal.domains.montezuma_sub_goals import FACT_BYTES, FACTS
+from hypogoal.domains.montezuma import emulator as game
+from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, Start, beginning_named, labels_of, make_starts
+from hypogoal.domains.montezuma.sub_goals import FACT_BYTES, FACTS
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
 DYING = game.RAM["dying"]

@@ -11,8 +11,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma_emulator import RAM, Position
-from hypogoal.domains.montezuma_ladders import BASES, GROUPS, REACH, TOPS, place_of
+from hypogoal.domains.montezuma.emulator import RAM, Position
+from hypogoal.domains.montezuma.ladders import BASES, GROUPS, REACH, TOPS, place_of
 
 FACTS = ("room", "x", "y", "skull", "object")  # the bytes of ``RAM`` that predicates read
 FACT_BYTES = [RAM[name] for name in FACTS]

@@ -15,8 +15,8 @@ from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
-from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
+from hypogoal.domains.gymnasium import engine as engines
 from hypogoal.observations import Observations, digest
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]

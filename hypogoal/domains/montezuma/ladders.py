@@ -1,6 +1,6 @@
 """The ladders of Montezuma's Revenge: their positions, when one is climbed down, and distances (Spec B4, B5, F3).
 
-Positions are in RAM units (see ``montezuma_emulator``), read off the emulator while the agent climbed down; a test
+Positions are in RAM units (see ``emulator``), read off the emulator while the agent climbed down; a test
 marked ``atari`` repeats every descent.
 """
 
@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma_emulator import FIRST_ROOM_OF_ROW, ROOMS, Position, row_of
+from hypogoal.domains.montezuma.emulator import FIRST_ROOM_OF_ROW, ROOMS, Position, row_of
 
 REACH = 2  # at a place: at most this far from it, in x and in y
 

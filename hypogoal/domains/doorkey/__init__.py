@@ -1,0 +1,1 @@
+"""Three-key DoorKey (Spec B1-B3)."""
