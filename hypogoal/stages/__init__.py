@@ -10,7 +10,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,17 +20,17 @@ from typer import Option
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.terminal import say
 
 if TYPE_CHECKING:
     from hypogoal.core.artefacts import Draft
-    from hypogoal.core.progress import MetricsLog, Progress
     from hypogoal.made import Made
 
 Place = str | os.PathLike[str]
 DOMAINS = "doorkey, montezuma, rooms, or module:object."
 WIDTH = 100  # of tables
-NO_SETTINGS = ("preset", "set_", "seed", "device")  # options that a stage without settings leaves out
+NO_SETTINGS = ("preset", "seed", "device")  # options that a stage without settings leaves out
 STAGES: dict[str, "Stage"] = {}  # by command, those that were imported
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
@@ -52,14 +52,14 @@ class Call:
     """One call of a stage: where it writes, and how it was asked for."""
 
     stage: str
-    out: Path
-    preset: str | None = None
-    typed: Mapping[str, Any] = field(default_factory=dict)  # settings: options and --set, or arguments in Python
-    seed: int = 0
-    device: str = "auto"
-    force: bool = False
-    resume: bool = False
-    quiet: bool = False
+    out: Out
+    typed: Mapping[str, Any]  # settings: options and --set, or arguments in Python
+    preset: Preset = None
+    seed: Seed = 0
+    device: Device = "auto"
+    force: Force = False
+    resume: Resume = False
+    quiet: Quiet = False
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -72,13 +72,23 @@ class Call:
         return settings_of(self.stage, domain, self.preset, self.typed, inherited=inherited)
 
     def draft(
-        self, kind: str, config: Mapping[str, Any], inputs: Sequence[Path] = ()
-    ) -> "contextlib.AbstractContextManager[Draft]":
+        self,
+        kind: str,
+        config: Mapping[str, Any],
+        inputs: Sequence[Path] = (),
+    ) -> contextlib.AbstractContextManager["Draft"]:
         """The output to fill, see :func:`hypogoal.core.artefacts.create`."""
         from hypogoal.core.artefacts import create
 
-        how: dict[str, Any] = {"seed": self.seed, "force": self.force, "resume": self.resume}
-        return create(self.out, kind=kind, config=config, inputs=inputs, **how)
+        return create(
+            self.out,
+            kind=kind,
+            config=config,
+            seed=self.seed,
+            inputs=inputs,
+            force=self.force,
+            resume=self.resume,
+        )
 
     @contextlib.contextmanager
     def training(
@@ -91,7 +101,6 @@ class Call:
     ) -> Iterator["Training"]:
         """The same for a training of so many steps; TensorBoard's folder gets the numbers of the log, too."""
         from hypogoal.core.artefacts import LOG
-        from hypogoal.core.progress import MetricsLog, Progress
 
         with (
             self.draft(kind, config, inputs) as draft,
@@ -106,8 +115,8 @@ class Training:
     """An artefact in training: its draft, its log, its progress bar."""
 
     draft: "Draft"
-    log: "MetricsLog"
-    progress: "Progress"
+    log: MetricsLog
+    progress: Progress
 
 
 @dataclass(frozen=True)
@@ -119,17 +128,23 @@ class Done:
     path: Path | None = None  # where to look, if not where the stage says by default
 
 
-def stage(
-    example: str,
-    *,
-    often: Sequence[str] = (),
-    leaves_out: Sequence[str] = (),
-    into: str = "",
-    page: str = "",
-) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
-    """Make a function a stage. It gets a :class:`Call`, then what it works on, then inputs of its own by name.
+def stage(example: str, **more: Any) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
+    """Make a function a stage; ``example`` and ``more`` are of :class:`Stage`."""
 
-    Args:
+    def register(function: Callable[..., Done]) -> Callable[..., "Made"]:
+        made = Stage(function, example, **more)
+        STAGES[made.name] = made
+        return made.python()
+
+    return register
+
+
+@dataclass
+class Stage:
+    """A function as a stage. It gets a :class:`Call`, then what it works on, then inputs of its own by name.
+
+    Attributes:
+        function: the function.
         example: a command, with which ``--help`` ends.
         often: the settings changed most, options of the command.
         leaves_out: options of all stages that this one has not.
@@ -137,67 +152,46 @@ def stage(
         page: the file of its output to look at, if not the output itself.
     """
 
-    def register(function: Callable[..., Done]) -> Callable[..., "Made"]:
-        it = Stage(function, example, often, leaves_out, into, page)
-        STAGES[it.name] = it
+    function: Callable[..., Done]
+    example: str
+    often: Sequence[str] = ()
+    leaves_out: Sequence[str] = ()
+    into: str = ""
+    page: str = ""
 
-        @functools.wraps(function)
-        def made(source: Any, out: Place | None = None, **arguments: Any) -> "Made":
-            return it.made(source, out, arguments)
-
-        made.__signature__ = it.signature  # type: ignore[attr-defined]
-        return made
-
-    return register
-
-
-class Stage:
-    """A function that ``@stage`` decorates."""
-
-    def __init__(
-        self,
-        function: Callable[..., Done],
-        example: str,
-        often: Sequence[str],
-        leaves_out: Sequence[str],
-        into: str,
-        page: str,
-    ):
-        self.function = function
-        self.example = example
-        self.often = often
-        self.into = into
-        self.page = page
-        self.name = function.__name__.replace("_", "-")
-        _, self.source, *self.inputs = inspect.signature(function).parameters.values()
-        self.out, *shared = inspect.signature(_shared).parameters.values()
-        self.shared = [_keyword(option) for option in shared if option.name not in leaves_out]
-        if into:
-            by_default: Any = Option("--out", help=f"Default: {self.source.name.upper()}/{into}.")
+    def __post_init__(self) -> None:
+        self.name = self.function.__name__.replace("_", "-")
+        _, self.source, *self.inputs = inspect.signature(self.function).parameters.values()
+        _, self.out, _, *shared = inspect.signature(Call).parameters.values()
+        self.options = [option for option in shared if option.name not in self.leaves_out]
+        self.has_settings = "preset" not in self.leaves_out
+        if self.into:
+            by_default: Any = Option("--out", help=f"Default: {self.source.name.upper()}/{self.into}.")
             self.out = self.out.replace(default=None, annotation=Annotated[Path | None, by_default])
 
-    @property
-    def signature(self) -> inspect.Signature:
-        """Of the Python function: settings are further arguments."""
-        options = [option for option in self.shared if option.name != "set_"]
-        out = self.out.replace(default=None)
+    def python(self) -> Callable[..., "Made"]:
+        """The function of Python: arguments that are neither inputs nor options are settings."""
+
+        @functools.wraps(self.function)
+        def called(source: Any, out: Place | None = None, **arguments: Any) -> "Made":
+            from hypogoal.core.processes import own_settings
+            from hypogoal.made import Made
+
+            own_code.allow([source, *arguments.values()])
+            values: dict[str, Any] = {}
+            for parameter in (*self.inputs, *self.options):
+                if parameter.name in arguments:
+                    values[parameter.name] = _as_path(parameter, arguments.pop(parameter.name))
+            with own_settings():
+                call, _ = self.run(_as_path(self.source, source), out, values, arguments)
+            return Made(call.out)
+
+        out = self.out.replace(default=None, annotation=Place | None)
+        options = map(_keyword, self.options)
         settings = Parameter("settings", Parameter.VAR_KEYWORD)
-        return inspect.Signature([self.source, out, *self.inputs, *options, settings])
-
-    def made(self, source: Any, out: Place | None, arguments: Mapping[str, Any]) -> "Made":
-        """Run it from Python; ``arguments`` that are no options are settings."""
-        from hypogoal.core.processes import own_settings
-        from hypogoal.made import Made
-
-        own_code.allow([source, *arguments.values()])
-        values: dict[str, Any] = {}
-        typed = dict(arguments)
-        for parameter in (*self.inputs, *self.shared):
-            if parameter.name in typed:
-                values[parameter.name] = _as_path(parameter, typed.pop(parameter.name))
-        with own_settings():
-            call, _ = self.run(_as_path(self.source, source), out, values, typed)
-        return Made(call.out)
+        signature = inspect.Signature([self.source, out, *self.inputs, *options, settings])
+        called.__signature__ = signature  # type: ignore[attr-defined]
+        return called
 
     def command(self) -> Any:
         """The command of the command line."""
@@ -211,74 +205,64 @@ class Stage:
             typed |= assigned(values.pop("set_", None) or ())
             call, done = self.run(source, out, values, typed)
             if not call.quiet:
-                _tell(done)
+                for line in done.lines:
+                    say(line)
+                if done.then:
+                    say(f"next: {own_code.command(*done.then)}")
             say(done.path or call.out / self.page)
 
-        parameters = map(_keyword, (self.source, *self.inputs, self.out))
-        options = _options(self.name, self.often) if self.often else []
-        called.__signature__ = inspect.Signature([*parameters, *self.shared, *options])  # type: ignore[attr-defined]
+        parameters = [self.source, *self.inputs, self.out, *self.options, *self._settings()]
+        called.__signature__ = inspect.Signature([*map(_keyword, parameters)])  # type: ignore[attr-defined]
         called.__doc__ = inspect.cleandoc(self.function.__doc__ or "").partition("\n\n")[0]
         alone = typer.Typer(add_completion=False)
         alone.command(self.name, epilog=f"Example:\n\n[bold]hypogoal {self.example}[/bold]")(called)
         return typer.main.get_command(alone)
 
     def run(
-        self, source: Any, out: Place | None, values: dict[str, Any], typed: Mapping[str, Any]
+        self,
+        source: Any,
+        out: Place | None,
+        values: dict[str, Any],
+        typed: Mapping[str, Any],
     ) -> tuple[Call, Done]:
-        """Call the function with the ``values`` of options. What is complete already, with ``resume``, is kept."""
-        inputs = {each.name: values.pop(each.name) for each in self.inputs if each.name in values}
-        if typed and not any(option.name == "preset" for option in self.shared):
+        """Call the function with the ``values`` of inputs and options. With ``resume`` what is complete is kept."""
+        if typed and not self.has_settings:
             raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
+        inputs = {}
+        for each in self.inputs:
+            if each.name in values:
+                inputs[each.name] = values.pop(each.name)
         place = Path(out) if out else Path(source, self.into)
-        call = Call(self.name, place, typed=typed, **values)
+        call = Call(self.name, place, typed, **values)
         try:
             return call, self.function(call, source, **inputs)
         except Complete as complete:
             say(complete, err=True)
             return call, Done()
 
+    def _settings(self) -> Iterator[Parameter]:
+        """``--set``, and options that are short for it; their values stay text, read as those of ``--set``."""
+        from hypogoal.core.config import described, model_of
 
-def _shared(
-    out: Out,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-) -> None:
-    """The options of all stages."""
+        if not self.has_settings:
+            return
+        yield Parameter("set_", Parameter.KEYWORD_ONLY, default=None, annotation=Set)
+        if not self.often:
+            return
+        rows = {row["name"]: row for row in described(model_of(self.name))}
+        panel = f"Settings, with doorkey's defaults (all: hypogoal config {self.name})"
+        for name in self.often:
+            row = rows[name]
+            meaning = row["meaning"][0].upper() + row["meaning"][1:]
+            choices = f" ({row['allowed']})" if "|" in row["allowed"] else ""
+            text = f"{meaning}{choices}. [dim]\\[default: {row['default']}][/dim]"
+            option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
+            annotation = Annotated[str | None, option]
+            yield Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
 def _keyword(parameter: Parameter) -> Parameter:
     return parameter.replace(kind=Parameter.KEYWORD_ONLY)
-
-
-def _options(stage: str, often: Sequence[str]) -> list[Parameter]:
-    """Options that are short for ``--set``. Values stay text, read as those of ``--set``."""
-    from hypogoal.core.config import described, model_of
-
-    rows = {row["name"]: row for row in described(model_of(stage))}
-    panel = f"Settings, with doorkey's defaults (all: hypogoal config {stage})"
-    options = []
-    for name in often:
-        row = rows[name]
-        meaning = row["meaning"][0].upper() + row["meaning"][1:]
-        choices = f" ({row['allowed']})" if "|" in row["allowed"] else ""
-        text = f"{meaning}{choices}. [dim]\\[default: {row['default']}][/dim]"
-        option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
-        annotation = Annotated[str | None, option]
-        options.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation))
-    return options
-
-
-def _tell(done: Done) -> None:
-    """Print the result and the next command."""
-    for line in done.lines:
-        say(line)
-    if done.then:
-        say(f"next: {own_code.command(*done.then)}")
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:
