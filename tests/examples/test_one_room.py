@@ -328,7 +328,7 @@ def test_what_is_saved_is_what_was_trained(tmp_path: Path) -> None:
     ("words", "line"),
     [
         (["--set", "view.jiter=1"], "the view has no such setting: view.jiter. It has jitter, localiser_steps"),
-        (["--set", "view.jitter=21"], "value out of range: jitter='21' in one_room:AgentView. Allowed: 0 .. 20"),
+        (["--set", "view.jitter=21"], "value not allowed: jitter='21' in one_room:AgentView. Allowed: 0 .. 20"),
     ],
 )
 def test_wrong_settings_are_one_line(

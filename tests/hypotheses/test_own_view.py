@@ -135,7 +135,7 @@ def test_pools_of_positives_take_turns(kinds: list[int], each: tuple[int, int]) 
         ({"view": "window"}, "unknown view: window"),
         ({"view": "own_view:Settings"}, "this is no view: own_view:Settings"),
         ({"view_settings": ("jiter=3",)}, "the view has no such setting: view.jiter. It has jitter"),
-        ({"view_settings": ("jitter=9",)}, "value out of range: jitter='9' in own_view:Moved. Allowed: 0 .. 8"),
+        ({"view_settings": ("jitter=9",)}, "value not allowed: jitter='9' in own_view:Moved. Allowed: 0 .. 8"),
         ({"view": "own_view:Wrong"}, r"the view shows uint8 \(1, 41, 42, 3\) of one state: .* Show uint8 \(1, 42, 42"),
         ({"view": "own_view:OfNumbers", "view_settings": ()}, "the view is of float32, these observations are uint8"),
     ],

@@ -84,7 +84,7 @@ def test_what_would_end_a_command_is_an_error(run: Path, tmp_path: Path) -> None
     cases = [
         ({"stepz": 3}, "train-ensemble has no setting: stepz. Did you mean 'steps'"),
         ({"steps": "many"}, "valid integer"),
-        ({"members": 0}, "value out of range"),
+        ({"members": 0}, "value not allowed"),
         ({"diversity": "none:such"}, "cannot be loaded"),
         ({"preset": "none-such"}, "no such preset"),
         ({"device": "tpu"}, "unknown device"),

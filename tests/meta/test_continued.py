@@ -89,7 +89,7 @@ def test_an_embedding_by_name_goes_through_both_stages(ensemble: Path, tmp_path:
     run(*meta)
     assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["embedding"] == "tiles"
     planned = ["--out", tmp_path / "other", *named, "--set", "network=planned", "-q"]
-    refuses("network=planned has no setting: embedding", *meta[:2], *planned)
+    refuses("only beside another choice: embedding", *meta[:2], *planned)
 
 
 @pytest.mark.usefixtures("small_gru")

@@ -113,7 +113,9 @@ def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_ru
 def test_settings_that_do_nothing_are_refused(pair: str, without: str, corridor_run: Path, tmp_path: Path) -> None:
     """Spec G2: where they were given; those of a preset, or of an experiment for all its cells, pass."""
     command = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW]
-    refuses(f"{without} has no setting: {pair.partition('=')[0]}", *command, *settings(pair, without))
+    refuses(
+        f"has this setting only beside another choice: {pair.partition('=')[0]}", *command, *settings(pair, without)
+    )
     preset = tmp_path / "all.toml"
     preset.write_text("[train-meta]\nentropy = 0.1\n")
     run(*command, "--preset", preset, "--set", "chooser=random")
