@@ -32,7 +32,8 @@ import torch
 from torch import Tensor, nn
 
 import hypogoal
-from hypogoal.core.seeding import seed_for
+from hypogoal.core.drawing import DrawsFrom
+from hypogoal.core.seeding import torch_generator
 from hypogoal.learners.double_dqn import descend
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.choosers import Ids
@@ -126,8 +127,7 @@ class Learner(LightLearner):
         self.actions = plan_of(self.engine, self.terminations, config, self.engine.ids[:1]).actions
         self.exploration = Exploration(config, self.engine.count, len(self.actions), self.rng)
         shape, actions = self.engine.observation_shape, self.engine.n_actions
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed_for(seed, "option-weights"))
+        with DrawsFrom(torch_generator(seed, "option-weights")):
             network = LightQNetwork(shape, self.options, actions, self.engine.standard, config.embedding)
         self.online = self.target = network.to(self.device)  # best actions are known: no target moves
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)

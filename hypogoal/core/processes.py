@@ -24,6 +24,7 @@ TOGETHER = 0.5  # seconds within which signals count as one: a second one would 
 RESEND_SECONDS = 1.0
 
 _stopped_at = float("-inf")
+_turn = threading.RLock()  # a stage may call another one
 
 
 def stop(number: int, _frame: FrameType | None) -> None:
@@ -172,17 +173,21 @@ def prepare(device: str = "auto") -> str:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """torch as if nobody had changed its settings; afterwards they are the caller's again."""
+    """torch as if nobody had changed its settings; afterwards they are the caller's again.
+
+    Most are of the whole process, so its threads take turns.
+    """
     import torch
 
-    threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
-    torch.set_default_dtype(torch.float32)
-    torch.set_default_device(None)
-    try:
-        with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
-            yield
-    finally:
-        torch.set_num_threads(threads)
-        torch.set_flush_denormal(False)
-        torch.set_default_dtype(dtype)
-        torch.set_default_device(device if device.type != "cpu" else None)
+    with _turn:
+        threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
+        try:
+            with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+                yield
+        finally:
+            torch.set_num_threads(threads)
+            torch.set_flush_denormal(False)
+            torch.set_default_dtype(dtype)
+            torch.set_default_device(device if device.type != "cpu" else None)

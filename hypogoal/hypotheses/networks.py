@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.hypotheses.load import ByKey
@@ -155,15 +156,15 @@ def _checked(name: str, function: Callable[..., Parts | nn.Module]) -> Callable[
 def build_network(
     name: str,
     observation_shape: tuple[int, ...],
-    generator: torch.Generator,
+    generator: torch.Generator | None,
     dtype: np.dtype[Any] = PICTURE,
 ) -> nn.Sequential:
     """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
-    ``generator`` draws the initial weights (PyTorch's default distributions). Of mixed observations, of type ``dtype``,
-    each key has its network without the last layer; a dense layer joins them. An unknown network (see
-    :func:`load_network`), or observations that it does not take, for example images too small for it, are a
-    ``UserError``.
+    ``generator`` draws the initial weights (PyTorch's default distributions); None: that of the ``DrawsFrom`` around.
+    Of mixed observations, of type ``dtype``, each key has its network without the last layer; a dense layer joins them.
+    An unknown network (see :func:`load_network`), or observations that it does not take, for example images too small
+    for it, are a ``UserError``.
     """
     where = f"observation shape {tuple(observation_shape)}"
     parts_of = None if dtype.names else load_network(name)
@@ -175,8 +176,7 @@ def build_network(
         joined: Parts = [by_key], (JOINT,)
     sizes = (values_in((), dtype),) if dtype.names else as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
-    with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
-        torch.manual_seed(seed)
+    with DrawsFrom(torch.Generator().manual_seed(seed)):
         layers, hidden = parts_of(observation_shape) if parts_of else joined
         # Without numbers (device meta) PyTorch takes longer over what keeps shapes than over the rest of the network.
         shaping = [layer for layer in layers if not isinstance(layer, nn.BatchNorm2d | nn.ReLU)]

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from hypogoal.core.arrays import Columns, tensor
 from hypogoal.core.checkpoints import State
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import rng_for, seed_for, torch_generator
+from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
@@ -61,8 +62,7 @@ class MetaPolicy(Chooser):
     def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int, device: torch.device | str = "cpu"):
         self.engine, self.options, self.config = engine, options, config
         self.device = torch.device(device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed_for(seed, "meta-weights"))
+        with DrawsFrom(torch_generator(seed, "meta-weights")):
             network = meta_network(config.meta_network, engine.observation_shape, options, engine.standard)
             self.network = network.to(self.device)
             self.head = HEADS[config.head](options).to(self.device)

@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import seed_for
+from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting, load_into
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
@@ -72,8 +73,7 @@ class LightLearner(Learner):
     def build(self, config: LightConfig, seed: int) -> None:
         self.running_only = config.experience == "own"
         self.ahead = StepsAhead(self.engine.count, config.n_step)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed_for(seed, "option-weights"))
+        with DrawsFrom(torch_generator(seed, "option-weights")):
             shape, standard = self.engine.observation_shape, self.engine.standard
             network = LightQNetwork(shape, self.options, self.engine.n_actions, standard, config.embedding)
             self.online = network.to(self.device)

@@ -101,7 +101,7 @@ class OwnEmbedding(FullView):
 
     def __init__(self, name: str, observation_shape: tuple[int, ...], standard: Standard | None = None):
         super().__init__(observation_shape, standard)
-        network = build_network(name, observation_shape, torch.default_generator)
+        network = build_network(name, observation_shape, None)
         last = network[-1]
         assert isinstance(last, nn.Linear)
         self.encoder, self.features = network[:-1].eval(), last.in_features

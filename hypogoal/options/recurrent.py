@@ -18,8 +18,9 @@ from torch import Tensor
 
 from hypogoal.core.arrays import Columns
 from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import seed_for
+from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting, load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow, target_rate
@@ -50,8 +51,7 @@ class Member(Resumable):
     CHANGING = ("online", "target", "optimiser", "replay", "updates", "due", "executions")
 
     def __init__(self, engine: Engine, config: PaperConfig, seed: int, option: int, actions: int, device: torch.device):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed_for(seed, "option-weights", option))
+        with DrawsFrom(torch_generator(seed, "option-weights", option)):
             remembers = config.recurrence == "execution"
             self.online = PaperQNetwork(engine.observation_shape, actions, remembers).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()

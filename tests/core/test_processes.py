@@ -1,4 +1,4 @@
-"""Work in other processes: how many there may be, how they end, and what they leave of the caller's settings."""
+"""Work in other processes: how many there may be, how they end."""
 
 import os
 import signal
@@ -8,11 +8,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import Killed, UserError
-from hypogoal.core.processes import CORES, allowed, cores, in_processes, own_settings, prepare
+from hypogoal.core.processes import CORES, allowed, cores, in_processes
 
 
 def ignore(number: int, result: object) -> None:
@@ -98,26 +97,3 @@ def test_scripts_without_a_guard_and_pools(tmp_path: Path, code: str, said: str)
     command = [sys.executable, tmp_path / "script.py"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
     assert said in done.stdout and done.stderr == ""
-
-
-def test_the_callers_settings_of_torch_hold_again() -> None:
-    """In the block they are torch's own, whatever they were."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    torch.set_default_dtype(torch.float64)
-    torch.set_default_device("meta")
-    try:
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-            with own_settings():
-                prepare()
-                weights = torch.ones(2, 2, requires_grad=True)
-                product = weights @ weights
-                assert product.requires_grad and product.device.type == "cpu" and product.dtype == torch.float32
-                assert torch.get_num_threads() == 1
-            assert not torch.is_grad_enabled() and torch.is_autocast_enabled("cpu")
-        assert (torch.get_num_threads(), torch.get_default_dtype()) == (2, torch.float64)
-        assert torch.get_default_device().type == "meta"
-    finally:
-        torch.set_default_device(None)
-        torch.set_default_dtype(torch.float32)
-        torch.set_num_threads(threads)

@@ -1,0 +1,144 @@
+"""Stages inside other people's programs: whatever torch, NumPy and threads were set to, the bytes are the same."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from own_domain import CorridorDomain
+
+import hypogoal
+from hypogoal.domains import base
+
+WITH_WEIGHTS = "*.safetensors"
+
+
+class Walked(CorridorDomain):
+    """A domain that only this program has."""
+
+    name = "corridor-walked"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Its states."""
+    path = tmp_path_factory.mktemp("data") / "data.h5"
+    hypogoal.collect(Walked(), out=path, copies=9, quiet=True)
+    yield path
+    del base.REGISTERED[Walked.name]
+
+
+def weights(folder: Path) -> dict[str, bytes]:
+    """Of members, options and agent."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob(WITH_WEIGHTS))}
+
+
+def train(data: Path, folder: Path) -> dict[str, bytes]:
+    """A few steps of an ensemble, of its options and of an agent; the weights."""
+    ensemble = hypogoal.train_ensemble(data, folder / "ensemble", steps=3, workers=1, members=2, quiet=True)
+    few = {"steps": 64, "environments": 4, "warm_up": 16, "decisions": 8, "random_episodes": 2}
+    hypogoal.train_meta(ensemble, folder / "meta", **few, quiet=True)
+    return weights(folder)
+
+
+@pytest.fixture(scope="module")
+def plain(data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What comes of it where nothing was set."""
+    return train(data, tmp_path_factory.mktemp("plain"))
+
+
+@contextmanager
+def setting(change: Callable[[Any], Any], value: Any, before: Any) -> Iterator[None]:
+    """What is set for a whole process, and set back afterwards."""
+    change(value)
+    try:
+        yield
+    finally:
+        change(before)
+
+
+@contextmanager
+def strict_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+@contextmanager
+def drawing_beside() -> Iterator[None]:
+    """Another thread draws from the global generators all the time."""
+    over = threading.Event()
+
+    def draw() -> None:
+        while not over.wait(1e-4):
+            torch.rand(3)
+            np.random.rand(3)  # noqa: NPY002
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+SETTINGS: dict[str, Callable[[], AbstractContextManager[Any]]] = {
+    "another type": lambda: setting(torch.set_default_dtype, torch.float64, torch.float32),
+    "another device": lambda: setting(torch.set_default_device, "meta", None),
+    "more threads": lambda: setting(torch.set_num_threads, 2, 1),
+    "no gradients": torch.no_grad,
+    "gradients off": lambda: setting(torch.set_grad_enabled, False, True),
+    "inference": torch.inference_mode,
+    "half precision": lambda: torch.autocast("cpu", torch.bfloat16),
+    "deterministic": lambda: setting(torch.use_deterministic_algorithms, True, False),
+    "anomalies": lambda: setting(torch.autograd.set_detect_anomaly, True, False),
+    "NumPy's errors": lambda: np.errstate(all="raise"),
+    "warnings are errors": strict_warnings,
+    "a thread that draws": drawing_beside,
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_the_callers_settings_change_nothing(name: str, data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:
+    """And they hold again afterwards."""
+    with SETTINGS[name]():
+        before = settings_of_torch()
+        assert train(data, tmp_path) == plain
+        assert settings_of_torch() == before
+
+
+def settings_of_torch() -> tuple[Any, ...]:
+    return (
+        *(torch.get_default_dtype(), torch.get_default_device(), torch.get_num_threads()),
+        *(torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.is_autocast_enabled("cpu")),
+    )
+
+
+def test_threads_take_turns(data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:
+    """Two at once with the same seed give the same, and so does a thread of asyncio."""
+    folders = [tmp_path / "one", tmp_path / "other"]
+    with ThreadPoolExecutor(2) as pool:
+        assert [*pool.map(train, [data, data], folders)] == [plain, plain]
+    assert asyncio.run(asyncio.to_thread(train, data, tmp_path / "third")) == plain
+
+
+def test_the_callers_generators_go_on_as_they_would(data: Path, tmp_path: Path) -> None:
+    """As if there had been no call in between."""
+    drawn = []
+    for call in (False, True):
+        torch.manual_seed(7)
+        np.random.seed(7)  # noqa: NPY002
+        if call:
+            train(data, tmp_path)
+        drawn.append((float(torch.rand(())), np.random.rand()))  # noqa: NPY002
+    assert drawn[0] == drawn[1]
