@@ -412,7 +412,7 @@ def open_dataset(path: Path) -> Dataset:
             observation_dtype=type_of(attributes["observation_dtype"]),
             channels=_channels_in(attributes.get("channels", "{}")),
         )
-    require_names(dataset.sub_goals)
+        require_names(dataset.sub_goals)
     return dataset
 
 

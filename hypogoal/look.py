@@ -8,7 +8,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import AGAIN, LOG, MANIFEST, Artefact, Draft
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import json_lines, read_end, read_json, visible
+from hypogoal.core.files import read_json, read_log, visible
 from hypogoal.core.terminal import drawn
 from hypogoal.data import SPLITS, open_dataset
 from hypogoal.observations import type_text
@@ -64,7 +64,7 @@ def numbers_of(path: Path) -> dict[str, Any]:
     """The numbers of an evaluation or a comparison; of a training the last in its log, means over sub-goals."""
     if (path / METRICS).is_file():
         return dict(read_json(path / METRICS, "the numbers are", AGAIN))
-    last = {str(row.get("sub_goal")): row for row in json_lines(read_end(path / LOG))}
+    last = {str(row.get("sub_goal")): row for row in read_log(path / LOG)}
     numbers = {}
     for name, title in LOGGED.items():
         values = [row[name] for row in last.values() if isinstance(row.get(name), int | float)]
@@ -158,13 +158,7 @@ def _faults_of(part: Path, within: Path) -> list[str]:
     if part.is_file():
         _read_all(part)
         return []
-    artefact = Artefact(part)
-    lines = [f"{name}: {fault}" for name, fault in artefact.file_faults().items()]
-    for entry in artefact.manifest.inputs:
-        fault = artefact.input_fault(entry)
-        if fault and artefact.place_of(entry).is_relative_to(within):
-            lines.append(f"its input {entry.path} ({entry.kind}) is {fault}")
-    return lines
+    return Artefact(part).faults(within)
 
 
 def _read_all(data: Path) -> None:

@@ -173,7 +173,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("train-ensemble {data} --out {out} --diversity magic", "magic"),
         ("train-ensemble {cut} --out {out}", "the data file cannot be read"),
         ("show {cut}", "the data file cannot be read"),
-        ("train-meta {newer} --out {out}", "reads formats 2 and 3, this is 4"),
+        ("train-meta {newer} --out {out}", "format 3, this is 4"),
         ("train-meta {ensemble} --out {out} --device tpu", "unknown device"),
         ("train-meta {ensemble} --options {made}/options --out {out} --layout-seed 3", "layout_seed"),
         ("evaluate {none}", "no such run: "),

@@ -73,7 +73,7 @@ def test_what_follows_a_changed_artefact_is_stale(small_run: Path, make) -> None
 
 def test_a_damaged_file_and_a_lost_input_are_named(small_run: Path) -> None:
     (small_run / "meta" / "file.txt").write_text("mine")
-    changed = "file.txt: changed since it was written"
+    changed = "file.txt is changed since it was written"
     assert reasons(small_run) == {"meta": changed, "report": "its input run/meta is stale"}
     assert fails("verify", "run").out.splitlines() == [f"run/meta: {changed}"]
     (small_run / "options").rename("elsewhere")
@@ -145,7 +145,7 @@ def test_every_file_that_is_gone_is_named(corridor_copy: Path) -> None:
     for artefact in (each for kind in KINDS for each in find_artefacts(corridor_copy, kind)[:1]):
         for name in artefact.manifest.files:
             (artefact.path / name).rename(corridor_copy / "aside")
-            assert faults(artefact.path) == [f"{artefact.path}: {name}: missing"]
-            with pytest.raises(UserError, match=f"the artefact is damaged .{name}: missing"):
+            assert faults(artefact.path) == [f"{artefact.path}: {name} is missing"]
+            with pytest.raises(UserError, match=f"the artefact is damaged .{name} is missing"):
                 open_artefact(artefact.path)
             (corridor_copy / "aside").rename(artefact.path / name)

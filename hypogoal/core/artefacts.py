@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout, lock_descriptor
-from pydantic import BaseModel, ValidationError, field_validator
+from pydantic import BaseModel, ValidationError
 
 from hypogoal.core.checkpoints import ANEW, Checkpoints
 from hypogoal.core.errors import Complete, UserError
@@ -26,14 +26,11 @@ from hypogoal.core.files import read_json, replace_text, sync
 from hypogoal.core.processes import peak_memory
 
 FORMAT = 3
-READ = (2, FORMAT)  # 2, of 0.23 and 0.24, ended with a digest of itself
 MANIFEST = "manifest.json"
 LOG = "metrics.jsonl"
 TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
 DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
-# How a file of a kind begins, and what its first bytes have, even if the rest is cut off.
-SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations.npy")}
-FRONT = 1 << 16  # bytes of a file that are looked at for its kind
+SIGNATURES = {DATA: b"\x89HDF\r\n\x1a\n", ARRAYS: b"PK\3\4"}  # how such files begin
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers", "quiet")  # settings that change no result
 AGAIN = "Make the artefact again."
@@ -42,18 +39,6 @@ PACKAGES = (
     "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
     "safetensors", "stable-baselines3",
 )  # fmt: skip
-# Settings of 0.23 without which what was made would be taken for something else, and the values that changed nothing.
-GONE = {
-    "actions": "all",
-    "encoder": "separate",
-    "initiation": "anywhere",
-    "keyring": True,
-    "policy_pixels": "all",
-    "policy_view": "full",
-}
-
-# Settings that other stages read as text.
-TEXTS = frozenset({"agent", "chooser", "diversity", "domain", "layouts", "network", "setting", "termination", "view"})
 
 
 class Input(BaseModel):
@@ -77,14 +62,6 @@ class Manifest(BaseModel):
     versions: dict[str, str] = {}
     command: list[str] = []
     took: dict[str, Any] = {}  # seconds and bytes of memory, in which alone two runs of a command differ
-
-    @field_validator("config")
-    @classmethod
-    def _has_texts(cls, config: dict[str, Any]) -> dict[str, Any]:
-        for name in TEXTS & config.keys():
-            if not isinstance(config[name], str):
-                raise ValueError(f"the setting {name} is no text")
-        return config
 
 
 class Settings(dict[str, Any]):
@@ -118,9 +95,10 @@ class Artefact:
         """The input of a kind; a ``UserError`` if there is none, or it is missing or was changed."""
         for entry in self.manifest.inputs:
             if entry.kind == kind:
-                if fault := self.input_fault(entry):
+                place = self.place_of(entry)
+                if fault := _fault(place, entry.sha256):
                     raise UserError(f"the {kind} that {self.path} was made from is {fault}", entry.path, "Restore it.")
-                return self.place_of(entry)
+                return place
         raise UserError(f"{self.path} was not made from any {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
     def place_of(self, entry: Input) -> Path:
@@ -129,20 +107,18 @@ class Artefact:
         moved_alone = recorded.exists() and not relative.exists()
         return (recorded if moved_alone else relative).resolve()
 
-    def input_fault(self, entry: Input) -> str:
-        """What is wrong with an input; empty if nothing is."""
-        return _fault(self.place_of(entry), entry.sha256)
-
-    def file_faults(self) -> dict[str, str]:
-        """What is wrong with each file that is missing or was changed, by name."""
-        faults = {name: _fault(self.path / name, digest) for name, digest in self.manifest.files.items()}
-        return {name: fault for name, fault in faults.items() if fault}
-
-    def faults(self) -> list[str]:
-        """A line for each file and each input that is missing or was changed."""
-        files = [f"{name}: {fault}" for name, fault in self.file_faults().items()]
-        inputs = [(entry, self.input_fault(entry)) for entry in self.manifest.inputs]
-        return files + [f"its input {entry.path} ({entry.kind}) is {fault}" for entry, fault in inputs if fault]
+    def faults(self, within: Path | None = None) -> list[str]:
+        """A line for each file and each input that is missing or changed; with ``within`` only of inputs in there."""
+        checks = [(name, self.path / name, digest) for name, digest in self.manifest.files.items()]
+        for entry in self.manifest.inputs:
+            place = self.place_of(entry)
+            if within is None or place.is_relative_to(within):
+                checks.append((f"its input {entry.path} ({entry.kind})", place, entry.sha256))
+        lines = []
+        for name, place, digest in checks:
+            if fault := _fault(place, digest):
+                lines.append(f"{name} is {fault}")
+        return lines
 
 
 def _fault(path: Path, digest: str) -> str:
@@ -158,19 +134,14 @@ def _fault(path: Path, digest: str) -> str:
 def _read_manifest(path: Path, do: str) -> Manifest:
     content = read_json(path, "the manifest is", do)
     version = content.get("format") if isinstance(content, dict) else None
-    if version not in READ:
-        fault = f"this hypogoal reads formats 2 and 3, this is {version}"
+    if version != FORMAT:
+        fault = f"this hypogoal reads manifests of format {FORMAT}, this is {version}"
         raise UserError(fault, path, "Use the hypogoal that wrote it, or make it again.")
     try:
-        manifest = Manifest.model_validate(content)
+        return Manifest.model_validate(content)
     except ValidationError as error:
         place = ".".join(map(str, error.errors()[0]["loc"]))
         raise UserError(f"the manifest's {place!r} is missing or malformed", path, do) from None
-    settings = manifest.config | manifest.config.get("domain_config", {})
-    for key, without in GONE.items():
-        if settings.get(key, without) != without:
-            raise UserError(f"it was made with {key}={settings[key]}, which is gone since 0.24", path, do)
-    return manifest
 
 
 def open_artefact(path: Path, *kinds: str) -> Artefact:
@@ -182,8 +153,8 @@ def open_artefact(path: Path, *kinds: str) -> Artefact:
     if kinds and artefact.kind not in kinds:
         fault = f"this is a {artefact.kind!r} artefact, but {' or '.join(kinds)} is needed"
         raise UserError(fault, path, "Give the right folder.")
-    for name, fault in artefact.file_faults().items():
-        raise UserError(f"the artefact is damaged ({name}: {fault})", path, AGAIN)
+    for fault in artefact.faults(within=path):
+        raise UserError(f"the artefact is damaged ({fault})", path, AGAIN)
     return artefact
 
 
@@ -193,12 +164,8 @@ def sha256_of(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     content = read_json(path / MANIFEST, "the manifest is", AGAIN)
-    kept = {key: value for key, value in content.items() if key not in ("took", "sha256")}
-    digest = hashlib.sha256(_text_of(kept).encode()).hexdigest()
-    if kept["format"] == FORMAT:
-        return digest
-    sealed = _text_of({**kept, "sha256": digest})  # what was made of it recorded its sha256 with that at its end
-    return hashlib.sha256(sealed.encode()).hexdigest()
+    content.pop("took", None)
+    return hashlib.sha256(_text_of(content).encode()).hexdigest()
 
 
 def _text_of(manifest: Mapping[str, Any]) -> str:
@@ -312,17 +279,18 @@ def create(
     """
     started = time.monotonic()
     draft = Draft(out)
-    entries = [_input(path, draft.out) for path in inputs]
-    wanted = Manifest(kind=kind, config=dict(config), seed=seed, inputs=entries, versions=versions())
-    wanted.command = _command()
+    wanted = Manifest(
+        kind=kind,
+        config=dict(config),
+        seed=seed,
+        inputs=[_input(path, draft.out) for path in inputs],
+        versions=versions(),
+        command=_command(),
+    )
     with draft.locked():
         _put_in_place(draft)  # a process was killed while it did
-        begun = _begun(draft, wanted, out, force=force, resume=resume)
-        if begun is None:
+        if not _continues(draft, wanted, force=force, resume=resume):
             draft.begin(wanted)
-        else:
-            draft.files.mkdir(exist_ok=True)
-            wanted.command = begun.command
         try:
             yield draft
             wanted.config = dict(config)
@@ -349,47 +317,45 @@ def _input(path: Path, out: Path) -> Input:
     return Input(kind=kind, path=str(path), relative=relative, sha256=sha256_of(path))
 
 
-def _begun(draft: Draft, wanted: Manifest, out: Path, *, force: bool, resume: bool) -> Manifest | None:
-    """How the draft to continue was begun; None: begin anew. May I write here? If not, a ``UserError``."""
-    kind = kind_of(out)
+def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> bool:
+    """Whether the draft is continued, rather than begun anew. May I write here? If not, a ``UserError``."""
+    out, kind = draft.out, kind_of(draft.out)
     if kind not in (None, wanted.kind):
         description = f"of kind {kind!r}" if kind else "none of hypogoal's"
         raise UserError(f"what is there is not of kind {wanted.kind!r} but {description}", out, AWAY)
     if draft.is_resumable and resume:
-        begun = _read_manifest(draft.begun, ANEW)
-        _refuse_other(begun, wanted, "the unfinished output was begun", out)
-        return begun
+        _refuse_other(_read_manifest(draft.begun, ANEW), wanted, "the unfinished output was begun", out)
+        return True
     if draft.is_resumable and not force:
         raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
     if kind and resume:
-        complete = _made(out).model_copy(update={"versions": {}})  # nothing is continued
-        _refuse_other(complete, wanted, "the complete output was made", out)
+        _refuse_other(_made(out), wanted, "the complete output was made", out)
         raise Complete(out)
     if kind and not force:
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
-    return None
+    return False
 
 
 def _refuse_other(before: Manifest, now: Manifest, subject: str, out: Path) -> None:
     """Refuse (``UserError``) what differs in a setting that both have, in seed, inputs or versions."""
     old, new = _identity(before), _identity(now)
     for key, value in old.items():
-        if key in new and json.dumps(value) != json.dumps(new[key]):
+        if new.get(key, value) != value:
             other = "other inputs" if key == "inputs" else f"{key}={value}, not {new[key]}"
             raise UserError(f"{subject} with {other}", out, ANEW)
 
 
-def _identity(manifest: Manifest) -> dict[str, Any]:
-    """All that determines an output, by name."""
+def _identity(manifest: Manifest) -> dict[str, str]:
+    """All that determines an output by name, as JSON."""
     inputs = [entry.sha256 for entry in manifest.inputs]
     identity = {"kind": manifest.kind, "seed": manifest.seed, "inputs": inputs, **manifest.versions, **manifest.config}
-    return {key: value for key, value in identity.items() if key not in NO_RESULT}
+    return {key: json.dumps(value) for key, value in identity.items() if key not in NO_RESULT}
 
 
 def _made(out: Path) -> Manifest:
-    """What made a complete output, a folder or an HDF5 file."""
+    """What made a complete output, a folder or an HDF5 file; without versions, since nothing is continued."""
     if out.is_dir():
-        return open_artefact(out).manifest
+        return open_artefact(out).manifest.model_copy(update={"versions": {}})
     import h5py
 
     try:
@@ -404,17 +370,16 @@ def _made(out: Path) -> Manifest:
 
 def kind_of(out: Path) -> str | None:
     """The kind of an output, whole or damaged; empty if it is none of hypogoal's, None if nothing is there."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+    if not out.exists() or (out.is_dir() and not os.listdir(out)):
         return None
     if out.is_dir():
         with contextlib.suppress(UserError, TypeError, KeyError):
-            content = read_json(out / MANIFEST, "the manifest is", AGAIN)
-            return str(content["kind"]) if "format" in content else ""
+            return str(read_json(out / MANIFEST, "the manifest is", AGAIN)["kind"])
         return ""
     with out.open("rb") as file:
-        front = file.read(FRONT)
-    for kind, (begin, part) in SIGNATURES.items():
-        if front.startswith(begin) and part in front:
+        front = file.read(8)
+    for kind, signature in SIGNATURES.items():
+        if front.startswith(signature):
             return kind
     return ""
 
@@ -422,9 +387,9 @@ def kind_of(out: Path) -> str | None:
 def _finish(draft: Draft, manifest: Manifest) -> None:
     """Write the manifest of what is in the draft, and put it in place."""
     files = [path for path in sorted(draft.files.rglob("*")) if path.is_file() and path.name != TO_FILL_IN]
-    manifest.files = {path.relative_to(draft.files).as_posix(): sha256_of(path) for path in files}
     for path in files:
         sync(path)
+        manifest.files[path.relative_to(draft.files).as_posix()] = sha256_of(path)
     if manifest.kind in SIGNATURES:
         [data] = files
         data.replace(draft.out)

@@ -5,16 +5,14 @@
 
 import contextlib
 import csv
-import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 from hypogoal.core.errors import UserError
 
-MAX_NAME_BYTES = 200  # of a file's name
 NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
 
 
@@ -22,37 +20,27 @@ def read_text(path: Path, subject: str, do: str) -> str:
     """The text of a file in UTF-8, with or without a byte order mark, with line feeds as line ends."""
     try:
         return path.read_text(encoding="utf-8-sig")
-    except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"{subject} missing", path, do) from None
     except UnicodeDecodeError:
         raise UserError(f"{subject} not text in UTF-8", path, do) from None
     except OSError as error:
         raise UserError(f"{subject} not readable ({error.strerror})", path, do) from None
 
 
-def read_end(path: Path) -> list[str]:
-    """The lines of a log that may still be growing; none if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return []
-
-
 def read_json(path: Path, subject: str, do: str) -> Any:
     """The contents of a JSON file."""
     try:
         return json.loads(read_text(path, subject, do))
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UserError(f"{subject} not valid JSON ({error})", path, do) from None
 
 
-def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """The objects in a log's lines; half-written and other lines are left out."""
-    for line in lines:
-        with contextlib.suppress(ValueError, RecursionError):
-            value = json.loads(line)
-            if isinstance(value, dict):
-                yield value
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The rows of a log that may still be growing, but for a half-written one; none if it cannot be read."""
+    rows: list[dict[str, Any]] = []
+    with contextlib.suppress(OSError, ValueError):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            rows.append(json.loads(line))
+    return rows
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -90,25 +78,21 @@ def sync(path: Path) -> None:
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a CSV file with a header."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    replace_text(path, text.getvalue())
+    with replacing(path) as fresh, fresh.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
-def plain_name(name: object) -> TypeGuard[str]:
+def plain_name(name: str) -> bool:
     """Whether a text can name a sub-goal or the like: a file's name on every system. Any script is fine."""
-    if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
-        return False
-    return name.isprintable() and name.strip(" .") == name and not set(name) & set(f"{NO_FILE_NAME}/\\")
+    return name.isprintable() and name.strip(" .") == name != "" and not set(name) & set(f"{NO_FILE_NAME}/\\")
 
 
-def plain_names(names: object) -> bool:
-    """Whether this is a list of plain names that differ even if case is ignored."""
-    if not (isinstance(names, list | tuple) and names and all(map(plain_name, names))):
-        return False
-    return len({name.casefold() for name in names}) == len(names)
+def plain_names(names: Sequence[str]) -> bool:
+    """Whether there are names, all plain, that differ even if case is ignored."""
+    different = {name.casefold() for name in names}
+    return len(different) == len(names) > 0 and all(map(plain_name, names))
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:

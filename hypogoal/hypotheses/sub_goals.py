@@ -11,7 +11,7 @@ import numpy as np
 
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import json_lines, read_end
+from hypogoal.core.files import read_log
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
@@ -96,8 +96,8 @@ def steps_in(logs: Iterable[Path]) -> int:
     """How many steps of all sub-goals are in the logs that their processes are writing."""
     steps = 0
     for log in logs:
-        last = next(iter(json_lines(reversed(read_end(log)))), {})
-        steps += last.get("step", 0)
+        for row in read_log(log)[-1:]:
+            steps += row["step"]
     return steps
 
 
