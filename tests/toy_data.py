@@ -15,7 +15,7 @@ from hypogoal.data import Collected, States, create_hdf5, write_dataset
 SHAPE = (4, 5, 3)
 
 
-def write(path: Path, states: int = 7, domain: str = "toy") -> Path:
+def write(path: Path, states: int = 7, domain: str = "toy", goals: tuple[str, ...] = ("one", "two")) -> Path:
     """Two sub-goals, three sets of random states; ``path``."""
     rng = np.random.default_rng(0)
 
@@ -23,7 +23,7 @@ def write(path: Path, states: int = 7, domain: str = "toy") -> Path:
         images = rng.integers(0, 256, size=(count, *SHAPE), dtype=np.uint8)
         return States(images, rng.random((count, 2)) < 0.5, {"layout_seed": np.arange(count)})
 
-    collected = Collected(SHAPE, ("one", "two"), some(states), some(states), some(states))
+    collected = Collected(SHAPE, goals, some(states), some(states), some(states))
     write_dataset(path, collected, domain=domain, config={"a": 1}, seed=3)
     return path
 

@@ -40,9 +40,10 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
     """A function from observations (N, ...), or such arrays by key, to members' probabilities, float32 (N, K)."""
     config = json.loads((HERE / "config.json").read_text(encoding="utf-8"))
     state = load_file(HERE / f"{sub_goal}.safetensors")
-    standard = [state.pop(name).flatten() for name in ("mean", "deviation") if name in state]
+    standard = [state[name].flatten() for name in ("view.mean", "view.deviation") if name in state]
+    weights = {name.removeprefix("members."): tensor for name, tensor in state.items() if name.startswith("members.")}
     members = torch.nn.ModuleList(built(config["layers"]) for _ in range(config["members"]))
-    members.load_state_dict(state)
+    members.load_state_dict(weights)
     members.eval()
 
     def predict(observations: Any) -> torch.Tensor:

@@ -47,9 +47,9 @@ BOARD = "Also write the log for TensorBoard into this folder (pip install 'hypog
 Tensorboard = Annotated[Path | None, Option("--tensorboard", metavar="DIR", help=BOARD)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Call:
-    """One call of a stage: where it writes, and how it was asked for."""
+    """One call of a stage: where it writes, and how it was asked for. What follows ``typed`` are options."""
 
     stage: str
     out: Out
@@ -178,19 +178,17 @@ class Stage:
             from hypogoal.made import Made
 
             own_code.allow([source, *arguments.values()])
-            values: dict[str, Any] = {}
-            for parameter in (*self.inputs, *self.options):
-                if parameter.name in arguments:
-                    values[parameter.name] = _as_path(parameter, arguments.pop(parameter.name))
+            values = {}
+            for each in (*self.inputs, *self.options):
+                values[each.name] = _as_path(each, arguments.pop(each.name, each.default))
             with own_settings():
                 call, _ = self.run(_as_path(self.source, source), out, values, arguments)
             return Made(call.out)
 
-        out = self.out.replace(default=None, annotation=Place | None)
-        options = map(_keyword, self.options)
+        out = Parameter("out", Parameter.POSITIONAL_OR_KEYWORD, default=None)
         settings = Parameter("settings", Parameter.VAR_KEYWORD)
-        signature = inspect.Signature([self.source, out, *self.inputs, *options, settings])
-        called.__signature__ = signature  # type: ignore[attr-defined]
+        parameters = [self.source, out, *self.inputs, *self.options, settings]
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         return called
 
     def command(self) -> Any:
@@ -211,11 +209,13 @@ class Stage:
                     say(f"next: {own_code.command(*done.then)}")
             say(done.path or call.out / self.page)
 
-        parameters = [self.source, *self.inputs, self.out, *self.options, *self._settings()]
-        called.__signature__ = inspect.Signature([*map(_keyword, parameters)])  # type: ignore[attr-defined]
-        called.__doc__ = inspect.cleandoc(self.function.__doc__ or "").partition("\n\n")[0]
+        source = self.source.replace(kind=Parameter.KEYWORD_ONLY)
+        parameters = [source, *self.inputs, self.out, *self.options, *self._settings()]
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        summary, *_ = str(self.function.__doc__).splitlines()
+        example = f"Example:\n\n[bold]hypogoal {self.example}[/bold]"
         alone = typer.Typer(add_completion=False)
-        alone.command(self.name, epilog=f"Example:\n\n[bold]hypogoal {self.example}[/bold]")(called)
+        alone.command(self.name, help=summary, epilog=example)(called)
         return typer.main.get_command(alone)
 
     def run(
@@ -228,12 +228,9 @@ class Stage:
         """Call the function with the ``values`` of inputs and options. With ``resume`` what is complete is kept."""
         if typed and not self.has_settings:
             raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
-        inputs = {}
-        for each in self.inputs:
-            if each.name in values:
-                inputs[each.name] = values.pop(each.name)
+        inputs = {each.name: values.pop(each.name) for each in self.inputs}
         place = Path(out) if out else Path(source, self.into)
-        call = Call(self.name, place, typed, **values)
+        call = Call(stage=self.name, out=place, typed=typed, **values)
         try:
             return call, self.function(call, source, **inputs)
         except Complete as complete:
@@ -259,10 +256,6 @@ class Stage:
             option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
             annotation = Annotated[str | None, option]
             yield Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-
-
-def _keyword(parameter: Parameter) -> Parameter:
-    return parameter.replace(kind=Parameter.KEYWORD_ONLY)
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:

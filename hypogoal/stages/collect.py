@@ -42,7 +42,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
             seed=call.seed,
         )
     if name not in BUILT_IN:
-        for line in _doubts(played, collected, call.quiet):
+        for line in _doubts(played, collected):
             say(f"hypogoal: {line}", err=True)
     run = call.out.parent if call.out.name == "data.h5" else Path("runs", call.out.stem)
     counts = open_dataset(call.out).counts()
@@ -62,7 +62,7 @@ def _name_of(domain: Any) -> str:
     return str(domain.name)
 
 
-def _doubts(domain: Any, collected: Any, quiet: bool) -> list[str]:
+def _doubts(domain: Any, collected: Any) -> list[str]:
     """What may be hard about the states of a domain of the user's own."""
     import numpy as np
 
@@ -70,18 +70,16 @@ def _doubts(domain: Any, collected: Any, quiet: bool) -> list[str]:
     from hypogoal.options.config import OptionConfig
 
     labelled = collected.labelled
-    few = hard_to_learn(labelled.labels, collected.sub_goals)
-    lines = [f"{line}. {GET_MORE}" for line in few]
-    lines += hard_to_judge(collected.heldout.labels, collected.sub_goals)
+    goals = collected.sub_goals
+    lines = [f"{line}. {GET_MORE}" for line in hard_to_learn(labelled.labels, goals)]
+    lines += hard_to_judge(collected.heldout.labels, goals)
     steps = labelled.origins.get("step")
     defaults = domain.defaults.get("train-options", {})
-    if quiet or steps is None or "option_timeout" in defaults:
+    if steps is None or "option_timeout" in defaults:
         return lines
     soonest = [steps[holds].min() for holds in labelled.labels.T]
     apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
     if 2 * apart > OptionConfig().option_timeout:
-        lines.append(
-            f"play took up to {apart} steps from one sub-goal to the next, each at its earliest: "
-            f"train-options --option-timeout {2 * apart} gives options time for that"
-        )
+        fault = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
+        lines.append(f"{fault}: train-options --option-timeout {2 * apart} gives options time for that")
     return lines

@@ -30,13 +30,15 @@ def evaluate(
     from hypogoal.evaluation import questions
     from hypogoal.evaluation.judging import cases_of
     from hypogoal.evaluation.run import find
+    from hypogoal.experiments.sweep import unmade
     from hypogoal.meta.config import layout_seeds
 
     prepare()
-    played = tuple(layout_seeds(layouts)) if layouts else ()
-    settings: dict[str, Any] = dict(questions.SETTINGS)
+    settings: dict[str, Any] = {**questions.SETTINGS}
+    played: tuple[int, ...] = ()
     if layouts:
         settings["layouts"] = layouts
+        played = tuple(layout_seeds(layouts))
     contents = find(run)
     trained = [artefact.path for artefact in contents.everything()]
     data = sorted({artefact.input("data") for artefact in contents.ensembles})
@@ -44,7 +46,8 @@ def evaluate(
     with call.draft("evaluation", settings, [*data, *trained]) as draft:
         for path in trained:
             open_artefact(path)  # refuses changed files
-        parts = 2 * len(cases) + len(contents.ladders) + len(contents.agents) * (1 + len(played))
+        times = 1 + len(played)
+        parts = 2 * len(cases) + len(contents.ladders) + times * len(contents.agents)
         with (
             create_hdf5(draft.files / "arrays.h5") as arrays,
             Progress("evaluate", total=parts, quiet=call.quiet) as progress,
@@ -52,21 +55,11 @@ def evaluate(
             work = questions.work_of(contents, arrays, progress, played)
             questions.judge_ensembles(work, cases)
             questions.answer(work)
-            missing = [*questions.missing(work), *unmade_cells(run)]
+            missing = questions.missing(work)
+            if left := unmade(run):
+                missing.append(f"{len(left)} of the run's cells are not done; the first is {left[0]}")
             metrics = questions.metrics_of(work, settings, data, missing)
         questions.write(draft.files, metrics, work.rows)
     table = drawn(questions.summary_table(metrics), WIDTH).splitlines()
-    if call.out == run / "evaluation":
-        return Done(table, ("report", run))
-    return Done(table, ("show", call.out))
-
-
-def unmade_cells(run: Path) -> list[str]:
-    """The cells that the run was to have and has not: failed, or not run yet."""
-    from hypogoal.experiments.sweep import unmade
-
-    left = unmade(run)
-    if not left:
-        return []
-    names = ", ".join(left[:5]) + (", ..." if len(left) > 5 else "")
-    return [f"{len(left)} of the run's cells are not done: {names}"]
+    is_of_run = call.out == run / "evaluation"
+    return Done(table, ("report", run) if is_of_run else ("show", call.out))

@@ -52,22 +52,26 @@ def report(
     source = evaluation_of(run)
     agents = films.agents_to_play(run, videos)
     config = {"videos": len(agents) if videos is None else videos}
-    inputs = [source.path, *(agent.path for agent in agents)]
+    inputs = [source.path]
+    for agent in agents:
+        inputs.append(agent.path)
     with call.draft("report", config, inputs) as draft:
         evaluation = read_evaluation(run)
-        played, missing = films.films_of(agents, run, videos)
-        metrics = {**evaluation.metrics, "missing": [*evaluation.metrics["missing"], *missing]}
+        played, unplayed = films.films_of(agents, run, videos)
         shown = [film(each.gif, each.caption) for each in played[:1] if len(each.gif) <= MOST_BYTES]
+        missing = [*evaluation.metrics["missing"], *unplayed]
+        metrics = {**evaluation.metrics, "missing": missing}
         material = Material(metrics, evaluation.arrays, films=shown)
         with fitting(source.path):
-            page = render(material, versions().get("hypogoal", "unknown"))
+            page = render(material, versions()["hypogoal"])
         (draft.files / "index.html").write_text(page, encoding="utf-8")
-        folder = draft.files / "figures"
-        folder.mkdir()
+        drawn = draft.files / "figures"
+        drawn.mkdir()
         for name, figure in material.figures.items():
-            (folder / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
-            (folder / f"{name}.png").write_bytes(to_png(figure))
+            (drawn / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
+            (drawn / f"{name}.png").write_bytes(to_png(figure))
         for each in played:
-            (draft.files / "videos").mkdir(exist_ok=True)
-            (draft.files / "videos" / each.name).write_bytes(each.gif)
+            filmed = draft.files / "videos"
+            filmed.mkdir(exist_ok=True)
+            (filmed / each.name).write_bytes(each.gif)
     return Done()

@@ -28,10 +28,10 @@ def train_baseline(
     from hypogoal.core.processes import prepare
     from hypogoal.core.tensors import save_tensors
     from hypogoal.domains.base import load_domain, require_one_kind
-    from hypogoal.learners.baselines.agents import train, weights
+    from hypogoal.learners.baselines import agents
     from hypogoal.learners.baselines.engine_env import EngineEnv
     from hypogoal.learners.baselines.settings import HYPERPARAMETERS
-    from hypogoal.meta.training import check_start, cut, played_world, write_layout
+    from hypogoal.meta import training
     from hypogoal.observations import PICTURE, standard_of
     from hypogoal.options.tables import Episodes
 
@@ -40,10 +40,11 @@ def train_baseline(
     played = load_domain(domain)
     dataset = _states_of(domain, data) if data else None
     collected = played.world(dataset.config) if dataset else {}
-    world = played_world(played, collected, config.world)
-    begins = {"start": config.start} if config.start else {}
+    world = training.played_world(played, collected, config.world)
+    begins = {}
     if config.start:
-        check_start(played, config.start)
+        training.check_start(played, config.start)
+        begins["start"] = config.start
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = chosen.model_copy(update={"environments": config.environments})
@@ -54,7 +55,7 @@ def train_baseline(
         **world,
         **begins,
     )
-    cut(engine, config.cap)
+    training.cut(engine, config.cap)
     require_one_kind(engine)
     if dataset and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, dataset.unlabelled())
@@ -67,27 +68,13 @@ def train_baseline(
     inputs = [data] if data else []
     with call.training("baseline", settings, inputs, config.steps, tensorboard) as work:
         env = EngineEnv(engine)
-        agent = train(
-            env,
-            chosen,
-            config.steps,
-            call.seed,
-            work.log,
-            work.progress,
-            work.draft.checkpoints(),
-            device,
-        )
+        files = work.draft.files
+        kept = work.draft.checkpoints()
+        agent = agents.train(env, chosen, config.steps, call.seed, work.log, work.progress, kept, device)
         work.progress.update(config.steps)
-        Episodes.of_rows(env.episodes).write(work.draft.files)
-        save_tensors(work.draft.files / "policy.safetensors", weights(agent))
-        write_layout(
-            work.draft.files,
-            engine,
-            config.layout_seed,
-            config.random_episodes,
-            call.seed,
-            **begins,
-        )
+        Episodes.of_rows(env.episodes).write(files)
+        save_tensors(files / "policy.safetensors", agents.weights(agent))
+        training.write_layout(files, engine, config.layout_seed, config.random_episodes, call.seed, **begins)
     numbers = env.episodes.counts() | env.episodes.recent()
     return Done(outcome_of(numbers), ("evaluate", call.out.parent))
 

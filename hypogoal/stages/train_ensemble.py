@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from functools import partial
+from math import isnan
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any
 
 from typer import Argument, Option
@@ -43,29 +45,17 @@ def train_ensemble(
     dataset = open_dataset(data)
     config, sub_goals = checked(call.settings(dataset.domain), dataset)
     others = [unlabelled_file(path, dataset) for path in unlabelled or ()]
-    settings = _described(config, sub_goals, dataset)
     steps = len(sub_goals) * config.steps
     if config.schedule == "sequential":
         steps *= config.members
+    settings = _described(config, sub_goals, dataset)
     with call.training("ensemble", settings, [data, *others], steps) as work:
-        logs = [log_of(work.draft, sub_goal) for sub_goal in sub_goals]
         jobs = []
         for sub_goal in sub_goals:
-            board = None
-            if tensorboard:
-                board = Path(tensorboard, sub_goal)
-            job = partial(
-                train_sub_goal,
-                work.draft,
-                data,
-                others,
-                sub_goal,
-                config,
-                call.seed,
-                device,
-                board,
-            )
+            board = Path(tensorboard, sub_goal) if tensorboard else None
+            job = partial(train_sub_goal, work.draft, data, others, sub_goal, config, call.seed, device, board)
             jobs.append(job)
+        logs = [log_of(work.draft, sub_goal) for sub_goal in sub_goals]
         accuracies: list[dict[str, float]] = [{} for _ in jobs]
         work.draft.checkpoint.mkdir(exist_ok=True)
         work.progress.resume(steps_in(logs))
@@ -74,8 +64,7 @@ def train_ensemble(
             in_processes(jobs, workers, accuracies.__setitem__)
         texts = [log.read_text(encoding="utf-8") for log in logs]
         (work.draft.files / LOG).write_text("".join(texts), encoding="utf-8")
-    lines = _outcome(accuracies, call.out)
-    return Done(lines, _next(call.out, dataset.domain))
+    return Done(_outcome(accuracies, call.out), _next(call.out, dataset.domain))
 
 
 def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str, Any]:
@@ -95,14 +84,12 @@ def _outcome(accuracies: Sequence[dict[str, float]], out: Path) -> list[str]:
     """Best, mean and worst member, means over the sub-goals that can be judged; without any the last losses."""
     from hypogoal.look import numbers_of
 
-    judged = [each for each in accuracies if each["best"] == each["best"]]
-    if not judged:
-        return outcome_of(numbers_of(out))
-    numbers = {}
+    means = {}
     for name, title in TITLES.items():
-        values = [each[name] for each in judged]
-        numbers[title] = sum(values) / len(values)
-    return outcome_of(numbers)
+        values = [each[name] for each in accuracies if not isnan(each[name])]
+        if values:
+            means[title] = fmean(values)
+    return outcome_of(means or numbers_of(out))
 
 
 def _next(out: Path, domain: str) -> tuple[object, ...]:
@@ -112,7 +99,7 @@ def _next(out: Path, domain: str) -> tuple[object, ...]:
     installed = installed_domain(domain)
     if installed is None:
         return "evaluate", out.parent
-    practised = "train-options" in installed.defaults
-    if "train-meta" in installed.defaults and not practised:
-        return "train-meta", out, "--out", out.parent / "meta"
-    return "train-options", out, "--out", out.parent / "options"
+    name = "options"
+    if "train-meta" in installed.defaults and "train-options" not in installed.defaults:
+        name = "meta"
+    return f"train-{name}", out, "--out", out.parent / name

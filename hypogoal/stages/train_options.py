@@ -84,24 +84,11 @@ def train_options(
         if config.until:
             settings["ended_at"] = loop.recorder.steps  # for the manifest, which comes last
             settings["until_reached"] = solved
-    numbers = _numbers(loop.recorder, config, solved)
-    return Done(outcome_of(numbers), _next(call, ensemble, config))
-
-
-def _numbers(recorder: Any, config: Any, solved: bool) -> dict[str, Any]:
-    """Steps, episodes, and success and length over the last 100 of random choice; with ``until`` what ended it.
-
-    Where each option begins an episode, instead of these two the shares of ``recorder.recent``.
-    """
-    numbers: dict[str, Any] = dict(recorder.episodes.counts())
-    if config.restart_options:
-        numbers |= recorder.recent(restarted=True)
-    else:
-        numbers |= recorder.episodes.recent()
+    recorder = loop.recorder
+    numbers: dict[str, Any] = {**recorder.episodes.counts(), **recorder.recent(restarted=config.restart_options)}
     if config.until:
-        goal = f"until={config.until:g}"
-        numbers["ended"] = f"by {goal}" if solved else f"by the limit, {goal} not reached"
-    return numbers
+        numbers[f"until={config.until:g}"] = "reached" if solved else "not reached"
+    return Done(outcome_of(numbers), _next(call, ensemble, config))
 
 
 def _next(call: Call, ensemble: Path, config: Any) -> tuple[object, ...]:

@@ -48,7 +48,8 @@ def audit(
     device = prepare(call.device)
     config, world = call.settings(domain), load_domain(domain)
     [column] = training.columns_of(world, [sub_goal], "Give another --sub-goal.")
-    target = target_of(classifier, sub_goal, member or 0, domain, device)
+    member = member or 0
+    target = target_of(classifier, sub_goal, member, domain, device)
     edges = _edges(config, target.threshold)
     ensemble_config = {
         "sub_goals": [sub_goal],
@@ -57,7 +58,7 @@ def audit(
         "domain_config": target.domain_config,
     }
     training.start_arguments(world, config, 1, call.seed)  # refuse an impossible start before any work
-    settings = training.description(world, ensemble_config, config, classifier=classifier, member=member or 0)
+    settings = training.description(world, ensemble_config, config, classifier=classifier, member=member)
     ends = terminations_of(target.classify, np.array(edges), config.termination)
     with call.training("audit", settings, target.inputs, config.steps) as work:
         loop = training.assemble(world, Path(), ensemble_config, config, call.seed, device, ends, target.standard)
@@ -105,15 +106,14 @@ def _on_recorded_data(call: Call, source: str, sub_goal: str | None, member: int
     if not Path(source).is_dir() or member is not None or call.typed or call.preset or call.resume:
         do = "Give --domain and --sub-goal; or an ensemble's folder alone."
         raise UserError("on recorded data an audit takes an ensemble, all members, without settings", source, do)
-    lines = audit_recorded(
-        Path(source), call.out, sub_goal=sub_goal, force=call.force, quiet=call.quiet, device=call.device
-    )
-    then: tuple[object, ...] = ()
+    lines = audit_recorded(call, Path(source), sub_goal)
+    page = call.out / "index.html"
     data = open_artefact(call.out).input(DATA)
-    goals = open_dataset(data).sub_goals
-    if len(goals) == 1:  # 'import' takes labels of a data file's only sub-goal
-        table = call.out / "next" / goals[0] / TO_FILL_IN
-        lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
-        more = data.with_name(f"{data.stem}-more.h5")
-        then = ("import", data, "--label", f"{goals[0]}={table}", "--out", more)
-    return Done(lines, then, path=call.out / "index.html")
+    goal, *others = open_dataset(data).sub_goals
+    if others:
+        return Done(lines, path=page)
+    table = call.out / "next" / goal / TO_FILL_IN
+    lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
+    more = data.with_name(f"{data.stem}-more.h5")
+    then = ("import", data, "--label", f"{goal}={table}", "--out", more)  # which takes labels of one sub-goal
+    return Done(lines, then, path=page)

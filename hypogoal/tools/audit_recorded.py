@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import Artefact, create, open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
@@ -12,33 +12,25 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Block
 from hypogoal.evaluation.recorded_page import draw, findings_of, lines_of, look_at, write_next
 from hypogoal.importing.labels import COLUMNS
+from hypogoal.stages import Call
 
 
-def audit_recorded(
-    source: Path,
-    out: Path,
-    *,
-    sub_goal: str | None = None,
-    force: bool = False,
-    quiet: bool = False,
-    device: str = "auto",
-) -> list[str]:
-    """Audit the members of the ensemble artefact ``source`` on the data file that it was trained on; write ``out``.
+def audit_recorded(call: Call, source: Path, sub_goal: str | None) -> list[str]:
+    """Audit the members of the ensemble artefact ``source`` on the data file that it was trained on.
 
     ``audit.json``, the page ``index.html`` and, for each sub-goal (or the one that is named), ``next/SUB_GOAL/``: the
     unlabelled states to label next, best first, as pictures and a table to fill in. Returns the findings in lines. An
-    unknown sub-goal, data that are gone or have no unlabelled states, and an ``out`` that exists are a ``UserError``.
+    unknown sub-goal, and data that are gone or have no unlabelled states, are a ``UserError``.
     """
-    device = prepare(device)
+    device = prepare(call.device)
     artefact = open_artefact(source, "ensemble")
     goals = _chosen(artefact, sub_goal)
     data = artefact.input("data")
     parts: list[dict[str, Any]] = []
     sections: list[Block] = []
-    manifest: dict[str, Any] = {"kind": "recorded-audit", "config": {"sub_goals": goals}, "seed": 0}
     with (
-        create(out, **manifest, inputs=[source, data], force=force) as draft,
-        Progress("audit", len(goals), quiet=quiet) as progress,
+        call.draft("recorded-audit", {"sub_goals": goals}, [source, data]) as draft,
+        Progress("audit", len(goals), quiet=call.quiet) as progress,
     ):
         for goal in goals:
             look = look_at(artefact, data, goal, device)

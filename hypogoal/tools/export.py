@@ -2,25 +2,23 @@
 
 import inspect
 import json
-import os
 import re
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import DTypeLike
 
-from hypogoal.core.artefacts import ARRAYS, create, open_artefact
+from hypogoal.core.artefacts import ARRAYS, Artefact, create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import amount
 from hypogoal.data import open_dataset
-from hypogoal.domains.base import Engine
 from hypogoal.importing.arrays import write_arrays
 from hypogoal.observations import PICTURE, fields_of
 
+HUB, EPISODES = "hub", "episodes"  # kinds of exports, beside arrays
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # of a Minari dataset
 CARD = """---
 library_name: hypogoal
@@ -39,114 +37,118 @@ from load import load  # needs torch and safetensors
 probabilities = load({first!r})(observations)  # (N, {count})
 ```
 
-Positive above the thresholds in `config.json`.
+Positive above the `thresholds` in the file of weights.
 """
 
 
 def export(source: Path, out: Path, *, episodes: int, seed: int, force: bool, quiet: bool) -> str:
     """Write ``source`` for other software; returns a line that says how much, empty where there is nothing to say.
 
-    A data file becomes arrays, a meta artefact so many ``episodes`` of its agent, an ensemble artefact a folder.
+    A data file becomes ``.npz``, which ``import`` reads, an ensemble artefact a folder that torch and safetensors load
+    without hypogoal, a meta artefact a Minari dataset of so many ``episodes``. ``seed`` is of its agent's choices.
     """
+    config = {}
     if not source.is_dir():
-        export_arrays(source, out, force=force)
-        return ""
-    if open_artefact(source, "meta", "ensemble").kind == "ensemble":
-        export_ensemble(source, out, force=force)
-        return ""
-    steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
-    return f"{amount(episodes, 'episode')}, {amount(steps, 'step')}"
+        kind = ARRAYS
+        if out.suffix != ".npz":
+            raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
+    elif open_artefact(source, "meta", "ensemble").kind == "ensemble":
+        kind = HUB
+    else:
+        kind = EPISODES
+        config["episodes"] = episodes
+        if not NAME.fullmatch(out.name):
+            raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
+    with create(
+        out,
+        kind=kind,
+        config=config,
+        seed=seed,
+        inputs=[source],
+        force=force,
+    ) as draft:
+        if kind == ARRAYS:
+            write_arrays(draft.files / out.name, open_dataset(source))
+            return ""
+        artefact = Artefact(source)
+        if kind == HUB:
+            write_hub(artefact, draft.files)
+            return ""
+        with Progress("export", total=episodes, quiet=quiet) as progress:
+            steps = write_episodes(artefact, draft.files / "data", out, seed, progress)
+        return f"{amount(episodes, 'episode')}, {amount(steps, 'step')}"
 
 
-def export_arrays(data: Path, out: Path, *, force: bool = False) -> None:
-    """Write the states of a data file as ``.npz``, which ``import`` reads."""
-    if out.suffix != ".npz":
-        raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
-    with create(out, kind=ARRAYS, config={}, seed=0, inputs=[data], force=force) as draft:
-        write_arrays(draft.files / out.name, open_dataset(data))
+def write_hub(artefact: Artefact, folder: Path) -> None:
+    """Write an ensemble's weights, the layers that they are of, ``load.py`` and a card.
 
-
-def export_ensemble(source: Path, out: Path, *, force: bool = False) -> None:
-    """Write the members of an ensemble artefact, ``load.py`` and a card into the folder ``out``.
-
-    torch and safetensors load it without hypogoal. Members with layers or a view of the user's own are a ``UserError``.
+    Members with layers or a view of the user's own are a ``UserError``.
     """
-    from torch import nn
-
-    from hypogoal.core.tensors import save_tensors
     from hypogoal.hypotheses import load
+    from hypogoal.hypotheses.config import FULL
     from hypogoal.hypotheses.ensemble import read_ensemble
-    from hypogoal.hypotheses.views import FullView
 
-    artefact = open_artefact(source, "ensemble")
     config = artefact.config
-    thresholds: dict[str, list[float]] = {}
-    with create(out, kind="hub", config={}, seed=artefact.seed, inputs=[source], force=force) as draft:
-        for goal in config["sub_goals"]:
-            ensemble = read_ensemble(artefact.path, config, goal)
-            if not isinstance(ensemble.view, FullView):
-                do = "Export those trained with view=full."
-                raise UserError("these members have a view of your own, which only hypogoal can load", source, do)
-            members = nn.ModuleList(ensemble.members)
-            state = {**members.state_dict(), **dict(ensemble.view.named_buffers())}
-            save_tensors(draft.files / f"{goal}.safetensors", {name: part.clone() for name, part in state.items()})
-            thresholds[goal] = [round(float(threshold), 6) for threshold in ensemble.thresholds]
-        fields = fields_of(ensemble.observation_shape, ensemble.view.dtype)
-        observations = {key: [str(kind), list(shape)] for key, (kind, shape) in fields.items()}
-        facts = {
-            "members": len(members),
-            "thresholds": thresholds,
-            "observations": observations,
-            "layers": _layers(members[0].children(), source),
-        }
-        card = CARD.format(
-            count=len(members),
-            goals=", ".join(thresholds),
-            first=next(iter(thresholds)),
-            observations=observations,
-            diversity=config["diversity"],
-            version=artefact.manifest.versions["hypogoal"],
-        )
-        loader = Path(load.__file__).read_text(encoding="utf-8")
-        (draft.files / "config.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        (draft.files / "README.md").write_text(card, encoding="utf-8")
-        (draft.files / "load.py").write_text(loader, encoding="utf-8")
+    if config["view"] != FULL:
+        do = "Export those trained with view=full."
+        raise UserError("these members have a view of your own, which only hypogoal can load", artefact.path, do)
+    goals = config["sub_goals"]
+    ensemble = read_ensemble(artefact.path, config, goals[0])
+    observations = {}
+    for key, (dtype, shape) in fields_of(ensemble.observation_shape, ensemble.view.dtype).items():
+        observations[key] = str(dtype), shape
+    facts = {
+        "members": len(ensemble),
+        "observations": observations,
+        "layers": _layers(ensemble.members[0], artefact.path),
+    }
+    card = CARD.format(
+        count=len(ensemble),
+        goals=", ".join(goals),
+        first=goals[0],
+        observations=observations,
+        diversity=config["diversity"],
+        version=artefact.manifest.versions["hypogoal"],
+    )
+    (folder / "config.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    (folder / "README.md").write_text(card, encoding="utf-8")
+    shutil.copy(load.__file__, folder / "load.py")
+    for goal in goals:
+        shutil.copy(artefact.path / f"{goal}.safetensors", folder)
 
 
-def _layers(layers: Iterable[Any], source: Path) -> list[Any]:
-    """The names and arguments of layers, from which ``load.py`` builds them."""
+def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The names and arguments of a network's layers, from which ``load.py`` builds them."""
     from torch import nn
 
     from hypogoal.hypotheses.load import ByKey
 
-    rows: list[Any] = []
-    for layer in layers:
+    rows: list[tuple[str, dict[str, Any]]] = []
+    for layer in network.children():
         kind = type(layer)
         if isinstance(layer, ByKey):
-            shapes = [list(shape) for shape in layer.shapes]
-            encoders = [_layers(encoder.children(), source) for encoder in layer.encoders]
-            rows.append([kind.__name__, {"shapes": shapes, "encoders": encoders}])
+            encoders = [_layers(encoder, source) for encoder in layer.encoders]
+            rows.append((kind.__name__, {"shapes": layer.shapes, "encoders": encoders}))
             continue
         if getattr(nn, kind.__name__, None) is not kind or [*layer.children()]:
             fault = f"only hypogoal can build the layer {kind.__name__}"
             raise UserError(fault, source, "Export members of a built-in network, such as doorkey.")
-        names = {*inspect.signature(kind).parameters} & {*getattr(kind, "__constants__", ())}
-        arguments = {name: getattr(layer, name) for name in sorted(names)}
-        if isinstance(layer, nn.Conv2d):
+        parameters = inspect.signature(kind).parameters
+        kept = getattr(kind, "__constants__", ())
+        arguments = {name: getattr(layer, name) for name in parameters if name in kept}
+        if "bias" in parameters:
             arguments["bias"] = layer.bias is not None
-        rows.append([kind.__name__, arguments])
+        rows.append((kind.__name__, arguments))
     return rows
 
 
-def export_episodes(
-    meta: Path, out: Path, *, episodes: int = 20, seed: int = 0, force: bool = False, quiet: bool = False
-) -> int:
-    """Let the agent of a meta artefact play and write its episodes as a Minari dataset; returns the number of steps.
+def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress: Progress) -> int:
+    """Let the agent of a meta artefact play as a Minari dataset of the name ``out``; returns the number of steps.
 
-    ``out`` is the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
-    ``seed`` determines the draws of options; ``infos/option`` is the option that led to each state, -1 at the start.
-    A missing agent, another name, or an existing ``out`` is a ``UserError``.
+    ``infos/option`` is the option that led to each state, -1 at the start.
     """
+    from gymnasium import spaces
+
     from hypogoal.core.processes import prepare
     from hypogoal.meta.episodes import agent_of, play_episodes
 
@@ -156,68 +158,51 @@ def export_episodes(
     except ImportError:
         raise UserError("episodes are written by minari", out, "Install it: pip install 'hypogoal[minari]'.") from None
 
-    if not NAME.fullmatch(out.name):
-        raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
     prepare()
-    source = open_artefact(meta, "meta")
-    where = source.config["layouts"] or source.config["layout_seed"]
-    options = len(source.config["sub_goals"]) * source.config["members"]
+    loop = agent_of(meta, seed)
+    engine = loop.engine
+    low, high = (0, 255) if engine.observation_dtype == PICTURE else (-np.inf, np.inf)
+    kind: Any = engine.observation_dtype.type
+    storage = MinariStorage.new(
+        folder.resolve(),
+        observation_space=spaces.Box(low, high, engine.observation_shape, kind),
+        action_space=spaces.Discrete(engine.n_actions),
+        jpeg_encoding=False,
+    )
+    place = meta.config["layouts"] or meta.config["layout_seed"]
+    about = f"{meta.config['domain']}, layout seed {place}, seed {seed}"
     description = {
         "dataset_id": dataset_id(out),
         "minari_version": __version__,
         "algorithm_name": "hypogoal",
-        "description": f"Episodes of an agent that chooses among {options} options "
-        f"({source.config['domain']}, layout seed {where}, seed {seed}).",
+        "description": f"Episodes of an agent that chooses among options ({about}).",
     }
-    config = {"episodes": episodes}
-    with create(out, kind="episodes", config=config, seed=seed, inputs=[meta], force=force) as draft:
-        loop = agent_of(source, seed)
-        storage = MinariStorage.new(
-            (draft.files / "data").resolve(),
-            observation_space=_observation_space(loop.engine),
-            action_space=spaces.Discrete(loop.engine.n_actions),
-            jpeg_encoding=False,
-        )
-        storage.update_metadata(description)
-        with Progress("export", total=episodes, quiet=quiet) as progress:
-            storage.update_episodes(_buffers(play_episodes(loop, episodes), progress))
-        return int(storage.total_steps)
-
-
-def _observation_space(engine: Engine) -> spaces.Space[Any]:
-    """The space of an engine's observations, a ``Dict`` of those with keys."""
-    fields = fields_of(engine.observation_shape, engine.observation_dtype)
-    boxes: dict[str, spaces.Space[Any]] = {key: _box(shape, dtype) for key, (dtype, shape) in fields.items()}
-    return boxes[""] if "" in boxes else spaces.Dict(boxes)
-
-
-def _box(shape: tuple[int, ...], dtype: DTypeLike) -> spaces.Box:
-    if dtype == PICTURE:
-        return spaces.Box(0, 255, shape, np.uint8)
-    return spaces.Box(-np.inf, np.inf, shape, np.float32)
+    storage.update_metadata(description)
+    storage.update_episodes(_buffers(play_episodes(loop, progress.total), progress))
+    return int(storage.total_steps)
 
 
 def _buffers(episodes: Iterable[Any], progress: Progress) -> Iterator[Any]:
     """Episodes as minari takes them."""
     from minari.data_collector import EpisodeBuffer
 
-    for number, episode in enumerate(episodes, 1):
+    for episode in episodes:
         last = np.arange(len(episode.actions)) == len(episode.actions) - 1
-        seen = episode.observations
         yield EpisodeBuffer(
-            observations={key: seen[key] for key in seen.dtype.names} if seen.dtype.names else seen,
+            observations=episode.observations,
             actions=episode.actions,
             rewards=episode.rewards,
             terminations=last & episode.terminated,
             truncations=last & (not episode.terminated),
             infos={"option": np.concatenate([[-1], episode.options])},
         )
-        progress.update(number)
+        progress.advance()
 
 
 def dataset_id(out: Path) -> str:
     """The id by which minari finds a dataset's folder: its path below minari's root folder, else its name."""
-    configured = os.environ.get("MINARI_DATASETS_PATH")
-    root = Path(os.path.expanduser("~"), ".minari", "datasets") if configured is None else Path(configured)
-    place, root = out.resolve(), root.resolve()
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    place = out.resolve()
+    root = get_dataset_path().resolve()
     return place.relative_to(root).as_posix() if place.is_relative_to(root) else out.name

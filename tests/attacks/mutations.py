@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -85,28 +85,16 @@ def table_changed(data: bytes, rng: Rng) -> bytes:
     return "\n".join(",".join(cells) for cells in rows).encode() + b"\n"
 
 
-def toml_of(tree: Any) -> str:
-    """TOML text of tables; values that TOML lacks are written as text."""
-    lines: list[str] = []
-    for stage, table in tree.items() if isinstance(tree, dict) else ():
-        if isinstance(table, dict):
-            lines += [
-                f"[{json.dumps(stage)}]",
-                *(f"{json.dumps(key)} = {_toml(value)}" for key, value in table.items()),
-            ]
-        else:
-            lines.insert(0, f"{json.dumps(stage)} = {_toml(table)}")
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{json.dumps(key)} = {_toml(item)}' for key, item in value.items())}}}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, float):
-        return repr(value)
-    return json.dumps(str(value) if value is None else value)
+def toml_changed(data: bytes, rng: Rng) -> bytes:
+    """Bytes, a value or a key of a TOML file."""
+    if rng.random() < 0.3:
+        return bytes_changed(data, rng)
+    lines = data.decode().splitlines()
+    at = rng.choice([number for number, line in enumerate(lines) if "=" in line])
+    key, _, value = lines[at].partition(" = ")
+    odd = json.dumps(rng.choice(ODD)).replace("NaN", "nan").replace("Infinity", "inf")
+    lines[at] = rng.choice((f"{key} = {odd}", f"{key} = {odd}", f"{key}_ = {value}", ""))
+    return "\n".join(lines).encode()
 
 
 def weights_changed(data: bytes, rng: Rng) -> bytes:
@@ -143,23 +131,12 @@ def hdf5_changed(path: Path, rng: Rng) -> None:
                 file.attrs[name] = odd if isinstance(odd, int | float) else json.dumps(odd)
             return
         name = rng.choice(names)
-        values = file[name][()] if isinstance(file[name], h5py.Dataset) else np.zeros(3)
+        values = np.atleast_1d(file[name][()]) if isinstance(file[name], h5py.Dataset) else np.zeros(3)
+        others: list[Any] = [  # nothing, fewer states, other shapes, types and values
+            None, values[:0], values[: len(values) // 2], 1, values[..., None], np.full(values.shape, -1),
+            np.full(values.shape, 0.5), np.full(values.shape[:1], np.nan), "a text", h5py.Empty("u1"),
+        ]  # fmt: skip
         del file[name]
-        if made := rng.choice(_others(np.atleast_1d(values))):
-            file[name] = made()
-
-
-def _others(values: Any) -> list[Callable[[], Any] | None]:
-    """What may stand in a dataset's place: nothing, fewer states, other shapes, types and values."""
-    return [
-        None,
-        lambda: values[:0],
-        lambda: values[: len(values) // 2],
-        lambda: 1,
-        lambda: values[..., None],
-        lambda: values.astype(np.float64) + 0.5 if values.dtype.kind in "iufb" else 1,
-        lambda: np.full(values.shape, -1),
-        lambda: np.full(values.shape[:1], np.nan),
-        lambda: "a text",
-        lambda: h5py.Empty("u1"),
-    ]
+        other = rng.choice(others)
+        if other is not None:
+            file[name] = other

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from typing import Any
 
 import pytest
 from command_line import refuses, run
@@ -10,7 +11,9 @@ from toy_data import fill, reseal
 
 from hypogoal.core.artefacts import Artefact, create, open_artefact, sha256_of
 from hypogoal.core.files import write_table
-from hypogoal.evaluation.compare import labels_of
+from hypogoal.evaluation.compare import compared_sections, labels_of
+from hypogoal.evaluation.page import Material
+from hypogoal.evaluation.run import read_evaluation
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.tools.compare import compare
 
@@ -53,13 +56,12 @@ def compared(runs):
 
 def test_what_differs_is_told_and_nothing_else(compared):
     """Spec A8, F7: the setting that was changed; agents that only one run has show in what they bring."""
-    found = {(one["of"], one["setting"]): one["values"] for one in compared["differences"]}
-    assert found == {
+    assert {(row["of"], row["setting"]): row["values"] for row in compared["differences"]} == {
         ("baseline", "agent"): {"slow": "dqn, ppo", "fast": "ppo"},
         ("baseline", "learning_rate"): {"slow": "0.001", "fast": "0.0001"},
     }
-    assert [one["label"] for one in compared["runs"]] == ["slow", "fast"]
-    assert compared["runs"][0]["layout_seeds"] == [100, 101]
+    slow, fast = compared["runs"]
+    assert (slow["label"], slow["layout_seeds"], fast["label"]) == ("slow", [100, 101], "fast")
 
 
 def test_runs_are_paired_by_layout_and_seed(compared):
@@ -78,11 +80,10 @@ def test_the_page_shows_both(runs, compared):
     text = (runs / "both" / "index.html").read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", text)
     assert titles == ["What is compared", "What differs", "Agents", "Who wins, seed by seed"]
-    assert text.count("<figure") == 2
-    assert "<summary>runs and seeds</summary>slow, 4 runs: layout seeds 100 and 101, run seeds 0 and 1; fast" in text
-    assert "DQN tuned" in text
-    assert "within 1.5 shortest paths</th>" in text
-    assert not re.search(r'(?:src|href)="(?!#|data:)', text)
+    seeds = "slow, 4 runs: layout seeds 100 and 101, run seeds 0 and 1; fast"
+    for shown in (f"<summary>runs and seeds</summary>{seeds}", "DQN tuned", "within 1.5 shortest paths</th>"):
+        assert shown in text
+    assert text.count("<figure") == 2 and not re.search(r'(?:src|href)="(?!#|data:)', text)
     artefact = open_artefact(runs / "both", "comparison")
     assert [entry.kind for entry in artefact.manifest.inputs] == ["evaluation", "evaluation"]
     assert {path.name for path in (runs / "both" / "figures").iterdir()} == {"reward-0.svg", "length-0.svg"}
@@ -91,35 +92,29 @@ def test_the_page_shows_both(runs, compared):
 def test_methods_side_by_side(runs, tmp_path):
     """Spec F5: runs without a common agent share one figure of all; there are no pairs."""
     write_baseline(tmp_path / "other", "dqn", 100, 0, 30, steps=6_000)
-    evaluate(tmp_path / "other", tmp_path / "other" / "evaluation", quiet=True)
+    evaluate(tmp_path / "other", quiet=True)
     text = compare([runs / "fast", tmp_path / "other"], tmp_path / "out").read_text(encoding="utf-8")
-    assert text.count("<figure") == 2
+    assert text.count("<figure") == 2 and "No two runs share a seed" in text
     assert "fast: PPO tuned" in text and "other: DQN tuned" in text
-    assert "No two runs share a seed" in text
-
-
-def of_another_domain(metrics):
-    for artefact in metrics["provenance"]["artefacts"]:
-        artefact["config"]["domain"] = "montezuma"
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("old", "new", "words"),
     [
-        (of_another_domain, "different domains (slow: doorkey; other: montezuma)"),
-        (lambda metrics: metrics["settings"].update(window=50), "different window (slow: 100; other: 50)"),
-        (lambda metrics: metrics.update(agents=[]), "no kind of result in common (slow: agents; other: nothing)"),
-        (lambda metrics: metrics.pop("distance"), "does not fit this hypogoal, or is damaged"),
-        (lambda metrics: metrics.pop("format"), "another version of hypogoal evaluated this (format 1, needed: 4)"),
+        ('"domain": "doorkey"', '"domain": "montezuma"', "different domains (slow: doorkey; other: montezuma)"),
+        ('"window": 100', '"window": 50', "different window (slow: 100; other: 50)"),
+        ('"agents": [', '"agents": [], "others": [', "no kind of result in common (slow: agents; other: nothing)"),
+        ('"distance": ', '"far": ', "does not fit this hypogoal, or is damaged"),
+        ('"format": 4', '"format": 1', "another version of hypogoal evaluated this (format 1, needed: 4)"),
     ],
 )
-def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, change, words):
+def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, old, new, words):
     """Spec G2: another domain, other settings, nothing in common, another version's."""
     shutil.copytree(runs / "fast", tmp_path / "other")
     path = tmp_path / "other" / "evaluation" / "metrics.json"
-    metrics = json.loads(path.read_text(encoding="utf-8"))
-    change(metrics)
-    path.write_text(json.dumps(metrics), encoding="utf-8")
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
     reseal(path.parent, files={**Artefact(path.parent).manifest.files, path.name: sha256_of(path)})
     refuses(words, "compare", runs / "slow", tmp_path / "other", "--out", tmp_path / "out")
 
@@ -132,27 +127,21 @@ def test_what_cannot_be_compared_is_refused(runs, tmp_path):
     refuses("two or more different runs", "compare", slow, fast, runs / "both" / ".." / "slow", "--out", out)
     refuses("was not evaluated", "compare", slow, tmp_path / "empty", "--out", out)
     refuses("would replace an input", "compare", slow, fast, "--out", fast)
-
-
-def test_labels_tell_runs_apart():
-    """Spec F7: as short as that can be."""
-    assert labels_of(["/a/one", "/a/two"]) == ["one", "two"]
+    assert labels_of(["/a/one", "/a/two"]) == ["one", "two"]  # as short as tells them apart
     assert labels_of(["/a/run", "/b/run"]) == ["a/run", "b/run"]
 
 
 def test_rewards_of_any_size_are_seen(runs, compared):
     """Spec F5: the reward axis of several runs has limits that fit rewards that are no shares of episodes."""
-    from hypogoal.evaluation.compare import compared_sections
-    from hypogoal.evaluation.page import Material
-    from hypogoal.evaluation.run import read_evaluation
-
     read = {name: read_evaluation(runs / name) for name in ("slow", "fast")}
-    for factor, limits in ((1, (-0.02, 1.04)), (20, None)):
-        curves = {
-            name: {key: values * factor if key.endswith("reward") else values for key, values in one.arrays.items()}
-            for name, one in read.items()
-        }
+    limits = []
+    for factor in (1, 20):
+        curves: dict[str, dict[str, Any]] = {}
+        for name, evaluation in read.items():
+            curves[name] = {**evaluation.arrays}
+            for key in curves[name]:
+                curves[name][key] = curves[name][key] * (factor if key.endswith("reward") else 1)
         material = Material({}, {})
-        compared_sections({name: one.metrics for name, one in read.items()}, curves, compared, material)
-        low, high = material.figures["reward-0"].axes[0].get_ylim()
-        assert (low, high) == limits if limits else low < factor < high
+        compared_sections({name: read[name].metrics for name in read}, curves, compared, material)
+        limits.append(material.figures["reward-0"].axes[0].get_ylim())
+    assert limits[0] == (-0.02, 1.04) and limits[1][0] < 20 < limits[1][1]

@@ -4,33 +4,32 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import refuses, run
+from command_line import refuses, run, settings
 from toy_data import reseal
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.evaluation.curves import read_run
 from hypogoal.learners import episodes
 
-FEW = ("--set", "environments=4", "--set", "warm_up=50", "--set", "steps=200", "-q")
+FEW = [*settings("environments=4", "warm_up=50", "steps=200"), "-q"]
 
 
 @pytest.mark.parametrize(
-    ("ensemble", "changes", "words"),
+    ("ensemble", "pairs", "words"),
     [
-        ("other-ensemble", (), "another ensemble"),
-        ("ensemble", ("--set", "layout_seed=3"), "layout_seed=100, not 3"),
-        ("ensemble", ("--set", "termination=oracle"), "termination=learned, not oracle"),
-        ("ensemble", ("--set", "network=paper", "--set", "experience=own"), "network=light, not paper"),
+        ("other-ensemble", [], "another ensemble"),
+        ("ensemble", ["layout_seed=3"], "layout_seed=100, not 3"),
+        ("ensemble", ["termination=oracle"], "termination=learned, not oracle"),
+        ("ensemble", ["network=paper", "experience=own"], "network=light, not paper"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(
-    corridor_copy: Path, tmp_path: Path, ensemble: str, changes: tuple[str, ...], words: str
+    corridor_copy: Path, tmp_path: Path, ensemble: str, pairs: list[str], words: str
 ) -> None:
     """Spec A8, G2: one line that says what differs."""
-    other = shutil.copytree(corridor_copy / "ensemble", corridor_copy / "other-ensemble")
-    reseal(other, seed=1)
-    options, out = corridor_copy / "options", tmp_path / "out" / "meta"
-    refuses(words, "train-meta", corridor_copy / ensemble, "--options", options, "--out", out, *FEW, *changes)
+    reseal(shutil.copytree(corridor_copy / "ensemble", corridor_copy / "other-ensemble"), seed=1)
+    command = ["train-meta", corridor_copy / ensemble, "--options", corridor_copy / "options", *FEW, *settings(*pairs)]
+    refuses(words, *command, "--out", tmp_path / "meta")
 
 
 def test_options_that_fit_are_continued(corridor_run: Path, tmp_path: Path) -> None:
@@ -50,16 +49,14 @@ def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(
 ) -> None:
     """What ended it stands on the command's last line and in the manifest; its limit is none of what was spent."""
     monkeypatch.setattr(episodes, "LAST", 3)
-    few = [*FEW[:-1], "--set", "until=0.3"]
-    said = {}
-    for name, changes in (("early", ("--set", "steps=4000")), ("late", ("--set", "steps=40"))):
-        command = ["train-options", corridor_run / "ensemble", "--out", tmp_path / name, *few, *changes]
-        said[name] = run(*command).out.splitlines()[-3]
-        run(*command, "--resume")  # it is complete
-    assert said["early"].endswith("ended by until=0.3") and said["late"].endswith(
-        "ended by the limit, until=0.3 not reached"
-    )
-    early, late = (open_artefact(tmp_path / name).config for name in said)
+    lines = {}
+    for name, steps in (("early", "4000"), ("late", "40")):
+        words = ["train-options", corridor_run / "ensemble", "--out", tmp_path / name, *FEW[:-1]]
+        words += settings("until=0.3", f"steps={steps}")
+        lines[name] = run(*words).out.splitlines()[-3]
+        run(*words, "--resume")  # it is complete
+    assert lines["early"].endswith("until=0.3 reached") and lines["late"].endswith("until=0.3 not reached")
+    early, late = (open_artefact(tmp_path / name).config for name in lines)
     assert 40 < early["ended_at"] < early["steps"] == 4000 and early["until_reached"] is True
     assert (late["ended_at"], late["steps"], late["until_reached"]) == (40, 40, False)
 
