@@ -27,7 +27,6 @@ LONGEST = (
     "test_cli",
     "test_docs",
     "test_loop",
-    "test_strange_texts",
     "test_rooms_domain",
     "test_own_code",
     "test_bad_files",
