@@ -14,7 +14,6 @@ import io
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -27,14 +26,13 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
-from hypogoal.core.checkpoints import Checkpoints  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.data import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
 from hypogoal.domains.base import settings_of  # noqa: E402
 from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
-from hypogoal.hypotheses.training import fit  # noqa: E402
+from hypogoal.hypotheses.training import Training  # noqa: E402
 
 WANTED = {"doorkey": {"hypogoal": 4.0}, "montezuma": {"hypogoal": 2.5}}
 SUB_GOAL = {"doorkey": "open-red-door", "montezuma": "climb-down-ladder"}
@@ -42,22 +40,6 @@ COLLECT = {
     "doorkey": ("heldout_layouts=1",),
     "montezuma": ("groups=1", "states_per_room=400", "unlabelled_per_room=400", "heldout_per_room=6", "workers=1"),
 }
-
-
-class Clock(Checkpoints):
-    """Looks at the CPU time after each step instead of saving."""
-
-    def __init__(self) -> None:
-        super().__init__(None)
-        self.times: list[float] = []
-
-    def offer(self, state: Callable[[], Any]) -> None:
-        """A step is done."""
-        self.times.append(time.process_time())
-
-    def per_step(self) -> float:
-        """Median seconds of a step, the first left out."""
-        return statistics.median(np.diff(self.times))
 
 
 def states(domain: str, folder: Path) -> tuple[States, np.ndarray]:
@@ -109,10 +91,10 @@ def plain(split: States, unlabelled: np.ndarray, config: EnsembleConfig, steps: 
 
 
 def ours(split: States, unlabelled: np.ndarray, config: EnsembleConfig) -> float:
-    """Seconds of a step of ``fit``."""
-    clock = Clock()
-    fit(split.observations, split.labels, unlabelled, config, 0, checkpoints=clock)
-    return clock.per_step()
+    """Seconds of a step of a training, the first left out."""
+    training = Training(split.observations, split.labels, unlabelled, config, 0)
+    times = [time.process_time() for _ in training.steps()]
+    return statistics.median(np.diff(times))
 
 
 def compared(split: States, unlabelled: np.ndarray, domain: str, members: int, steps: int, repeats: int) -> Any:

@@ -34,7 +34,7 @@ from hypogoal.evaluation.numbers import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
-from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.training import Training
 from studies.cells import Row, difference, interval, parser_of, printed, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -96,14 +96,16 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
             place = dict(zip(KEYS, (layouts, method, sub_goal, seed, step, member), strict=True))
             rows.append(place | {name: float(values[member]) for name, values in columns.items()})
 
-    fit(
+    training = Training(
         data.labelled.observations,
         data.labelled.labels[:, column],
         data.unlabelled.observations,
         EnsembleConfig(steps=looks[-1]).model_copy(update=METHODS[method]),
         seed_for(seed, "ensemble", sub_goal),
-        Watcher(look=look, look_at=looks),
     )
+    for step, _ in training.steps():
+        if step in looks:
+            look(step, training.ensemble)
     return rows
 
 

@@ -29,7 +29,7 @@ from hypogoal.evaluation.numbers import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
-from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.training import Training
 from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -110,14 +110,16 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> lis
             rows.append(place | {name: float(values[member]) for name, values in columns.items()})
 
     config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": looks[-1]})
-    fit(
+    training = Training(
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,
         config.model_copy(update=METHODS[method]),
         seed_for(seed, "ensemble", CLIMB_DOWN.name),
-        Watcher(look=look, look_at=looks),
     )
+    for step, _ in training.steps():
+        if step in looks:
+            look(step, training.ensemble)
     return rows
 
 

@@ -35,7 +35,7 @@ def test_killed_commands_end_with_the_same_bytes() -> None:
 @pytest.mark.parametrize(
     ("output", "name"),
     [
-        ("run/ensemble", "hypogoal.hypotheses.training:Round.optimiser"),
+        ("run/ensemble", "hypogoal.hypotheses.training:Training.optimiser"),
         ("run/options", "hypogoal.options.light:LightLearner.optimiser"),
         ("run/meta", "hypogoal.meta.ppo:MetaPolicy.rng"),
     ],

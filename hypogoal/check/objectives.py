@@ -8,6 +8,7 @@ from torch import Tensor
 
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.diversity import Context, Objective
+from hypogoal.hypotheses.fit import disagreement_of
 
 SIZES = ((1, 7, 0), (3, 7, 0), (2, 7, 2), (3, 0, 0))  # members, unlabelled states, frozen members
 EXTREME = (20.0, 100.0, 1e4)  # logits so far apart: from 17, a float32 probability is exactly 0 or 1
@@ -27,10 +28,9 @@ def check_objective(objective: Objective) -> Iterator[Verdict]:
 def shape(objective: Objective) -> str:
     """One number for each pair, or for all members; also without states."""
     for members, states, frozen in SIZES:
-        losses = objective.losses(context_of(members, states, frozen))
-        proper = losses.ndim == 1 and bool(losses.isfinite().all())
-        text = f"{members} members, {frozen} frozen members and {states} states give {losses.tolist()}"
-        promise(proper, text, "Give one finite number, a tensor (); divide by max(N, 1).")
+        loss = disagreement_of(objective, context_of(members, states, frozen))
+        text = f"{members} members, {frozen} frozen members and {states} states give {loss.item()}"
+        promise(bool(loss.isfinite()), text, "Give one finite number, a tensor (); divide by max(N, 1).")
     return "one number for 1 to 3 members, with frozen members, without states"
 
 
@@ -38,7 +38,7 @@ def order(objective: Objective) -> str:
     context = context_of()
     labelled, unlabelled = context.labelled.flip(0), context.unlabelled.flip(0, 1)
     turned = replace(context, labelled=labelled, unlabelled=unlabelled)
-    loss, other = objective.losses(context).sum(), objective.losses(turned).sum()
+    loss, other = disagreement_of(objective, context), disagreement_of(objective, turned)
     text = "the loss changes when members, and states, change places"
     promise(torch.allclose(loss, other), text, "Make it symmetric, for example by means.")
     return "members and states may change places"
@@ -95,7 +95,7 @@ def context_of(members: int = 3, states: int = 7, frozen: int = 0, gap: float = 
 
 def _derived(objective: Objective, context: Context) -> tuple[Tensor, Tensor]:
     """The loss, and its gradient by all logits, (K, B + N, 2)."""
-    loss = objective.losses(context).sum()
+    loss = disagreement_of(objective, context)
     logits = (context.labelled, context.unlabelled)
     parts = torch.autograd.grad(loss, logits, allow_unused=True, materialize_grads=True)
     return loss, torch.cat(parts, dim=1)

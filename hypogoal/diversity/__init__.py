@@ -9,15 +9,16 @@ An objective is one of two functions:
 Both must stay finite and differentiable at extreme logits and for N = 0 (``hypogoal check --diversity`` tests it). Name
 your own as ``module:function``, a function of two arguments or of one. Other packages add theirs under the entry point
 group ``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` with one of these functions.
+
+:func:`hypogoal.hypotheses.fit.disagreement` puts them into Eq. (1).
 """
 
 from __future__ import annotations
 
 import inspect
 import pkgutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hypogoal.core.errors import UserError
@@ -53,53 +54,31 @@ class Context:
     positives: float
 
 
+@dataclass(frozen=True)
 class Objective:
-    """A diversity objective by name, of either kind.
+    """A diversity objective by name, of either kind: one of the two losses is given."""
 
-    Attributes:
-        name: as in the setting ``diversity``.
-        pair_loss: the loss that Eq. (1) sums over pairs, or None.
-        ensemble_loss: the loss of all members at once; None if there is a ``pair_loss``.
-    """
-
-    def __init__(self, name: str, *, pair_loss: PairLoss | None = None, ensemble_loss: EnsembleLoss | None = None):
-        self.name, self.pair_loss, self.ensemble_loss = name, pair_loss, ensemble_loss
+    name: str
+    pair_loss: PairLoss | None = None
+    ensemble_loss: EnsembleLoss | None = None
 
     def acts(self, members: int) -> bool:
         """Whether it has an effect on an ensemble with this number of members: pairs need two."""
         return self.name != "none" and (members > 1 or self.ensemble_loss is not None)
 
-    def terms(self, members: Sequence[int], frozen: int) -> list[str]:
-        """Names for each of :meth:`losses`; ``members`` are in training, 0 to ``frozen`` - 1 are frozen."""
-        if self.ensemble_loss is not None:
-            return ["the diversity loss"]
-        pairs = [*combinations(members, 2), *((old, member) for member in members for old in range(frozen))]
-        return [f"the diversity loss of members {first} and {second}" for first, second in pairs]
+    def loss(self, *arguments: Any) -> Tensor:
+        """The loss of two members' logits, or of a :class:`Context`: a float (), else a ``UserError``.
 
-    def losses(self, context: Context) -> Tensor:
-        """The inner sums of Eq. (1), float (P,): a loss per pair, first in training, then with frozen members.
-
-        The double sum counts each pair in training twice. Its i = m is left out: disagreement with itself would push
-        every member to p = 1/2. An ``ensemble_loss`` is the only loss.
+        That it is finite is checked every few steps, or a GPU would wait.
         """
-        import torch
-
-        if self.ensemble_loss is not None:
-            return self._checked(self.ensemble_loss, context)[None]
-        assert self.pair_loss is not None
-        trained, frozen = context.unlabelled, context.frozen
-        losses = [2.0 * self._checked(self.pair_loss, *pair) for pair in combinations(trained, 2)]
-        losses += [self._checked(self.pair_loss, old, member) for member in trained for old in frozen]
-        return torch.stack(losses) if losses else trained.new_zeros(0)
-
-    def _checked(self, function: Callable[..., Tensor], *arguments: Any) -> Tensor:
-        """The loss, after a check of its shape; that it is finite is checked every few steps, or a GPU would wait."""
-        loss: Any = function(*arguments)
+        function: Any = self.ensemble_loss or self.pair_loss
+        loss = function(*arguments)
         if getattr(loss, "shape", None) != () or not loss.is_floating_point():
             received = f"{loss.dtype} {tuple(loss.shape)}" if hasattr(loss, "dtype") else type(loss).__name__
             do = "Give a float (): a mean over the states, axis -2."
             raise UserError(f"the diversity objective gave {received}", self.name, do)
-        return loss
+        checked: Tensor = loss
+        return checked
 
 
 def load_objective(name: str) -> Objective:
@@ -108,25 +87,29 @@ def load_objective(name: str) -> Objective:
     Raises ``UserError`` if it is unknown, cannot be loaded or is no objective, or if the user did not allow the code
     (see :mod:`hypogoal.core.own_code`).
     """
-    built_in = {objective: f"{__name__}.{objective.replace('-', '_')}" for objective in OBJECTIVES}
+    built_in = {}
+    for objective in OBJECTIVES:
+        built_in[objective] = f"{__name__}.{objective.replace('-', '_')}"
     loaded = load(name, "diversity objective", ENTRY_POINTS, built_in)
     for kind in ("ensemble_loss", "pair_loss"):  # the first may use the second
         if hasattr(loaded, kind):
-            function = getattr(loaded, kind)
-            break
-    else:
-        function, kind = loaded, "ensemble_loss" if _arguments(loaded) == 1 else "pair_loss"
-    if not callable(function):
+            return Objective(name, **{kind: getattr(loaded, kind)})
+    if not callable(loaded):
         do = "Give a pair_loss(logits_a, logits_b) or an ensemble_loss(context)."
         raise UserError("this is not a diversity objective", name, do)
-    return Objective(name, **{kind: function})
+    if _arguments(loaded) == 1:
+        return Objective(name, ensemble_loss=loaded)
+    return Objective(name, pair_loss=loaded)
 
 
-def _arguments(function: object) -> int:
+def _arguments(function: Callable[..., Any]) -> int:
     """The number of required positional arguments; 0 if unknown."""
     try:
-        parameters = inspect.signature(function).parameters.values()  # type: ignore[arg-type]
+        signature = inspect.signature(function)
     except (TypeError, ValueError):
         return 0
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(parameter.kind in positional and parameter.default is parameter.empty for parameter in parameters)
+    required = 0
+    for parameter in signature.parameters.values():
+        positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        required += positional and parameter.default is parameter.empty
+    return required

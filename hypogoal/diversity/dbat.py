@@ -21,6 +21,10 @@ def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
 
     Source: Eq. (1) and arXiv:2202.04414 (D-BAT).
     """
-    log_a, log_b = torch.log_softmax(logits_a, dim=-1), torch.log_softmax(logits_b, dim=-1)
-    differ = torch.logaddexp(log_a[..., 1] + log_b[..., 0], log_a[..., 0] + log_b[..., 1])
-    return -differ.sum(dim=-1) / max(differ.shape[-1], 1)
+    log_a = torch.log_softmax(logits_a, dim=-1)
+    log_b = torch.log_softmax(logits_b, dim=-1)
+    no_a, yes_a = log_a.unbind(-1)
+    no_b, yes_b = log_b.unbind(-1)
+    differ = torch.logaddexp(yes_a + no_b, no_a + yes_b)
+    states = max(differ.shape[-1], 1)
+    return -differ.sum(dim=-1) / states

@@ -16,4 +16,6 @@ def ensemble_loss(context: Context) -> Tensor:
         float (), at least 0, in nats; 0 for no states.
     """
     logits = context.unlabelled
-    return max(len(logits) + len(context.frozen) - 1, 1) * pair_loss(logits, logits).sum()
+    members = len(logits) + len(context.frozen)
+    with_itself = pair_loss(logits, logits)
+    return max(members - 1, 1) * with_itself.sum()

@@ -23,13 +23,22 @@ def ensemble_loss(context: Context) -> Tensor:
 
     Source: arXiv:2202.03418 (DivDis), its repulsion loss and its regularisation loss.
     """
-    logits, frozen = context.unlabelled, context.frozen
+    logits = context.unlabelled
+    frozen = context.frozen
     members, states = logits.shape[:2]
     if states == 0:
         return logits.sum()
-    losses = [2.0 * pair_loss(logits[:m], logits[m].expand_as(logits[:m])).sum() for m in range(1, members)]
-    losses += [pair_loss(frozen, member.expand_as(frozen)).sum() for member in logits if len(frozen)]
-    share = torch.logsumexp(torch.log_softmax(logits, dim=-1), dim=1) - math.log(states)  # (K, 2)
-    priors = (math.log(1.0 - context.positives), math.log(context.positives))
-    ratios = [(log.exp() * (log - prior)).sum() for log, prior in zip(share.unbind(-1), priors, strict=True)]
-    return torch.stack([*losses, *(RATIO_WEIGHT * ratio for ratio in ratios)]).sum()
+    terms = []
+    for number in range(1, members):
+        earlier = logits[:number]
+        shared = pair_loss(earlier, logits[number].expand_as(earlier))
+        terms.append(2.0 * shared.sum())
+    if len(frozen):
+        terms += [pair_loss(frozen, member.expand_as(frozen)).sum() for member in logits]
+    log_classes = torch.log_softmax(logits, dim=-1)
+    log_shares = torch.logsumexp(log_classes, dim=1) - math.log(states)  # (K, 2)
+    priors = (1.0 - context.positives, context.positives)
+    for log_share, prior in zip(log_shares.unbind(-1), priors, strict=True):
+        ratio = log_share.exp() * (log_share - math.log(prior))
+        terms.append(RATIO_WEIGHT * ratio.sum())
+    return torch.stack(terms).sum()

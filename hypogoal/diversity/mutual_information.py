@@ -33,8 +33,10 @@ def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
     log_a = torch.log_softmax(logits_a, dim=-1).clamp(min=SMALLEST_LOG)
     log_b = torch.log_softmax(logits_b, dim=-1).clamp(min=SMALLEST_LOG)
     log_states = math.log(states)
-    joint = torch.logsumexp(log_a[..., :, None] + log_b[..., None, :], dim=-3) - log_states  # (..., 2, 2)
+    both = log_a[..., :, None] + log_b[..., None, :]  # (..., N, 2, 2)
+    joint = torch.logsumexp(both, dim=-3) - log_states  # (..., 2, 2)
     marginal_a = torch.logsumexp(log_a, dim=-2) - log_states  # (..., 2)
     marginal_b = torch.logsumexp(log_b, dim=-2) - log_states
     product = marginal_a[..., :, None] + marginal_b[..., None, :]
-    return (joint.exp() * (joint - product)).sum(dim=(-2, -1))
+    information = joint.exp() * (joint - product)
+    return information.sum(dim=(-2, -1))

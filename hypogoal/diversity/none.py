@@ -8,4 +8,5 @@ def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
 
     Takes two members' logits (..., N, 2) on N unlabelled states; returns float (...,), 0 with gradients of 0.
     """
-    return (logits_a.sum(dim=(-2, -1)) + logits_b.sum(dim=(-2, -1))).nan_to_num(0.0, 0.0, 0.0) * 0.0
+    sums = logits_a.sum(dim=(-2, -1)) + logits_b.sum(dim=(-2, -1))
+    return sums.nan_to_num(0.0, 0.0, 0.0) * 0.0

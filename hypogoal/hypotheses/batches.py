@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, repeat
+from contextlib import contextmanager
+from itertools import chain, cycle, islice, repeat
 
 import numpy as np
 import torch
@@ -11,171 +12,201 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
-from hypogoal.hypotheses.views import Origins, View
+from hypogoal.hypotheses.views import Origins
 from hypogoal.observations import Observations, values_in
 
+Numbers = NDArray[np.int64]  # of states, (B,)
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
-PLAIN = View()
+NONE = np.zeros(0, dtype=np.int64)
 
 
-class TrainingStates:
-    """Labelled states followed by unlabelled ones, numbered in that order.
+class TrainingStates(Resumable):
+    """Labelled states (N, *obs) with labels (N,), and unlabelled ones (M, *obs), each numbered from 0.
+
+    On a CPU the arrays are kept and not copied. Pictures of which many patches are equal are kept as tables, see
+    :mod:`hypogoal.hypotheses.patches`. Mixed observations' numbers are standardised in each batch, since a standardised
+    copy would have copies of the pictures, too.
 
     Args:
-        observations, labels: of the labelled states what :meth:`View.to_change` keeps, (N, ...), and labels (N,).
-        unlabelled: the same of the unlabelled states. On a CPU these arrays are kept and not copied.
-        network: any of the networks that will see them (their layers decide how images are stored).
-        view: changes training batches at random, says how labelled ones are drawn, and has the standard of mixed
-            observations' numbers, which are standardised in each batch.
-        origins: of the labelled states, (N,) by name.
+        ensemble: whose members will see the states, on its device and by its view.
+        origins: of the labelled states, (N,) by name, for a view that draws by them.
+
+    Attributes:
+        changes: generators of a view's random changes of labelled and of unlabelled states. There are two since methods
+            differ in their use of the second.
 
     Raises:
         UserError: shapes that do not fit, or labels of one class only.
     """
+
+    CHANGING = ("changes",)
+    changes: list[np.random.Generator]
 
     def __init__(
         self,
         observations: Observations,
         labels: NDArray[np.bool_],
         unlabelled: Observations,
-        network: nn.Sequential,
-        device: torch.device,
-        *,
-        view: View = PLAIN,
-        origins: Origins | None = None,
+        ensemble: Ensemble,
+        origins: Origins,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
             raise UserError("the states do not fit together", shapes, "Collect them again.")
         require_classes(labels[:, None], ["the sub-goal"], None, "Collect others.")
-        self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
-        self.device, self._view, self._origins = device, view, origins or {}
-        self._dtype, self._shape = observations.dtype, (values_in(observations.shape[1:], observations.dtype),)
-        self._standard = [torch.from_numpy(values).to(device) for values in view.standard or ()]
-        images = [np.require(some, requirements=["C", "W"]) for some in (observations, unlabelled)]
-        tables = device.type == "cpu" and not view.changes  # changed images have changed patches
-        self._tables = patches.make_tables(images, network) if tables else None
-        self._images = [as_tensor(some).to(device) for some in images] if self._tables is None else []
-        self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
+        self.labels, self.n_unlabelled = labels, len(unlabelled)
+        self.view, self.device = ensemble.view, ensemble.thresholds.device
+        self._origins = origins
+        self._dtype = observations.dtype
+        self._values = values_in(observations.shape[1:], observations.dtype)
+        self._targets = torch.from_numpy(labels.astype(np.int64)).to(self.device)
+        self._standard: list[Tensor] = []
+        kept = [observations, unlabelled]
+        if self._dtype.names:
+            self._standard = [torch.from_numpy(values).to(self.device) for values in self.view.standard or ()]
+        else:
+            kept = [self.view.to_change(states) for states in kept]
+        kept = [np.require(states, requirements=["C", "W"]) for states in kept]
+        self._tables: patches.Tables | None = None
+        if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
+            self._tables = patches.make_tables(kept, ensemble.networks[0])
+        self._states: list[Tensor] = []
+        if self._tables is None:
+            self._states = [as_tensor(states).to(self.device) for states in kept]
 
-    def forward(
+    def begin(self, seed: int) -> None:
+        """Begin the random changes of one training; before any :meth:`logits`."""
+        self.changes = [rng_for(seed, "changes", group) for group in ("labelled", "unlabelled")]
+
+    def targets(self, labelled: Numbers) -> Tensor:
+        """Classes int64 (B,) of labelled states (B,)."""
+        return self._targets[torch.from_numpy(labelled).to(self.device)]
+
+    def logits(
         self,
         networks: Sequence[nn.Sequential],
-        *groups: NDArray[np.int64],
-        counted: Sequence[bool] = (),
-        changes: Sequence[np.random.Generator] = (),
-    ) -> list[Tensor]:
-        """All K networks' logits, float (K, B, 2), of each group of states (B,).
+        labelled: Numbers = NONE,
+        unlabelled: Numbers = NONE,
+        *,
+        counted: bool = True,
+    ) -> tuple[Tensor, Tensor]:
+        """All K networks' logits of labelled (K, B, 2) and of unlabelled states (K, N, 2).
 
-        BatchNorm sees each group on its own; all other layers take them together, which reads the weights once. In
-        training mode, BatchNorm's running statistics include the ``counted`` groups, all if that is empty. With
-        ``changes``, a generator per group, the view changes states at random; a group's draws do not depend on the
-        others.
+        In training mode the view changes the states at random, and ``counted`` says whether BatchNorm's running
+        statistics include the unlabelled ones, see :func:`plain_forward`.
         """
-        sizes, inputs = [len(group) for group in groups], self._inputs(groups, changes)
+        groups = (labelled, unlabelled)
+        inputs = self._inputs(groups, changing=networks[0].training)
+        sizes = [len(group) for group in groups]
         logits = torch.stack([_forward(network, inputs, sizes, counted) for network in networks])
-        return list(logits.split(sizes, dim=1))
+        on_labelled, on_unlabelled = logits.split(sizes, dim=1)
+        return on_labelled, on_unlabelled
 
-    def _inputs(
-        self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator]
-    ) -> Tensor | patches.Batch:
-        """The networks' inputs for groups of states: images, or their patches."""
-        if self._tables is not None:
-            return patches.take(self._tables, *groups)
-        if changes and self._view.changes:
-            return torch.cat([self._images_of(*group) for group in zip(groups, changes, strict=True)])
-        return self._images_of(np.concatenate(groups), None)
-
-    def count_in(
-        self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator
-    ) -> None:
-        """Update BatchNorm's running statistics, of networks in training mode, with states (B,), and nothing else."""
-        first = [_up_to_last_norm(network) for network in networks]
-        if not any(len(network) for network in first):
-            return
+    def count_in(self, networks: Sequence[nn.Sequential], unlabelled: Numbers) -> None:
+        """Include unlabelled states in BatchNorm's running statistics, where no loss needs their logits."""
         with torch.no_grad():
-            inputs = self._inputs([states], [changes])
-            for network in first:
-                _forward(network, inputs, [len(states)])
+            inputs = self._inputs((NONE, unlabelled), changing=True)
+            for network in networks:
+                _forward(_up_to_last_norm(network), inputs, [0, len(unlabelled)], counted=True)
 
-    def _images_of(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
-        numbers, (labelled, unlabelled) = torch.from_numpy(states).to(self.device), self._images
-        images, first = labelled.new_empty(len(states), *labelled.shape[1:]), numbers < self.n_labelled
-        images[first] = labelled[numbers[first]]
-        images[~first] = unlabelled[numbers[~first] - self.n_labelled]
-        if self._view.changes:
-            seen = self._view.change(images.cpu().numpy(), changes)
-            images = torch.from_numpy(np.ascontiguousarray(seen)).to(self.device)
-        return as_input(images, self._dtype, self._standard)
-
-    def targets(self, states: NDArray[np.int64]) -> Tensor:
-        """Classes int64 (B,) of labelled states (B,)."""
-        return self._targets[torch.from_numpy(states).to(self.device)]
-
-    def unlabelled_logits(self, networks: Sequence[nn.Sequential]) -> Tensor:
-        """Each trained network's logits, float (F, M, 2), of all unlabelled states, in evaluation mode."""
+    def frozen_logits(self, networks: Sequence[nn.Sequential]) -> Tensor:
+        """F trained networks' logits, float (F, M, 2), of all unlabelled states, in evaluation mode."""
         if not networks:
             return torch.zeros(0, self.n_unlabelled, 2, device=self.device)
-        states = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
         for network in networks:
             network.eval()
+        size = at_once(EVALUATED_AT_ONCE, (self._values,))
+        chunks = []
         with torch.no_grad():
-            size = at_once(EVALUATED_AT_ONCE, self._shape)
-            chunks = [self.forward(networks, states[at : at + size])[0] for at in range(0, len(states), size)]
+            for start in range(0, self.n_unlabelled, size):
+                some = np.arange(start, min(start + size, self.n_unlabelled))
+                chunks.append(self.logits(networks, unlabelled=some)[1])
         return torch.cat(chunks, dim=1)
 
-    def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see :meth:`View.pools`.
+    def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[Numbers, Numbers]]:
+        """``config.steps`` batches: numbers of labelled (B,) and of unlabelled states (B,).
 
-        Every state of a pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no
-        such states.
+        Half of the labelled ones are positive, unless the view has other pools (:meth:`View.pools`). Every state of a
+        pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no such states.
         """
-        draws = [_draw(pools, count, seed, name) for pools, count, name in self._pools(config)]
-        for _ in range(config.steps):
-            *labelled, unlabelled = (next(draw) for draw in draws)
-            yield np.concatenate(labelled), unlabelled
-
-    def _pools(self, config: EnsembleConfig) -> list[tuple[list[NDArray[np.int64]], int, str]]:
-        """The parts of a batch, the unlabelled last: pools of states that take turns, a count, and a name."""
-        positives, share = self._view.pools(self.labels, self._origins)
+        pools, share = self.view.pools(self.labels, self._origins)
+        positives = min(max(1, int(share * config.batch_size)), config.batch_size - 1)
         negatives = np.flatnonzero(~self.labels)
-        count = min(max(1, int(share * config.batch_size)), config.batch_size - 1)
-        unlabelled = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
-        return [
-            (positives, count, "positives"),
-            ([negatives], config.batch_size - count, "negatives"),
-            ([unlabelled], config.batch_size if len(unlabelled) else 0, "unlabelled"),
-        ]
+        others = config.batch_size if self.n_unlabelled else 0
+        drawn_positives = _draws(pools, positives, seed, "positives")
+        drawn_negatives = _draws([negatives], config.batch_size - positives, seed, "negatives")
+        drawn_unlabelled = _draws([np.arange(self.n_unlabelled)], others, seed, "unlabelled")
+        for _ in range(config.steps):
+            labelled = np.concatenate([next(drawn_positives), next(drawn_negatives)])
+            yield labelled, next(drawn_unlabelled)
+
+    def _inputs(self, groups: tuple[Numbers, Numbers], changing: bool) -> Tensor | patches.Batch:
+        """The networks' inputs for labelled and unlabelled states: pictures, or their patches."""
+        if self._tables is not None:
+            labelled, unlabelled = groups
+            tabled = (labelled, unlabelled + len(self.labels))
+            return patches.take(self._tables, *filter(len, tabled))
+        rows = []
+        for states, numbers, rng in zip(self._states, groups, self.changes, strict=True):
+            if not len(numbers):
+                continue
+            seen = states[torch.from_numpy(numbers).to(self.device)]
+            if self.view.changes:
+                changed = self.view.change(seen.cpu().numpy(), rng if changing else None)
+                seen = torch.from_numpy(np.ascontiguousarray(changed)).to(self.device)
+            rows.append(seen)
+        return as_input(torch.cat(rows), self._dtype, self._standard)
 
 
-def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> Iterator[NDArray[np.int64]]:
+def _draws(pools: Sequence[Numbers], count: int, seed: int, name: str) -> Iterator[Numbers]:
     """Endlessly, ``count`` items of the pools in turn; a pool is shuffled again once all its items were drawn."""
-    rngs = [rng_for(seed, name, *([number] if len(pools) > 1 else [])) for number in range(len(pools))]
-    streams = [chain.from_iterable(map(rng.permutation, repeat(pool))) for rng, pool in zip(rngs, pools, strict=True)]
-    turn = 0
+    streams = []
+    for number, pool in enumerate(pools):
+        names = [name, number] if len(pools) > 1 else [name]
+        rng = rng_for(seed, *names)
+        streams.append(chain.from_iterable(map(rng.permutation, repeat(pool))))
+    items = map(next, cycle(streams))
     while True:
-        drawn = np.array([next(streams[(turn + item) % len(streams)]) for item in range(count)], dtype=np.int64)
-        turn = (turn + count) % len(streams)
-        yield drawn
+        yield np.fromiter(islice(items, count), np.int64, count)
 
 
-def _forward(
-    network: nn.Sequential, values: Tensor | patches.Batch, sizes: Sequence[int], counted: Sequence[bool] = ()
-) -> Tensor:
-    """A network's outputs for consecutive groups of inputs; BatchNorm sees each group on its own."""
-    if isinstance(values, patches.Batch):
-        return patches.forward(network, values, counted)
+def _forward(network: nn.Sequential, inputs: Tensor | patches.Batch, sizes: Sequence[int], counted: bool) -> Tensor:
+    """A network's outputs, up to rounding the same for either kind of inputs (a test asserts it)."""
+    if isinstance(inputs, patches.Batch):
+        return patches.forward(network, inputs, counted)
+    return plain_forward(network, inputs, sizes, counted)
+
+
+def plain_forward(network: nn.Sequential, inputs: Tensor, sizes: Sequence[int], counted: bool) -> Tensor:
+    """A network's outputs for so many labelled inputs and, behind them, so many unlabelled ones.
+
+    In training, BatchNorm standardises each of the two groups by the group's own mean and variance, as if the other
+    were not there. The running mean and variance, by which a trained network predicts, follow both groups, first the
+    labelled one; where the unlabelled one is not ``counted``, they follow the labelled one alone. All other layers take
+    both groups at once.
+    """
+    values = inputs
     for layer in network:
-        if norms := _norms(layer):
-            groups = zip(values.split(list(sizes)), counted or [True] * len(sizes), strict=True)
-            normed = [layer(group) if counts else _uncounted(layer, norms, group) for group, counts in groups]
-        values = torch.cat(normed) if norms else layer(values)
+        norms = _norms(layer)
+        if not norms:
+            values = layer(values)
+            continue
+        labelled, unlabelled = values.split(list(sizes))
+        normed = []
+        if len(labelled):
+            normed.append(layer(labelled))
+        if len(unlabelled):
+            with _uncounted([] if counted else norms):
+                normed.append(layer(unlabelled))
+        values = torch.cat(normed)
     return values
 
 
@@ -184,18 +215,20 @@ def _norms(layer: nn.Module) -> list[_BatchNorm]:
     return [part for part in layer.modules() if isinstance(part, _BatchNorm) and part.training]
 
 
-def _uncounted(layer: nn.Module, norms: Sequence[_BatchNorm], inputs: Tensor) -> Tensor:
-    """A layer's outputs by the inputs' own statistics, without updating the running ones."""
-    tracked = [norm.track_running_stats for norm in norms]
-    for norm in norms:
+@contextmanager
+def _uncounted(norms: Sequence[_BatchNorm]) -> Iterator[None]:
+    """Within the block these do not update their running statistics."""
+    tracking = [norm for norm in norms if norm.track_running_stats]
+    for norm in tracking:
         norm.track_running_stats = False
-    outputs: Tensor = layer(inputs)
-    for norm, tracks in zip(norms, tracked, strict=True):
-        norm.track_running_stats = tracks
-    return outputs
+    yield
+    for norm in tracking:
+        norm.track_running_stats = True
 
 
 def _up_to_last_norm(network: nn.Sequential) -> nn.Sequential:
     """The layers that BatchNorm's running statistics depend on."""
-    last = max((index for index, layer in enumerate(network) if _norms(layer)), default=-1)
-    return nn.Sequential(*list(network)[: last + 1])
+    layers = list(network)
+    while layers and not _norms(layers[-1]):
+        layers.pop()
+    return nn.Sequential(*layers)

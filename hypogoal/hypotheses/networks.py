@@ -13,8 +13,7 @@ network, which the paper does not have.
 from __future__ import annotations
 
 import inspect
-import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import prod
 from typing import Any, TypeAlias
@@ -32,7 +31,7 @@ from hypogoal.observations import NUMBERS, PICTURE, Observations, fields_of, sta
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
-KEPT = {f"torch.{name}" for name in ("float32", "float64", "int64", "int32", "uint8", "bool")}  # types of weights
+SUITABLE = {PICTURE: "doorkey", NUMBERS: "mlp"}
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
@@ -50,9 +49,13 @@ def doorkey(channels: int) -> Parts:
 
     Source: the paper's appendix; sizes from the authors' code (minigrid_cnn.py).
     """
-    first = [*_convolution(channels, 32, 5, 2), nn.MaxPool2d(kernel_size=3, stride=2)]
-    second = [*_convolution(32, 64, 3, 2), nn.MaxPool2d(kernel_size=4, stride=2)]
-    return first + second, (750, 100)
+    layers = [
+        *_convolution(channels, 32, 5, 2),
+        nn.MaxPool2d(kernel_size=3, stride=2),
+        *_convolution(32, 64, 3, 2),
+        nn.MaxPool2d(kernel_size=4, stride=2),
+    ]
+    return layers, (750, 100)
 
 
 def montezuma(channels: int) -> Parts:
@@ -60,12 +63,21 @@ def montezuma(channels: int) -> Parts:
 
     Source: the paper's appendix; sizes from the authors' code (monte_cnn.py).
     """
-    return [*_convolution(channels, 32, 8, 4), *_convolution(32, 64, 4, 2), *_convolution(64, 64, 3, 1)], (512,)
+    layers = [
+        *_convolution(channels, 32, 8, 4),
+        *_convolution(32, 64, 4, 2),
+        *_convolution(64, 64, 3, 1),
+    ]
+    return layers, (512,)
 
 
 def tiles(channels: int) -> Parts:
     """Pictures of 8x8 tiles: a layer that reads tiles, one of 3x3 tiles, a hidden dense layer; from 24x24 pixels."""
-    return [*_convolution(channels, 16, 8, 8), *_convolution(16, 16, 3, 1)], (64,)
+    layers = [
+        *_convolution(channels, 16, 8, 8),
+        *_convolution(16, 16, 3, 1),
+    ]
+    return layers, (64,)
 
 
 def mlp(channels: int) -> Parts:
@@ -89,13 +101,19 @@ def network_for(name: str, dtype: np.dtype[Any]) -> str:
     key that they lack is a ``UserError``.
     """
     if not dtype.names:
-        return {PICTURE: "doorkey", NUMBERS: "mlp"}[dtype] if name == AUTO else name
-    named = dict(part.strip().rpartition("=")[::2] for part in name.split(","))
+        return SUITABLE[dtype] if name == AUTO else name
+    named = {}
+    for part in name.split(","):
+        key, _, network = part.strip().rpartition("=")
+        named[key] = network
     if unknown := {*named} - {"", *dtype.names}:
         raise UserError("no such key in the observations", ", ".join(unknown), f"Known are {', '.join(dtype.names)}.")
-    general = {PICTURE: named.get("", AUTO), NUMBERS: AUTO}
-    kinds = {key: dtype[key].base for key in dtype.names}
-    return ",".join(f"{key}={network_for(named.get(key, general[kind]), kind)}" for key, kind in kinds.items())
+    resolved = []
+    for key in dtype.names:
+        kind = dtype[key].base
+        general = named.get("", AUTO) if kind == PICTURE else AUTO
+        resolved.append(f"{key}={network_for(named.get(key, general), kind)}")
+    return ",".join(resolved)
 
 
 def names_in(network: str) -> list[str]:
@@ -112,45 +130,44 @@ def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
     """
     if name in NETWORKS:
         return lambda shape: NETWORKS[name](shape[-1])
-    built_in = {network: f"{__name__}:{function.__name__}" for network, function in NETWORKS.items()}
+    built_in = dict.fromkeys(NETWORKS, __name__)
     function = load(name, "network", ENTRY_POINTS, built_in)
     if not callable(function):
         raise UserError("this is not a member network", name, "Give a function of channels or of observation_shape.")
-    return _checked(name, function)
 
-
-def _checked(name: str, function: Callable[..., Parts | nn.Module]) -> Callable[[tuple[int, ...]], Parts]:
-    """A user's network: parts as in :data:`NETWORKS`, or an encoder, :func:`as_input` -> (N, F).
-
-    Its function gets the observations' shape if its argument is called ``observation_shape``, else their channels.
-    """
-
-    def checked(shape: tuple[int, ...]) -> Parts:
-        network = function(shape if "observation_shape" in inspect.signature(function).parameters else shape[-1])
+    def parts(shape: tuple[int, ...]) -> Parts:
+        by_shape = "observation_shape" in inspect.signature(function).parameters
+        network = function(shape if by_shape else shape[-1])
         if isinstance(network, nn.Module):
-            with torch.no_grad():
-                features = network.eval()(as_input(torch.zeros(1, *shape)))
-            kind, size = getattr(features, "dtype", type(features)), tuple(getattr(features, "shape", ()))
-            if kind != torch.float32 or size[:-1] != (1,) or not all(size):
-                fault = f"the network is an encoder that makes {kind} {size} of a state"
-                raise UserError(fault, name, "Make features, float32 (N, F).")
-            return keeping([network]), ()
-        if not (isinstance(network, tuple | list) and len(network) == 2):
-            raise UserError(f"the network gave {network!r}", name, "Give (modules, hidden widths), or an encoder.")
+            return _encoder(name, network, shape)
+        return _layers(name, network)
+
+    return parts
+
+
+def _encoder(name: str, network: nn.Module, shape: tuple[int, ...]) -> Parts:
+    """A user's encoder, :func:`as_input` -> (N, F), as parts."""
+    with torch.no_grad():
+        features = network.eval()(as_input(torch.zeros(1, *shape)))
+    kind = getattr(features, "dtype", type(features))
+    size = tuple(getattr(features, "shape", ()))
+    if kind != torch.float32 or size[:-1] != (1,) or not all(size):
+        fault = f"the network is an encoder that makes {kind} {size} of a state"
+        raise UserError(fault, name, "Make features, float32 (N, F).")
+    return [network], ()
+
+
+def _layers(name: str, network: Any) -> Parts:
+    """A user's parts, if they are some."""
+    try:
         layers, hidden = network
-        widths = bool(hidden) and all(operator.index(width) > 0 for width in hidden)
-        if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
-            fault = f"the network gave layers {layers} and widths {hidden}"
-            raise UserError(fault, name, "Give (modules, hidden widths above 0).")
-        return keeping(layers), tuple(hidden)
-
-    def keeping(layers: Iterable[nn.Module]) -> list[nn.Module]:
-        parts = nn.ModuleList(layers)
-        for kind in {str(tensor.dtype) for tensor in parts.state_dict().values()} - KEPT:
-            raise UserError(f"the network keeps weights of type {kind}", name, "Keep them as float32.")
-        return [*parts]
-
-    return checked
+        widths = tuple(map(int, hidden))
+        proper = min(widths) > 0 and all(isinstance(layer, nn.Module) for layer in layers)
+    except (TypeError, ValueError):
+        proper = False
+    if not proper:
+        raise UserError(f"the network gave {network!r}", name, "Give (modules, hidden widths above 0), or an encoder.")
+    return list(layers), widths
 
 
 def build_network(
@@ -166,45 +183,54 @@ def build_network(
     An unknown network (see :func:`load_network`), or observations that it does not take, for example images too small
     for it, are a ``UserError``.
     """
-    where = f"observation shape {tuple(observation_shape)}"
-    parts_of = None if dtype.names else load_network(name)
-    if dtype.names:
-        fields = fields_of((), dtype).values()
-        names = zip(names_in(network_for(name, dtype)), fields, strict=True)
-        encoders = [build_network(of_key, shape, generator)[:-1] for of_key, (_, shape) in names]
-        by_key = ByKey([as_input(torch.zeros(1, *shape)).shape[1:] for _, shape in fields], encoders)
-        joined: Parts = [by_key], (JOINT,)
-    sizes = (values_in((), dtype),) if dtype.names else as_input(torch.zeros(1, *observation_shape)).shape[1:]
+    by_key = _by_key(name, generator, dtype) if dtype.names else None
+    example = torch.zeros(1, values_in((), dtype)) if by_key else as_input(torch.zeros(1, *observation_shape))
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with DrawsFrom(torch.Generator().manual_seed(seed)):
-        layers, hidden = parts_of(observation_shape) if parts_of else joined
-        # Without numbers (device meta) PyTorch takes longer over what keeps shapes than over the rest of the network.
-        shaping = [layer for layer in layers if not isinstance(layer, nn.BatchNorm2d | nn.ReLU)]
-        features = _features(shaping if name in NETWORKS else layers, *sizes)
+        layers, hidden = ([by_key], (JOINT,)) if by_key else load_network(name)(observation_shape)
+        features = _features(layers, example)
         if features is None:
-            channels = observation_shape[-1]
-            built_in = {other: parts_of(channels)[0] for other, parts_of in NETWORKS.items()}
-            ways = [f"--set network={other}" for other, part in built_in.items() if _features(part, *sizes) is not None]
-            do = f"Give {', '.join(ways)}, larger pictures, or a network of your own (--set network=module:function)."
-            raise UserError(f"the network {name!r} does not take these observations", where, do)
-        if not isinstance(features, Tensor):
-            fault = f"the network {name!r} makes {features!r} of images, not a tensor"  # type: ignore[unreachable]
-            raise UserError(fault, where, "Make a tensor.")
-        layers.append(nn.Flatten())
-        *widths, last = features.numel(), *hidden
-        for inputs, outputs in pairwise((*widths, last)):
-            layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-        layers.append(nn.Linear(last, CLASSES))
-    return nn.Sequential(*layers).train()
+            raise UserError(
+                f"the network {name!r} does not take these observations",
+                f"observation shape {tuple(observation_shape)}",
+                f"Give {_ways(example)}, larger pictures, or a network of your own (--set network=module:function).",
+            )
+        widths = [features.numel(), *hidden]
+        dense: list[nn.Module] = []
+        for inputs, outputs in pairwise(widths):
+            dense += [nn.Linear(inputs, outputs), nn.ReLU()]
+        dense.append(nn.Linear(widths[-1], CLASSES))
+    return nn.Sequential(*layers, nn.Flatten(), *dense).train()
 
 
-def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
-    """A convolutional part's output for an input (1, *sizes); None if it takes none of this size."""
+def _by_key(name: str, generator: torch.Generator | None, dtype: np.dtype[Any]) -> ByKey:
+    """The encoders of mixed observations."""
+    shapes, encoders = [], []
+    names = names_in(network_for(name, dtype))
+    for of_key, (_, shape) in zip(names, fields_of((), dtype).values(), strict=True):
+        shapes.append(as_input(torch.zeros(1, *shape)).shape[1:])
+        encoders.append(build_network(of_key, shape, generator)[:-1])
+    return ByKey(shapes, encoders)
+
+
+def _features(layers: list[nn.Module], example: Tensor) -> Tensor | None:
+    """A convolutional part's output for an input; None if it does not take it."""
     try:
         with torch.no_grad():
-            return nn.Sequential(*layers).eval()(torch.zeros(1, *sizes))
+            features: Tensor = nn.Sequential(*layers).eval()(example)
+            return features
     except (RuntimeError, ValueError):
         return None
+
+
+def _ways(example: Tensor) -> str:
+    """The settings of the built-in networks that take an input."""
+    channels = example.shape[1]
+    ways = []
+    for name, parts_of in NETWORKS.items():
+        if _features(parts_of(channels)[0], example) is not None:
+            ways.append(f"--set network={name}")
+    return ", ".join(ways)
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:
@@ -213,16 +239,15 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
     ReLU is monotone, so the order changes neither values nor gradients, but behind the pooling it has a quarter of the
     work. Only attribution needs the other order.
     """
-    layers = [_reordered_by_key(layer) if isinstance(layer, ByKey) else layer for layer in network]
-    for index, (layer, following) in enumerate(pairwise(network)):
-        if isinstance(layer, nn.ReLU) and isinstance(following, nn.MaxPool2d):
-            layers[index], layers[index + 1] = following, layer
+    layers: list[nn.Module] = []
+    for layer in network:
+        if isinstance(layer, ByKey):
+            layer = ByKey(layer.shapes, map(reordered, layer.encoders))
+        place = len(layers)
+        if isinstance(layer, nn.MaxPool2d) and layers and isinstance(layers[-1], nn.ReLU):
+            place -= 1
+        layers.insert(place, layer)
     return nn.Sequential(*layers)
-
-
-def _reordered_by_key(layer: ByKey) -> ByKey:
-    encoders = layer.encoders
-    return ByKey(layer.shapes, (reordered(each) if isinstance(each, nn.Sequential) else each for each in encoders))
 
 
 def folded(network: nn.Sequential) -> nn.Sequential:
@@ -252,18 +277,27 @@ def as_input(observations: Tensor, dtype: np.dtype[Any] = PICTURE, standard: Seq
     mean and deviation, (numbers,) each, if these are given.
     """
     if dtype.names:
-        rows, place = [], 0
-        for key, (kind, shape) in fields_of((), dtype).items():
-            at = dtype.fields[key][1]  # type: ignore[index]
-            part = observations[:, at : at + dtype[key].itemsize].clone(memory_format=torch.contiguous_format)
-            if kind == NUMBERS:
-                part, place = part.view(torch.float32), place + prod(shape)
-                if standard:
-                    part = standardised(part, *(each[place - prod(shape) : place] for each in standard))
-            rows.append(as_input(part.reshape(-1, *shape)).flatten(1))
-        return torch.cat(rows, dim=1)
+        return _inputs_by_key(observations, dtype, standard)
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
+
+
+def _inputs_by_key(rows: Tensor, dtype: np.dtype[Any], standard: Sequence[Tensor]) -> Tensor:
+    """See :func:`as_input`."""
+    inputs, first = [], 0
+    for key, (kind, shape) in fields_of((), dtype).items():
+        start = dtype.fields[key][1]  # type: ignore[index]
+        part = rows[:, start : start + dtype[key].itemsize].clone(memory_format=torch.contiguous_format)
+        if kind == NUMBERS:
+            part = part.view(torch.float32)
+            last = first + prod(shape)
+            if standard:
+                mean, deviation = standard
+                part = standardised(part, mean[first:last], deviation[first:last])
+            first = last
+        of_key = as_input(part.reshape(-1, *shape))
+        inputs.append(of_key.flatten(1))
+    return torch.cat(inputs, dim=1)
 
 
 def at_once(most: int, shape: tuple[int, ...]) -> int:

@@ -206,12 +206,12 @@ def _positions(values: NDArray[np.int32], among: NDArray[np.int64]) -> NDArray[n
     return np.searchsorted(among, values)
 
 
-def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) -> Tensor:
+def forward(network: nn.Sequential, batch: Batch, counted: bool = True) -> Tensor:
     """The logits (B, 2) of ``network`` for the images of ``batch``, in training or evaluation mode.
 
     Of a network without dense layers the last level's patches, (U, C), which ``batch.last`` places in the images.
-    ``windows_of`` must support its layers. In training mode, BatchNorm's running statistics include the ``counted``
-    groups, all if that is empty.
+    ``windows_of`` must support its layers. In training mode, BatchNorm's running statistics include the first group,
+    and the others where they are ``counted``.
     """
     rows, level = batch.first, -1
     for layer in network:
@@ -238,7 +238,7 @@ def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) 
 
 
 def _batch_norm(
-    layer: nn.BatchNorm2d, rows: Tensor, shares: Sequence[Tensor], places: Sequence[int], counted: Sequence[bool]
+    layer: nn.BatchNorm2d, rows: Tensor, shares: Sequence[Tensor], places: Sequence[int], counted: bool
 ) -> Tensor:
     """BatchNorm of rows (U, C), group after group; each row is weighted by its share of its group's places."""
     if not layer.training:
@@ -247,9 +247,7 @@ def _batch_norm(
         assert running_var is not None
         scale = layer.weight * torch.rsqrt(running_var + layer.eps)
         return torch.addcmul(layer.bias - running_mean * scale, rows, scale)
-    groups = zip(
-        rows.split([share.shape[1] for share in shares]), shares, places, counted or [True] * len(shares), strict=True
-    )
+    groups = zip(rows.split([share.shape[1] for share in shares]), shares, places, [True, counted], strict=False)
     of_groups = [normed(layer, part, share.matmul, count, counts) for part, share, count, counts in groups]
     return of_groups[0] if len(of_groups) == 1 else torch.cat(of_groups)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hypogoal.core.artefacts import Draft
+from hypogoal.core.checkpoints import State
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_log
 from hypogoal.core.processes import prepare
@@ -23,7 +23,7 @@ from hypogoal.hypotheses.networks import load_network, names_in, network_for
 from hypogoal.hypotheses.scores import best_mean_worst, member_scores
 from hypogoal.hypotheses.teacher import load_teacher
 from hypogoal.hypotheses.thresholds import threshold_rule
-from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.training import CHECKED_EVERY, Training
 from hypogoal.hypotheses.views import StateOrigins, own_view
 
 LOOKED_AT = 100  # held-out states of each class, cheap beside training
@@ -64,27 +64,35 @@ def train_sub_goal(
     ``others`` are the files of unlabelled states, if not ``data``.
     """
     prepare()
-    checkpoints = draft.checkpoints(sub_goal)
     dataset = open_dataset(data)
     labelled = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or [data])
+    checkpoints = draft.checkpoints(sub_goal)
+    saved = checkpoints.load()
+    training = Training(
+        labelled.observations,
+        labelled.labels,
+        unlabelled,
+        config,
+        seed_for(seed, "ensemble", sub_goal),
+        origins=StateOrigins(labelled.origins, origins),
+        device=device,
+        saved=saved["training"] if saved else None,
+    )
     log = MetricsLog(log_of(draft, sub_goal), tensorboard)
-    if not checkpoints.saved:
-        log.restore(0)
-    with contextlib.closing(log):
-        ensemble = fit(
-            labelled.observations,
-            labelled.labels,
-            unlabelled,
-            config,
-            seed_for(seed, "ensemble", sub_goal),
-            LossLog(sub_goal, log),
-            origins=StateOrigins(labelled.origins, origins),
-            device=device,
-            checkpoints=checkpoints,
-        )
-    write_ensemble(draft.files, sub_goal, ensemble)
-    return heldout_accuracy(ensemble, dataset, sub_goal)
+    log.restore(saved["log"] if saved else 0)
+
+    def state() -> State:
+        return {"training": training.snapshot(), "log": log.snapshot()}
+
+    with contextlib.closing(log), checkpoints:
+        for step, losses in training.steps():
+            if step % config.steps % CHECKED_EVERY == 0:
+                log.write(sub_goal=sub_goal, step=step, **losses.numbers())
+            checkpoints.offer(state)
+    checkpoints.save(state())
+    write_ensemble(draft.files, sub_goal, training.ensemble)
+    return heldout_accuracy(training.ensemble, dataset, sub_goal)
 
 
 def log_of(draft: Draft, sub_goal: str) -> Path:
@@ -99,26 +107,6 @@ def steps_in(logs: Iterable[Path]) -> int:
         for row in read_log(log)[-1:]:
             steps += row["step"]
     return steps
-
-
-class LossLog(Watcher):
-    """Logs the losses of a sub-goal's ensemble."""
-
-    def __init__(self, sub_goal: str, log: MetricsLog):
-        super().__init__()
-        self.sub_goal, self.log = sub_goal, log
-
-    def report(self, step: int, losses: dict[str, float]) -> None:
-        """Write a line."""
-        self.log.write(sub_goal=self.sub_goal, step=step, **losses)
-
-    def snapshot(self) -> dict[str, Any]:
-        """How long the log is."""
-        return {"log": self.log.snapshot()}
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Cut the log to what it was."""
-        self.log.restore(snapshot["log"])
 
 
 def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dict[str, float]:

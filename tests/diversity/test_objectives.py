@@ -15,6 +15,7 @@ from hypogoal.check.objectives import check_objective, context_of
 from hypogoal.check.verdict import require
 from hypogoal.core.errors import UserError
 from hypogoal.diversity import ENTRY_POINTS, OBJECTIVES, Context, Objective, PairLoss, load_objective
+from hypogoal.hypotheses.fit import disagreement_of
 
 PAIRED = ("dbat", "mutual-information", "none")
 DIVERSE = [name for name in PAIRED if name != "none"]
@@ -31,7 +32,7 @@ def pair_loss_of(name: str) -> PairLoss:
 
 def ensemble_loss(name: str, context: Context) -> float:
     """The loss of an objective of the whole ensemble."""
-    return load_objective(name).losses(context).item()
+    return load_objective(name).loss(context).item()
 
 
 def logits_of(*probabilities: float) -> Tensor:
@@ -223,7 +224,7 @@ def test_dbat_unpaired_weighs_as_dbat_does() -> None:
     """Between members that are all the same it is D-BAT's sum, and so is its gradient."""
     for name in ("dbat-unpaired", "dbat"):
         logits = logits_of(0.9, 0.4, 0.2).expand(4, 3, 2).clone().requires_grad_()
-        loss = load_objective(name).losses(replace(context_of(4, 3), unlabelled=logits)).sum()
+        loss = disagreement_of(load_objective(name), replace(context_of(4, 3), unlabelled=logits))
         (gradient,) = torch.autograd.grad(loss, logits)
         if name == "dbat-unpaired":
             expected = (loss, gradient)
@@ -243,7 +244,8 @@ def test_divdis_moves_members_that_are_positive_everywhere() -> None:
     """Where mutual information has no gradient, the ratio term has one."""
     logits = confident(1, 1, 1, 1, gap=2.0).expand(2, 4, 2).clone().requires_grad_()
     for name, least, most in (("mutual-information", 0.0, 1e-6), ("divdis", 0.1, 10.0)):
-        loss = load_objective(name).losses(replace(batch(*logits), unlabelled=logits, positives=0.01)).sum()
+        context = replace(batch(*logits), unlabelled=logits, positives=0.01)
+        loss = disagreement_of(load_objective(name), context)
         (gradient,) = torch.autograd.grad(loss, logits)
         assert least <= float(gradient[..., 1].sum()) <= most
 
@@ -253,10 +255,9 @@ def test_the_double_sum_by_hand() -> None:
     logits = torch.stack([torch.full((1, 2), float(value)) for value in (1, 2, 4)])
     objective = Objective("distance", pair_loss=lambda a, b: (a - b).abs().mean())
     context = context_of(3, 1)
-    for trained, frozen, expected in ((3, 0, [2 * 1, 2 * 3, 2 * 2]), (1, 2, [1, 3]), (1, 0, [])):
+    for trained, frozen, expected in ((3, 0, 2 * (1 + 3 + 2)), (1, 2, 1 + 3), (2, 1, 2 * 1 + 3 + 2), (1, 0, 0)):
         seen = replace(context, unlabelled=logits[:trained], frozen=logits[trained : trained + frozen])
-        assert objective.losses(seen).tolist() == expected
-        assert len(objective.terms(range(frozen, frozen + trained), frozen)) == len(expected)
+        assert disagreement_of(objective, seen).item() == expected
 
 
 def test_a_function_of_one_argument_is_of_the_whole_ensemble(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -269,13 +270,15 @@ def test_a_function_of_one_argument_is_of_the_whole_ensemble(monkeypatch: pytest
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     context = context_of()
-    loss = load_objective("of_ensembles:spread").losses(context)
-    assert loss.tolist() == [pytest.approx(-context.unlabelled.std(0).mean().item())]
-    assert len(load_objective("of_ensembles:pull").losses(context)) == 3  # pairs
+    loss = disagreement_of(load_objective("of_ensembles:spread"), context)
+    assert loss.item() == pytest.approx(-context.unlabelled.std(0).mean().item())
+    pull, (one, other, third) = load_objective("of_ensembles:pull"), context.unlabelled
+    pairs = pull.loss(one, other) + pull.loss(one, third) + pull.loss(other, third)
+    assert disagreement_of(pull, context).item() == pytest.approx(2 * pairs.item())
     with pytest.raises(UserError, match=r"a diversity objective: of_ensembles:nothing\. Give a pair_loss\(logits_a"):
         load_objective("of_ensembles:nothing")
     with pytest.raises(UserError, match="the diversity objective gave int: of_ensembles:lies"):
-        load_objective("of_ensembles:lies").losses(context)
+        disagreement_of(load_objective("of_ensembles:lies"), context)
 
 
 def test_an_unknown_objective_is_one_clear_line() -> None:

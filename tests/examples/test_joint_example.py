@@ -18,7 +18,7 @@ from hypogoal.core.own_code import load
 from hypogoal.domains.rooms.states import FACTORS, crossed_states, labelled_states, unlabelled_states
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import train
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("shape", "place")
@@ -55,8 +55,8 @@ def followed(ensemble: Ensemble) -> NDArray[np.float64]:
 def test_two_taught_members_own_a_feature_each(joint: ModuleType) -> None:
     """The main claim: labels fit shape and place; taught members own one each, untaught ones do not."""
     *states, _ = rooms(1.0)
-    taught = followed(fit(*states, TAUGHT, 0))
-    untaught = followed(fit(*states, TAUGHT.model_copy(update={"teacher": ""}), 0))
+    taught = followed(train(*states, TAUGHT, 0))
+    untaught = followed(train(*states, TAUGHT.model_copy(update={"teacher": ""}), 0))
     assert (taught.max(0) > 0.9).all() and sorted(taught.argmax(1)) == [0, 1], taught
     assert untaught.max(0).min() < 0.8, untaught
 
@@ -160,7 +160,7 @@ def test_what_does_not_suit_is_one_clear_line(joint: ModuleType) -> None:
     *states, _ = rooms(1.0)
     for members in (1, 9):
         with pytest.raises(ValueError, match=rf"proposals .* from 2 to 8 members, not {members}"):
-            fit(*states, TAUGHT.model_copy(update={"members": members}), 0)
+            train(*states, TAUGHT.model_copy(update={"members": members}), 0)
     observations, labels, unlabelled = states
     with pytest.raises(ValueError, match="too small"):
         joint.teach(observations[:, :7], labels, unlabelled[:, :7], 2, 0)

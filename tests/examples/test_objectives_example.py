@@ -17,7 +17,7 @@ from hypogoal.check.verdict import require
 from hypogoal.diversity import Objective, load_objective
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.scores import mean_disagreement
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import train
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("repulsive", "ace")
@@ -48,14 +48,14 @@ def test_members_that_differ_have_a_lower_loss(name: str) -> None:
     losses = []
     for members in (agreeing, differing):
         context = context_of(3, 4)
-        losses.append(objective(name).losses(replace(context, unlabelled=torch.cat([members, third]))).item())
+        losses.append(objective(name).loss(replace(context, unlabelled=torch.cat([members, third]))).item())
     assert losses[1] < losses[0]
 
 
 def test_repulsive_is_the_kernels_own_repulsion() -> None:
     """Its gradient by one member's gaps is the sum of the kernel's gradients over the kernel's sum."""
     context = context_of(3, 5)
-    (gradient,) = torch.autograd.grad(objective("repulsive").losses(context).sum(), context.unlabelled)
+    (gradient,) = torch.autograd.grad(objective("repulsive").loss(context).sum(), context.unlabelled)
     gaps = (context.unlabelled[..., 1] - context.unlabelled[..., 0]).detach()
     squared = (gaps[:, None] - gaps[None]).square().mean(-1)
     width = squared[~torch.eye(3, dtype=torch.bool)].median() / math.log(3)
@@ -63,14 +63,14 @@ def test_repulsive_is_the_kernels_own_repulsion() -> None:
     for member in range(3):
         away = sum(kernel[member, j] * -2 * (gaps[member] - gaps[j]) / 5 / width for j in range(3))
         torch.testing.assert_close(gradient[member, :, 1], away / kernel[member].sum())
-    assert objective("repulsive").losses(context_of(1)).item() == 0.0
+    assert objective("repulsive").loss(context_of(1)).item() == 0.0
 
 
 def test_ace_asks_for_the_easiest_tenth_only() -> None:
     """Of 20 states the two cheapest of each direction; the others get no gradient."""
     generator = torch.Generator().manual_seed(1)
     logits = torch.randn(2, 20, 2, generator=generator, dtype=torch.float64).requires_grad_()
-    loss = objective("ace").losses(replace(context_of(2, 20), unlabelled=logits)).sum()
+    loss = objective("ace").loss(replace(context_of(2, 20), unlabelled=logits)).sum()
     log = torch.log_softmax(logits.detach(), -1)
     costs = [-(log[0, :, 1] + log[1, :, 0]), -(log[1, :, 1] + log[0, :, 0])]
     assert loss.item() == pytest.approx(sum(float(cost.sort().values[:2].mean()) for cost in costs))
@@ -96,7 +96,7 @@ def test_members_disagree_where_they_agree_without(name: str, weight: float) -> 
     diverse = plain.model_copy(update={"diversity": f"objectives:{name}", "diversity_weight": weight})
     found = []
     for config in (plain, diverse):
-        ensemble = fit(seen, labels, elsewhere, config, seed=1)
+        ensemble = train(seen, labels, elsewhere, config, seed=1)
         assert (ensemble.predictions(seen) == labels[:, None]).mean() > 0.95
         found.append(mean_disagreement(ensemble.predictions(elsewhere)))
     assert found[0] < 0.05 and found[1] > 0.15, found

@@ -24,7 +24,7 @@ from hypogoal.domains.montezuma.emulator import observed_pixel
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import ranking
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import train
 from hypogoal.hypotheses.views import StateOrigins
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
@@ -310,7 +310,7 @@ def test_what_is_saved_is_what_was_trained(tmp_path: Path) -> None:
     split, origins = dataset.labelled("base"), dataset.unlabelled_origins()
     config = resolve(EnsembleConfig, known(EnsembleConfig, artefact.config), stage="train-ensemble")
     seed = seed_for(0, "ensemble", "base")
-    direct = fit(
+    direct = train(
         split.observations,
         split.labels,
         dataset.unlabelled(),
@@ -349,7 +349,7 @@ def test_data_that_do_not_say_enough_are_one_line() -> None:
     for missing in ("y", "ladder"):
         some = {name: values for name, values in origins.items() if name != missing}
         with pytest.raises(UserError, match=f"the data do not say {missing} of each state"):
-            fit(observations, labels, observations, config, 0, origins=StateOrigins(some, origins))
+            train(observations, labels, observations, config, 0, origins=StateOrigins(some, origins))
 
 
 @pytest.mark.atari
@@ -366,7 +366,7 @@ def test_bases_are_recognised_in_rooms_without_labels(tmp_path: Path) -> None:
 
     def trained(**settings: object) -> tuple[object, float]:
         config = EnsembleConfig(members=2, **settings)  # type: ignore[arg-type]
-        ensemble = fit(split.observations, split.labels, unlabelled, config, 0, origins=origins)
+        ensemble = train(split.observations, split.labels, unlabelled, config, 0, origins=origins)
         return ensemble.view, float(ranking(ensemble.predict(unseen.observations), unseen.labels).mean())
 
     window = {"view": "one_room:AgentView", "network": "one_room:network", "view_settings": ("localiser_steps=70",)}

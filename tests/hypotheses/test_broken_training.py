@@ -5,15 +5,17 @@ from pathlib import Path
 import pytest
 import torch
 from breaking import Breaking, Broken
-from test_training import toy
+from test_training import assert_same, toy
 
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.training import Training
 from hypogoal.stages.train_ensemble import train_ensemble
 
 OWN = EnsembleConfig(members=2, steps=12, batch_size=16, diversity_weight=1e-2, view="own_view:Moved")
+TAUGHT = OWN.model_copy(update={"view": "full", "steps": 4, "teacher": "test_teacher:easy_and_hard"})
+SEQUENTIAL = {"schedule": "sequential", "threshold": "unlabelled-split"}
 
 
 def dropping(channels: int) -> tuple[list[torch.nn.Module], tuple[int, ...]]:
@@ -25,41 +27,34 @@ def dropping(channels: int) -> tuple[list[torch.nn.Module], tuple[int, ...]]:
     "config",
     [
         OWN,
-        OWN.model_copy(update={"schedule": "sequential", "threshold": "unlabelled-split"}),
+        OWN.model_copy(update=SEQUENTIAL),
         OWN.model_copy(update={"view": "full", "network": "test_broken_training:dropping"}),
+        TAUGHT,
+        TAUGHT.model_copy(update=SEQUENTIAL),
     ],
-    ids=["own view", "sequential, thresholds", "dropout"],
+    ids=["own view", "sequential, thresholds", "dropout", "teacher", "teacher, sequential"],
 )
 def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G1: weights, BatchNorm, view and thresholds, reports; a finished one is not trained again."""
+    """Spec G1: weights, BatchNorm, view and thresholds, losses; a finished one is not trained again.
+
+    Whoever drew from the global generator before; a teacher is not asked again.
+    """
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    observations, labels, unlabelled = toy()
-
-    def trained(checkpoints: Checkpoints | None) -> tuple[dict[str, torch.Tensor], list[tuple[int, dict[str, float]]]]:
-        reports: list[tuple[int, dict[str, float]]] = []
-        ensemble = fit(
-            observations,
-            labels,
-            unlabelled,
-            config,
-            0,
-            Watcher(lambda *report: reports.append(report)),
-            checkpoints=checkpoints,
-        )
-        return ensemble.state(), reports
-
-    unbroken, expected = trained(None)
-    path = tmp_path / "ensemble.safetensors"
-    for last in (5, 4, 4):
-        with pytest.raises(Broken):
-            trained(Breaking(path, last))
-    resumed, reports = trained(Checkpoints(path))
-    assert reports == expected[-len(reports) :] and reports
-    again, nothing = trained(Checkpoints(path))
-    assert nothing == []
-    for state in (resumed, again):
-        assert state.keys() == unbroken.keys()
-        assert all(torch.equal(state[name], value) for name, value in unbroken.items())
+    unbroken = Training(*toy(), config, 0)
+    expected = {step: losses.numbers() for step, losses in unbroken.steps()}
+    torch.rand(7)
+    checkpoints = Checkpoints(tmp_path / "ensemble.safetensors")
+    total = len(expected)
+    for last in (total // 4, total // 2 + 1, total):
+        training = Training(*toy(), config, 0, saved=checkpoints.load())
+        for step, losses in training.steps():
+            assert losses.numbers() == expected[step]
+            if step == last:
+                checkpoints.save(training.snapshot())
+                break
+    finished = Training(*toy(), config, 0, saved=checkpoints.load())
+    assert list(finished.steps()) == []
+    assert_same(finished.ensemble.state(), unbroken.ensemble.state())
 
 
 def test_a_broken_stage_ends_with_the_same_log(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

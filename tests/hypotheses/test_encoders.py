@@ -21,7 +21,7 @@ from hypogoal.hypotheses.deep_lift import INTEGRATED, attributed, mean_state, me
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import train
 from hypogoal.options.termination import learned_terminations
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -94,7 +94,7 @@ def states(count: int, side: int = 16) -> tuple[NDArray[np.uint8], NDArray[np.bo
 def trained(network: str, config: EnsembleConfig = FEW, side: int = 16, **settings: object) -> Ensemble:
     images, labels = states(24, side)
     config = config.model_copy(update={"network": network, **settings})
-    return fit(images[:12], labels[:12], images[12:], config, 0)
+    return train(images[:12], labels[:12], images[12:], config, 0)
 
 
 @pytest.mark.parametrize("network", ["test_encoders:ResNet18", "frozen_backbone:vit"])
@@ -108,7 +108,7 @@ def test_large_networks_are_members(network: str, tmp_path: Path) -> None:
     images, labels = engine.images(ids), np.arange(len(ids)) % 2 == 0
     config = FEW.model_copy(update={"network": network})
     half = len(ids) // 2
-    ensemble = fit(images[:half], labels[:half], images[half:], config, 0)
+    ensemble = train(images[:half], labels[:half], images[half:], config, 0)
     weights = sum(weight.numel() for weight in ensemble.members[0].parameters())
     assert weights > (2e5 if network.endswith("vit") else 1.1e7)
 

@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from breaking import Breaking, Broken
 from command_line import refuses, run, settings
 from stable_baselines3 import DQN, PPO
 
@@ -22,7 +21,7 @@ from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium.engine import reader_of
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, network_for
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Training, train
 from hypogoal.hypotheses.views import full_view
 from hypogoal.observations import packed, type_of, type_text
 from tests.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
@@ -108,13 +107,13 @@ def test_a_break_leaves_no_trace(tmp_path: Path) -> None:
     (seen, labels), (others, _) = states(40), states(20, 1)
     config = EnsembleConfig(members=2, steps=8, batch_size=16)
 
-    def trained(checkpoints: Checkpoints | None) -> dict[str, torch.Tensor]:
-        return fit(packed(seen), labels, packed(others), config, 0, checkpoints=checkpoints).state()
-
-    unbroken = trained(None)
-    with pytest.raises(Broken):
-        trained(Breaking(tmp_path / "e.safetensors", 5, saves=(3,)))
-    resumed = trained(Checkpoints(tmp_path / "e.safetensors"))
+    unbroken = train(packed(seen), labels, packed(others), config, 0).state()
+    broken = Training(packed(seen), labels, packed(others), config, 0)
+    checkpoints = Checkpoints(tmp_path / "e.safetensors")
+    for step, _ in broken.steps():
+        if step == 3:
+            checkpoints.save(broken.snapshot())
+    resumed = train(packed(seen), labels, packed(others), config, 0, saved=checkpoints.load()).state()
     assert resumed.keys() == unbroken.keys() and {"view.mean", "view.deviation"} <= resumed.keys()
     assert all(torch.equal(resumed[name], value) for name, value in unbroken.items())
 

@@ -11,16 +11,15 @@ from own_view import Moved, Settings
 from test_training import TOY, toy
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import torch_generator
+from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import train
+from hypogoal.hypotheses.views import View
 
 OWN = TOY.model_copy(update={"steps": 3, "view": "own_view:Moved", "view_settings": ("jitter=3",)})
-CPU = torch.device("cpu")
-AS_THEY_ARE = torch.nn.Sequential(torch.nn.Flatten())  # a network whose outputs are its inputs
 
 
 @pytest.fixture(autouse=True)
@@ -28,10 +27,14 @@ def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
 
 
+def members_of(view: View) -> Ensemble:
+    return Ensemble("tiles", (48, 48, view.shape[2]), 1, torch_generator(0, "weights"), view)
+
+
 def test_it_learns_and_comes_back_from_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec A8: what it learned lies beside the members' weights; nobody's code runs because a file names it."""
     observations, labels, unlabelled = toy()
-    ensemble = fit(observations, labels, unlabelled, OWN, seed=0)
+    ensemble = train(observations, labels, unlabelled, OWN, seed=0)
     seen = ensemble.see(observations)
     shade = int(observations.mean())
     assert seen.shape == (64, 42, 42, 3)
@@ -64,48 +67,52 @@ def test_stacked_members_of_several_views() -> None:
 
 
 def test_changes_are_made_in_training_alone() -> None:
-    """Without a generator states are what members see; with one each is changed on its own, as the view says."""
+    """In evaluation mode states are what members see; in training each is changed on its own, as the view says."""
     images = np.arange(48 * 48, dtype=np.uint32).astype(np.uint8).reshape(1, 48, 48, 1).repeat(40, axis=0)
     view = Moved((48, 48, 1), Settings())
-    kept = view.to_change(images)
-    states = TrainingStates(kept, np.arange(40) < 3, kept, AS_THEY_ARE, CPU, view=view)
-    plain = states.forward([AS_THEY_ARE], np.arange(40))[0][0].view(40, 44, 44, 1).numpy()
-    np.testing.assert_allclose(plain, view.see(images) / 255, atol=1e-7)
-    changed = states.forward([AS_THEY_ARE], np.arange(40), changes=[np.random.default_rng(0)])[0][0]
-    expected = view.change(kept, np.random.default_rng(0))
-    np.testing.assert_array_equal(changed.view(40, 44, 44, 1).numpy(), expected)
-    assert len(np.unique(expected[:, 0, 0])) > 30
+    states = TrainingStates(images, np.arange(40) < 3, images, members_of(view), {})
+    states.begin(0)
+    network = torch.nn.Sequential(torch.nn.Flatten())  # its outputs are its inputs
+    plain, none = states.logits([network.eval()], np.arange(40))
+    np.testing.assert_allclose(plain.view(40, 44, 44, 1).numpy(), view.see(images) / 255, atol=1e-7)
+    assert none.shape == (1, 0, 44 * 44)
+    changed, elsewhere = states.logits([network.train()], np.arange(40), np.arange(40))
+    for group, logits in (("labelled", changed), ("unlabelled", elsewhere)):
+        expected = view.change(view.to_change(images), rng_for(0, "changes", group))
+        np.testing.assert_array_equal(logits.view(40, 44, 44, 1).numpy(), expected)
+        assert len(np.unique(expected[:, 0, 0])) > 30
 
 
 def test_changes_decide_what_is_learned() -> None:
     """Another ensemble than from unchanged states, the same one again with the same seed."""
     observations, labels, unlabelled = toy()
-    first, second = (fit(observations, labels, unlabelled, OWN, seed=0).state() for _ in range(2))
+    first, second = (train(observations, labels, unlabelled, OWN, seed=0).state() for _ in range(2))
     plain = OWN.model_copy(update={"view_settings": ("jitter=0",)})
     assert all(torch.equal(first[name], second[name]) for name in first)
-    other = fit(observations, labels, unlabelled, plain, seed=0).state()
+    other = train(observations, labels, unlabelled, plain, seed=0).state()
     assert not torch.equal(first["members.0.0.weight"], other["members.0.0.weight"])
 
 
 def test_methods_see_the_same_labelled_states_changed_the_same_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """Decision 38: methods of one seed share what is random, whatever each does with unlabelled states."""
-    observations, labels, unlabelled = toy()
-    seen: list[list[torch.Tensor]] = []
+    seen: list[list[np.ndarray]] = []
+    change = Moved.change
 
-    def recorded(self: TrainingStates, states: np.ndarray, changes: np.random.Generator | None) -> torch.Tensor:
-        images = inputs(self, states, changes)
-        if states.max() < self.n_labelled and changes is not None:
+    def recorded(self: Moved, batch: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+        images = change(self, batch, rng)
+        if rng is not None:
             seen[-1].append(images)
         return images
 
-    inputs = TrainingStates._images_of
-    monkeypatch.setattr(TrainingStates, "_images_of", recorded)
+    monkeypatch.setattr(Moved, "change", recorded)
     for changes in ({}, {"diversity": "none"}, {"diversity": "none", "unlabelled_bn": False}):
         seen.append([])
-        fit(observations, labels, unlabelled, OWN.model_copy(update=changes), seed=0)
-    assert [len(method) for method in seen] == [3, 3, 3]
-    assert all(torch.equal(one, other) for method in seen[1:] for one, other in zip(seen[0], method, strict=True))
-    assert not torch.equal(seen[0][0], seen[0][1])
+        train(*toy(), OWN.model_copy(update=changes), seed=0)
+    assert [len(method) for method in seen] == [6, 6, 3]
+    labelled = [seen[0][::2], seen[1][::2], seen[2]]
+    np.testing.assert_array_equal(labelled[0], labelled[1])
+    np.testing.assert_array_equal(labelled[0], labelled[2])
+    assert not np.array_equal(seen[0][0], seen[0][2])
 
 
 @pytest.mark.parametrize(("kinds", "each"), [([0, 1, 2], (8, 8)), ([4], (24, 24)), ([0, 1, 2, 4, 8], (4, 5))])
@@ -116,7 +123,7 @@ def test_pools_of_positives_take_turns(kinds: list[int], each: tuple[int, int]) 
     of[:50] = kinds[0]  # more of the first kind than of the others
     images = np.zeros((400, 48, 48, 3), dtype=np.uint8)
     view = Moved((48, 48, 3), Settings())
-    states = TrainingStates(images, labels, images[:100], AS_THEY_ARE, CPU, view=view, origins={"kind": of})
+    states = TrainingStates(images, labels, images[:100], members_of(view), {"kind": of})
     total = np.zeros(len(kinds), dtype=int)
     for labelled, unlabelled in states.batches(EnsembleConfig(batch_size=64, steps=20), 0):
         assert len(labelled) == len(unlabelled) == 64
@@ -144,4 +151,4 @@ def test_what_does_not_fit_is_one_line(changes: dict[str, object], line: str) ->
     """Spec G2."""
     observations, labels, unlabelled = toy()
     with pytest.raises(UserError, match=line):
-        fit(observations, labels, unlabelled, OWN.model_copy(update=changes), seed=0)
+        train(observations, labels, unlabelled, OWN.model_copy(update=changes), seed=0)

@@ -15,7 +15,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import INTEGRATED, attributed, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import train
 
 FAR = np.array([1e4, 3.0, -0.01, 7.0], np.float32)  # numbers of quite different sizes, the last of which never changes
 
@@ -29,7 +29,7 @@ def states(count: int, seed: int, shape: tuple[int, ...] = (4,)) -> tuple[np.nda
 def trained(shape: tuple[int, ...] = (4,), seed: int = 0, **settings: Any) -> Ensemble:
     (seen, labels), (others, _) = states(300, 1, shape), states(200, 2, shape)
     config = EnsembleConfig(**{"members": 2, "diversity_weight": 0.0, **settings})  # type: ignore[arg-type]
-    return fit(seen, labels, others, config, seed)
+    return train(seen, labels, others, config, seed)
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 2), (2, 1, 2)])

@@ -1,18 +1,15 @@
 """Spec G5: ensembles are trained and asked on another device than the CPU."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
 from corridor import Corridor
 from far_device import FAR, FarTensor, far_device
 
-from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Training, train
 from hypogoal.options.termination import learned_terminations
 
 SHAPE = (41, 41, 3)
@@ -28,21 +25,26 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec C, G1: images without repeated patches, which only the CPU looks for: the same bytes."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     rng = np.random.default_rng(0)
     images = rng.integers(256, size=(90, *SHAPE), dtype=np.uint8)
     labels = np.arange(60) < 20
     config = EnsembleConfig(members=2, steps=6, batch_size=8, **CASES[case])  # type: ignore[arg-type]
-    train = partial(fit, images[:60], labels, images[60:], config, 1)
-    near = train()
+    arguments = (images[:60], labels, images[60:], config, 1)
+    near = train(*arguments)
     with far_device(monkeypatch):
-        far = train(device=FAR, checkpoints=Checkpoints(tmp_path / "far"))
+        training = Training(*arguments, device=FAR)
+        for _ in training.steps():
+            snapshot = training.snapshot()
+        far = training.ensemble
         assert all(isinstance(weight, FarTensor) for weight in far.parameters())
         state = far.state()
         np.testing.assert_allclose(far.log_odds(images), near.log_odds(images), atol=1e-6)  # in batches of other sizes
-        again = train(device=FAR, checkpoints=Checkpoints(tmp_path / "far"))  # finished: nothing is left to do
+        finished = Training(*arguments, device=FAR, saved=snapshot)
+        assert list(finished.steps()) == []
+        again = finished.ensemble
     for name, value in near.state().items():
         assert torch.equal(value, state[name]), name
         assert torch.equal(value, again.state()[name]), name

@@ -1,0 +1,135 @@
+"""Eq. (1): members agree with the labels of labelled states, and disagree with each other on unlabelled ones.
+
+The words of the loop:
+
+- A *member* h_i is one of the K networks in training. Its logits (negative, positive) of a state give
+  p_i = softmax(logits)[positive], its probability that the sub-goal holds there.
+- A *batch* has B labelled states x with classes y, half of them positive, and B unlabelled states u, from anywhere.
+- The *labelled loss* of a member is CE_i = sum_b w[y_b] (-log p_i(y_b | x_b)) / sum_b w[y_b], with p_i(1 | x) = p_i
+  and p_i(0 | x) = 1 - p_i. The class weights w are 0.5 and 0.5 in the paper, where it is the plain mean.
+- The *disagreement* of two members is d(h_i, h_m), for D-BAT the mean over the u of
+  -log(p_i (1 - p_m) + (1 - p_i) p_m): low where they differ.
+- The *weight* is alpha, the setting ``diversity_weight``.
+- A *frozen* member f was trained before these (``schedule=sequential``); it gets no gradient.
+- A *step* is a batch, the loss of it, and one update of all members by Adam, which adds ``l2_weight`` times each weight
+  to that weight's gradient.
+
+Eq. (1) as it is computed, summed over members, not averaged::
+
+    loss = sum_i CE_i + alpha ( sum_i sum_{m != i} d(h_i, h_m) + sum_i sum_f d(f, h_i) )
+
+The double sum has each pair twice. i = m is left out: disagreement with itself would push a member to p = 1/2. An
+objective of the whole ensemble stands for the whole bracket. Beyond the paper, a *teacher* with scores s of unlabelled
+states adds sum_i mean_u min(|s_i(u)|, 1) (-log p_i(s_i(u) > 0 | u)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy
+
+from hypogoal.diversity import Context, Objective, load_objective
+from hypogoal.hypotheses.batches import Numbers, TrainingStates
+from hypogoal.hypotheses.config import EnsembleConfig
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The losses of one step, detached: of labelled states (K,), the disagreement (), and their weighted sum ()."""
+
+    labelled: Tensor
+    disagreement: Tensor
+    loss: Tensor
+
+    def numbers(self) -> dict[str, float]:
+        """For a log: ``loss``, ``labelled`` (the mean over members), and ``diversity`` (before its weight)."""
+        return {
+            "loss": self.loss.item(),
+            "labelled": self.labelled.mean().item(),
+            "diversity": self.disagreement.item(),
+        }
+
+
+def fit(
+    members: Sequence[nn.Sequential],
+    frozen: Sequence[nn.Sequential],
+    states: TrainingStates,
+    batches: Iterable[tuple[Numbers, Numbers]],
+    optimiser: torch.optim.Optimizer,
+    config: EnsembleConfig,
+    taught: Tensor | None = None,
+) -> Iterator[Losses]:
+    """Train members, a step for each batch, by Eq. (1); yields after each step.
+
+    Args:
+        members: those in training, in training mode.
+        frozen: those trained earlier.
+        states: the states, with their classes.
+        batches: numbers of the labelled (B,) and of the unlabelled states (N,) of each step.
+        optimiser: of the members' weights.
+        config: diversity and its weight, class weights, ``unlabelled_bn``.
+        taught: a teacher's scores, float (K, M), of all unlabelled states.
+    """
+    objective = objective_of(config)
+    class_weights = torch.tensor([config.class_weight_negative, config.class_weight_positive], device=states.device)
+    frozen_logits = states.frozen_logits(frozen if objective else [])  # (F, M, 2)
+    positives = float(states.labels.mean())
+    for labelled, unlabelled in batches:
+        classes = states.targets(labelled)
+        if objective or taught is not None:
+            on_labelled, on_unlabelled = states.logits(members, labelled, unlabelled, counted=config.unlabelled_bn)
+        else:
+            on_labelled, on_unlabelled = states.logits(members, labelled)  # (K, B, 2), and none
+            if config.unlabelled_bn and len(unlabelled):
+                states.count_in(members, unlabelled)
+        numbers = torch.from_numpy(unlabelled).to(states.device)
+        context = Context(classes, on_labelled, on_unlabelled, frozen_logits[:, numbers], positives)
+
+        labelled_losses = torch.stack([cross_entropy(logits, classes, class_weights) for logits in on_labelled])
+        disagreement = disagreement_of(objective, context)
+        loss = labelled_losses.sum() + config.diversity_weight * disagreement  # Eq. (1)
+        if taught is not None:
+            loss = loss + taught_losses(on_unlabelled, taught[:, numbers]).sum()
+
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        yield Losses(labelled_losses.detach(), disagreement.detach(), loss.detach())
+
+
+def objective_of(config: EnsembleConfig) -> Objective | None:
+    """The objective; None where it has no effect: no weight, ``none``, or pairs of a single member."""
+    objective = load_objective(config.diversity)
+    if config.diversity_weight > 0 and objective.acts(config.members):
+        return objective
+    return None
+
+
+def disagreement_of(objective: Objective | None, context: Context) -> Tensor:
+    """The bracket of Eq. (1), float (): the double sum over pairs, or what an objective of the whole ensemble gives."""
+    members = context.unlabelled
+    if objective is None:
+        return members.new_zeros(())
+    if objective.ensemble_loss is not None:
+        return objective.loss(context)
+    losses = [2.0 * objective.loss(first, second) for first, second in combinations(members, 2)]
+    losses += [objective.loss(earlier, member) for member, earlier in product(members, context.frozen)]
+    if not losses:
+        return members.new_zeros(())
+    return torch.stack(losses).sum()
+
+
+def taught_losses(logits: Tensor, scores: Tensor) -> Tensor:
+    """What members (K, N, 2) still have to learn of a teacher's scores (K, N), float (K,).
+
+    Where its score is above 0 a member should predict positive. From 1 on either side, a score weighs as much as a
+    label, in proportion below.
+    """
+    errors = cross_entropy(logits.mT, (scores > 0).long(), reduction="none")
+    weights = scores.abs().clamp(max=1.0)
+    return (errors * weights).mean(1)
