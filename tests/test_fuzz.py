@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.attacks.fuzz import FORMATS, Sandbox, outcome_of
+from tests.attacks.fuzz import CHANGES, Sandbox, outcome_of
 
 CASES = range(1, 16)  # case 0 takes seconds
 
@@ -14,7 +14,7 @@ def box(corridor_run: Path, tmp_path: Path) -> Sandbox:
     return Sandbox(corridor_run, tmp_path)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", CHANGES)
 def test_every_case_is_read_or_refused(box: Sandbox, name: str) -> None:
     """Spec G2: nothing but ``UserError`` of one line, and nothing outside the output is touched."""
     outcomes = {outcome_of(box, name, case) for case in CASES}

@@ -1,6 +1,6 @@
 """Spec G2: thousands of damaged files, read by what reads them.
 
-``python -m tests.attacks.fuzz RUN [--cases 5000] [--format json] [--case 17]`` damages files of a whole run, a
+``python -m tests.attacks.fuzz RUN [--cases 5000] [--format json]`` damages files of a whole run, a
 case at a time, and prints a table. A case fails when something else than success or a ``UserError`` of one line comes
 of it, when it takes longer than ``SECONDS``, or when a file outside its output changes.
 """
@@ -25,52 +25,22 @@ from pathlib import Path
 import hypogoal
 from hypogoal import cli
 from hypogoal.core.artefacts import MANIFEST, sha256_of
+from hypogoal.core.config import MODELS
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.named import EXPERIMENTS
-from tests.attacks.mutations import (
-    Rng,
-    bytes_changed,
-    hdf5_changed,
-    json_changed,
-    table_changed,
-    toml_changed,
-    weights_changed,
-)
+from tests.attacks import mutations
+from tests.attacks.kills import TOY
 
 SECONDS = 300.0  # of the clock: the machine may be busy
-CHANGES: dict[str, Callable[[bytes, Rng], bytes]] = {
-    ".json": json_changed,
-    ".jsonl": bytes_changed,
-    ".csv": table_changed,
-    ".safetensors": weights_changed,
+CHANGES: dict[str, Callable[[bytes, random.Random], bytes]] = {
+    "json": mutations.json_changed,
+    "jsonl": mutations.bytes_changed,
+    "csv": mutations.table_changed,
+    "safetensors": mutations.weights_changed,
+    "h5": mutations.hdf5_changed,
+    "toml": mutations.toml_changed,
 }
-STAGES = ("collect", "train-ensemble", "train-options", "train-meta")
-PRESET = b"""[collect]
-door_label = "open"
-unlabelled_seeds = [1, 2]
-[train-ensemble]
-members = 3
-sub_goals = ["go-to-goal"]
-network = "doorkey"
-[train-options]
-option_timeout = 9
-[train-meta]
-head = "gaussian"
-termination = "learned"
-[run]
-layout_seeds = [100, 101]
-"""
-EXPERIMENT = b"""format = 1
-evaluate = false
-axes = { seed = [0, 1], layout = "210-211" }
-[[cells]]
-name = "data"
-command = "collect doorkey --set heldout_layouts=1"
-[[cells]]
-name = "ensemble"
-axes = ["seed"]
-command = "train-ensemble {data} --seed {seed}"
-"""
+PRESET = Path(cli.__file__).with_name("presets") / "doorkey" / "demo.toml"
 Call = Callable[[], object]
 
 
@@ -84,10 +54,7 @@ class Sandbox:
 
     def look(self) -> dict[Path, tuple[int, int]]:
         """Size and time of the last change of what no case may change."""
-        found = {}
-        for path in self.whole.rglob("*"):
-            found[path] = path.stat().st_size, path.stat().st_mtime_ns
-        return found
+        return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in self.whole.rglob("*")}
 
     def fresh(self) -> None:
         """The whole run again, and an empty output."""
@@ -139,43 +106,36 @@ def readers(box: Sandbox, path: Path, case: int) -> list[Call]:
     return calls
 
 
-def fuzz_files(suffix: str, box: Sandbox, rng: Rng, case: int) -> bool:
-    """One file of this kind is damaged; the manifest mostly says that it was so from the start."""
-    path = rng.choice(sorted(box.run.rglob(f"*{suffix}")))
-    if suffix == ".h5":
-        hdf5_changed(path, rng)
-    else:
-        path.write_bytes(CHANGES[suffix](path.read_bytes(), rng))
+def damaged_file(name: str, box: Sandbox, rng: random.Random, case: int) -> list[Call]:
+    """One file of a format is damaged; the manifest mostly says that it was so from the start."""
+    path = rng.choice(sorted(box.run.rglob(f"*.{name}")))
+    path.write_bytes(CHANGES[name](path.read_bytes(), rng))
     manifest = path.parent / MANIFEST
     if path.name != MANIFEST and manifest.exists() and rng.random() < 0.9:
         content = json.loads(manifest.read_bytes())
         content["files"][path.name] = sha256_of(path)
         manifest.write_text(json.dumps(content), encoding="utf-8")
-    return is_accepted(readers(box, path, case))
+    return readers(box, path, case)
 
 
-def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
+def damaged_toml(box: Sandbox, rng: random.Random, case: int) -> list[Call]:
     """A preset, for every stage and experiment; an experiment."""
     path, out = box.out / "own.toml", ("--out", box.out / "run", "--dry-run")
-    path.write_bytes(toml_changed(PRESET if case % 2 else EXPERIMENT, rng))
+    path.write_bytes(CHANGES["toml"](PRESET.read_bytes() if case % 2 else TOY.encode(), rng))
     if case % 2 == 0:
-        return is_accepted([partial(command, "run", path, *out)])
-    calls: list[Call] = [partial(command, "config", stage, "--preset", path) for stage in STAGES]
-    calls += [partial(command, "run", name, "--preset", path, *out) for name in EXPERIMENTS]
-    return is_accepted(calls)
-
-
-FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {"toml": fuzz_toml}
-for _suffix in (*CHANGES, ".h5"):
-    FORMATS[_suffix.removeprefix(".")] = partial(fuzz_files, _suffix)
+        return [partial(command, "run", path, *out)]
+    calls: list[Call] = [partial(command, "config", stage, "--preset", path) for stage in MODELS]
+    return calls + [partial(command, "run", name, "--preset", path, *out) for name in EXPERIMENTS]
 
 
 def outcome_of(box: Sandbox, name: str, case: int) -> str:
     """``accepted``, ``refused``, or what was wrong."""
     box.fresh()
     begun = time.monotonic()
+    rng = random.Random(f"{name} {case}")
     try:
-        outcome = "accepted" if FORMATS[name](box, random.Random(f"{name} {case}"), case) else "refused"
+        calls = damaged_toml(box, rng, case) if name == "toml" else damaged_file(name, box, rng, case)
+        outcome = "accepted" if is_accepted(calls) else "refused"
     except Exception as error:  # noqa: BLE001 - that nothing else escapes is what is tested
         outcome = f"{type(error).__name__}: {error}"
     if box.look() != box.before:
@@ -189,17 +149,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--cases", type=int, default=5000)
-    parser.add_argument("--format", action="append", choices=FORMATS)
-    parser.add_argument("--case", type=int)
+    parser.add_argument("--format", action="append", choices=CHANGES)
     given = parser.parse_args()
     faulthandler.enable()  # a library may crash on damaged bytes
     failed = 0
     print("| format | accepted | refused | failed |\n|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         box = Sandbox(given.run, Path(folder))
-        for name in given.format or FORMATS:
+        for name in given.format or CHANGES:
             counts: Counter[str] = Counter()
-            for case in range(given.cases) if given.case is None else [given.case]:
+            for case in range(given.cases):
                 outcome = outcome_of(box, name, case)
                 if outcome not in ("accepted", "refused"):
                     print(f"{name} case {case}: {outcome}", file=sys.stderr, flush=True)

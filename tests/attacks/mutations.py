@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import random
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -116,20 +116,18 @@ def weights_changed(data: bytes, rng: Rng) -> bytes:
     return len(text).to_bytes(8, "little") + text + body
 
 
-def hdf5_changed(path: Path, rng: Rng) -> None:
-    """Change an HDF5 file: its bytes, an attribute, or a dataset that becomes another."""
+def hdf5_changed(data: bytes, rng: Rng) -> bytes:
+    """Bytes of an HDF5 file, an attribute, or a dataset that becomes another."""
     if rng.random() < 0.4:
-        path.write_bytes(bytes_changed(path.read_bytes(), rng))
-        return
-    with h5py.File(path, "r+") as file:
+        return bytes_changed(data, rng)
+    stored = io.BytesIO(data)
+    with h5py.File(stored, "r+") as file:
         names: list[str] = []
         file.visit(names.append)
         if file.attrs and rng.random() < 0.4:
             name, odd = rng.choice(sorted(file.attrs)), rng.choice(ODD)
-            del file.attrs[name]
-            if rng.random() < 0.8:
-                file.attrs[name] = odd if isinstance(odd, int | float) else json.dumps(odd)
-            return
+            file.attrs[name] = odd if isinstance(odd, int | float) else json.dumps(odd)
+            return _content(file, stored)
         name = rng.choice(names)
         values = np.atleast_1d(file[name][()]) if isinstance(file[name], h5py.Dataset) else np.zeros(3)
         others: list[Any] = [  # nothing, fewer states, other shapes, types and values
@@ -140,3 +138,9 @@ def hdf5_changed(path: Path, rng: Rng) -> None:
         other = rng.choice(others)
         if other is not None:
             file[name] = other
+        return _content(file, stored)
+
+
+def _content(file: h5py.File, stored: io.BytesIO) -> bytes:
+    file.flush()
+    return stored.getvalue()
