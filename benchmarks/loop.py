@@ -71,10 +71,10 @@ def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: s
 
     The share of verdicts goes to ``shares``. The loop alone: start-up and the measures at the end are not counted.
     """
-    from hypogoal.meta import training
     from hypogoal.options.termination import Terminations
+    from hypogoal.stages import agents
 
-    judge, loop, played = Terminations.of, training.train, 0.0
+    judge, loop, played = Terminations.of, agents.train, 0.0
     judging = [0.0]
 
     def of(self: Terminations, ids: Any) -> Any:
@@ -83,15 +83,16 @@ def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: s
         judging[0] += time.process_time() - begin
         return found
 
-    def train(*given: Any) -> None:
+    def train(*given: Any) -> bool:
         nonlocal played
         judging[0] = 0.0
         begin = time.process_time()
-        loop(*given)
+        solved = loop(*given)
         played = time.process_time() - begin
+        return solved
 
     changes = (word for pair in ("random_episodes=1", f"steps={steps}", *more) for word in ("--set", pair))
-    with patch.object(Terminations, "of", of), patch.object(training, "train", train):
+    with patch.object(Terminations, "of", of), patch.object(agents, "train", train):
         out = folder / f"out-{time.monotonic_ns()}"
         quietly("train-meta", ensemble, "--layout-seed", LAYOUT, "--out", out, *changes)
     shares.append(judging[0] / played)

@@ -24,7 +24,8 @@ from hypogoal.learners.baselines.agents import train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.learners.episodes import EpisodeRecorder
-from hypogoal.meta.training import judged
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.training import Setup, of_ensemble
 from hypogoal.options.tables import Episodes
 from hypogoal.options.termination import Terminations
 from studies.figure6 import read_agents, rows_of, training_numbers, write_agents
@@ -76,7 +77,8 @@ def paid(ensemble: Artefact, layout: int, steps: int) -> Run:
     chosen = HYPERPARAMETERS["ppo", "tuned"]
     world = DOMAIN.world(ensemble.config["domain_config"])
     engine = DOMAIN.make_engine(layout, chosen.environments, BaselineConfig.max_episode_steps, **world)
-    env = PaidEnv(engine, judged(engine, ensemble.path, ensemble.config, device))
+    setup = Setup(DOMAIN, ensemble.config, ensemble.path, TrainMetaConfig.of(), ensemble.seed, device)
+    env = PaidEnv(engine, of_ensemble(setup, engine))
     train(env, chosen, steps, ensemble.seed)
     place = {"layout_seed": layout, "shortest_path": engine.shortest_path()}
     return Run("baseline", METHOD, ensemble.seed, {"steps": steps}, Episodes.of_rows(env.episodes), place)

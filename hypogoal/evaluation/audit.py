@@ -26,7 +26,8 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.episodes import Frame
-from hypogoal.observations import PICTURE, Standard
+from hypogoal.meta.training import Setup
+from hypogoal.observations import PICTURE, Standard, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
 from hypogoal.options.tables import read_table
@@ -92,16 +93,16 @@ def target_of(name: str, sub_goal: str, member: int, domain: str, device: str) -
     return Target(classify, threshold, ensemble.view.standard, world, [source.path])
 
 
-def terminations_of(
-    classify: Classifier, edges: NDArray[np.float64], termination: str
-) -> Callable[[Engine], Terminations]:
+def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Setup, Engine], Terminations]:
     """A function of an engine: options that end at a classifier's positives, one for each threshold (K,)."""
 
-    def ends(engine: Engine) -> Terminations:
+    def ends(setup: Setup, engine: Engine) -> Terminations:
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-            return np.repeat(classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
+            return np.repeat(target.classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
 
-        rule, length = rule_of(termination)
+        if engine.observation_dtype != PICTURE:
+            engine.standard = target.standard or standard_of(engine.observation_shape)
+        rule, length = rule_of(setup.config.termination)
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 
     return ends

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.config import known, resolve
-from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import ONE_LAYOUT, assemble, continue_with
+from hypogoal.meta.training import Setup, assemble, continue_with
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import FILE
 from hypogoal.options.loop import OptionLoop, Transitions
@@ -59,14 +58,12 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
         "save_visited": 0,
         "chooser": artefact.config["chooser"] if artefact.kind == "meta" else "random",
     }
-    domain, others = load_domain(artefact.config["domain"]), None
     if layouts:
-        if not domain.many_layouts:
-            raise UserError(ONE_LAYOUT, domain.name, "Evaluate without --layouts.")
         settings |= {"layouts": "", "cap": 0.0}
-        others = Layouts(layouts)
     config = resolve(TrainMetaConfig, settings, {}, stage="train-meta")
-    loop = assemble(domain, source.path, source.config, config, seed, layouts=others)
+    domain = load_domain(artefact.config["domain"])
+    setup = Setup(domain, source.config, source.path, config, seed)
+    loop = assemble(setup, layouts=Layouts(layouts) if layouts else None)
     continue_with(loop, artefact)
     if FILE in files:
         loop.chooser.load(load_tensors(artefact.path / FILE))

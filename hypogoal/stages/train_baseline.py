@@ -27,11 +27,11 @@ def train_baseline(
     """
     from hypogoal.core.processes import prepare
     from hypogoal.core.tensors import save_tensors
-    from hypogoal.domains.base import load_domain, require_one_kind
+    from hypogoal.domains.base import load_domain
+    from hypogoal.learners import world
     from hypogoal.learners.baselines import agents
     from hypogoal.learners.baselines.engine_env import EngineEnv
     from hypogoal.learners.baselines.settings import HYPERPARAMETERS
-    from hypogoal.meta import training
     from hypogoal.observations import PICTURE, standard_of
     from hypogoal.options.tables import Episodes
 
@@ -40,28 +40,16 @@ def train_baseline(
     played = load_domain(domain)
     dataset = _states_of(domain, data) if data else None
     collected = played.world(dataset.config) if dataset else {}
-    world = training.played_world(played, collected, config.world)
-    begins = {}
-    if config.start:
-        training.check_start(played, config.start)
-        begins["start"] = config.start
+    played_world = world.played_world(played, collected, config)
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = chosen.model_copy(update={"environments": config.environments})
-    engine = played.make_engine(
-        config.layout_seed,
-        chosen.environments,
-        config.max_episode_steps,
-        **world,
-        **begins,
-    )
-    training.cut(engine, config.cap)
-    require_one_kind(engine)
+    engine = world.make_engine(played, played_world, config, chosen.environments)
     if dataset and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, dataset.unlabelled())
     settings = config.model_dump(mode="json") | {
         "domain": domain,
-        "domain_config": world,
+        "domain_config": played_world,
         "environments": chosen.environments,
         "hyperparameters": chosen.model_dump(mode="json"),
     }
@@ -74,7 +62,7 @@ def train_baseline(
         work.progress.update(config.steps)
         Episodes.of_rows(env.episodes).write(files)
         save_tensors(files / "policy.safetensors", agents.weights(agent))
-        training.write_layout(files, engine, config.layout_seed, config.random_episodes, call.seed, **begins)
+        world.write_layout(files, engine, config, call.seed)
     numbers = env.episodes.counts() | env.episodes.recent()
     return Done(outcome_of(numbers), ("evaluate", call.out.parent))
 

@@ -39,37 +39,18 @@ def train_meta(
     from hypogoal.domains.base import load_domain
     from hypogoal.meta import training
     from hypogoal.options.tables import Episodes
+    from hypogoal.stages import agents
 
     device = prepare(call.device)
     source = open_artefact(ensemble, "ensemble")
     practice = open_artefact(options, "options") if options else None
-    config = call.settings(source.config["domain"], training.inherited(practice, FIXED))
-    if practice:
-        training.check_fit(practice, source, config, FIXED)
+    config = agents.settings_of(call, source, practice, FIXED)
     domain = load_domain(source.config["domain"])
-    training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
-    settings = training.description(
-        domain,
-        source.config,
-        config,
-        **_steps_spent(practice),
-    )
+    setup = training.Setup(domain, source.config, source.path, config, call.seed, device)
+    settings = agents.description(setup, **_steps_spent(practice))
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training(
-        "meta",
-        settings,
-        inputs,
-        config.steps,
-        tensorboard,
-    ) as work:
-        loop = training.assemble(
-            domain,
-            source.path,
-            source.config,
-            config,
-            call.seed,
-            device,
-        )
+    with call.training("meta", settings, inputs, config.steps, tensorboard) as work:
+        loop = training.assemble(setup)
         if practice:
             training.continue_with(loop, practice)
             begun_at = practice.config.get("ended_at", practice.config["steps"])
@@ -77,21 +58,7 @@ def train_meta(
             if all(practice.config[key] == settings[key] for key in WORLD):
                 practised = Episodes.read(practice.path / Episodes.FILE)
                 loop.recorder.episodes.extend(practised.rows())
-        training.train(
-            loop,
-            config.steps,
-            work.log,
-            work.progress,
-            work.draft.checkpoints(),
-        )
-        training.write_trained(
-            work.draft.files,
-            loop,
-            domain,
-            source.config,
-            config,
-            call.seed,
-        )
+        agents.learn(work, setup, loop, config.steps)
     episodes = loop.recorder.episodes
     numbers = episodes.counts() | episodes.recent()
     return Done(outcome_of(numbers), ("evaluate", call.out.parent))

@@ -28,59 +28,29 @@ def train_options(
     """
     from hypogoal.core.processes import prepare
     from hypogoal.domains.base import load_domain
+    from hypogoal.evaluation.nearness import distances_of
     from hypogoal.meta import training
+    from hypogoal.stages import agents
 
     device = prepare(call.device)
     source = open_artefact(ensemble, "ensemble")
     practice = open_artefact(options, "options") if options else None
-    config = call.settings(source.config["domain"], training.inherited(practice, FIXED))
-    if practice:
-        training.check_fit(practice, source, config, FIXED)
+    config = agents.settings_of(call, source, practice, FIXED)
     domain = load_domain(source.config["domain"])
-    training.start_arguments(domain, config, 1, call.seed)  # refuse an impossible start before any work
-    count = training.options_of(source.config, config)
+    setup = training.Setup(domain, source.config, source.path, config, call.seed, device)
     steps = config.steps
     if config.restart_options:
-        steps *= count
-    settings = training.description(domain, source.config, config, steps=steps)
+        steps *= setup.options
+    settings = agents.description(setup, steps=steps)
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training(
-        "options",
-        settings,
-        inputs,
-        steps,
-        tensorboard,
-    ) as work:
-        loop = training.assemble(
-            domain,
-            source.path,
-            source.config,
-            config,
-            call.seed,
-            device,
-        )
+    with call.training("options", settings, inputs, steps, tensorboard) as work:
+        loop = training.assemble(setup)
         if practice:
             training.continue_with(loop, practice)
-        solved = training.train(
-            loop,
-            steps,
-            work.log,
-            work.progress,
-            work.draft.checkpoints(),
-            config.until,
-        )
+        solved = agents.learn(work, setup, loop, steps, config.until)
         if domain.measures and loop.engine.position_names:
-            sub_goals = source.config["sub_goals"]
-            away = training.distances_of(domain, sub_goals, count // len(sub_goals))
+            away = distances_of(domain, source.config["sub_goals"], setup.members)
             loop.recorder.write_executions(work.draft.files, away)
-        training.write_trained(
-            work.draft.files,
-            loop,
-            domain,
-            source.config,
-            config,
-            call.seed,
-        )
         if config.until:
             settings["ended_at"] = loop.recorder.steps  # for the manifest, which comes last
             settings["until_reached"] = solved

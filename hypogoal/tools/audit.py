@@ -43,11 +43,13 @@ def audit(
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation.audit import lines_of, random_play, report_of, target_of, terminations_of
     from hypogoal.evaluation.numbers import plain
-    from hypogoal.meta import training
+    from hypogoal.learners.world import columns_of
+    from hypogoal.meta.training import Setup, assemble
+    from hypogoal.stages import agents
 
     device = prepare(call.device)
     config, world = call.settings(domain), load_domain(domain)
-    [column] = training.columns_of(world, [sub_goal], "Give another --sub-goal.")
+    [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
     member = member or 0
     target = target_of(classifier, sub_goal, member, domain, device)
     edges = _edges(config, target.threshold)
@@ -57,26 +59,11 @@ def audit(
         "domain": domain,
         "domain_config": target.domain_config,
     }
-    training.start_arguments(world, config, 1, call.seed)  # refuse an impossible start before any work
-    settings = training.description(world, ensemble_config, config, classifier=classifier, member=member)
-    ends = terminations_of(target.classify, np.array(edges), config.termination)
+    setup = Setup(world, ensemble_config, Path(), config, call.seed, device)
+    settings = agents.description(setup, classifier=classifier, member=member)
     with call.training("audit", settings, target.inputs, config.steps) as work:
-        loop = training.assemble(world, Path(), ensemble_config, config, call.seed, device, ends, target.standard)
-        training.train(
-            loop,
-            config.steps,
-            work.log,
-            work.progress,
-            work.draft.checkpoints(),
-        )
-        training.write_trained(
-            work.draft.files,
-            loop,
-            world,
-            ensemble_config,
-            config,
-            call.seed,
-        )
+        loop = assemble(setup, terminations_of(target, np.array(edges)))
+        agents.learn(work, setup, loop, config.steps)
         report = report_of(loop, edges, world.sub_goals, work.draft.files)
         report["random_play"] = random_play(loop, column, rng_for(call.seed, "random-play"))
         text = json.dumps(plain(report), indent=1)

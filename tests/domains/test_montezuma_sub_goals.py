@@ -17,7 +17,7 @@ from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, CLIMBED_UP, arrives, labels_of, make_starts
 from hypogoal.domains.montezuma.ladders import LADDERS, TOPS, Ladder
 from hypogoal.domains.montezuma.sub_goals import ENEMIES, FACT_BYTES, GATES, LASER_Y, SUB_GOALS, Enemy
-from hypogoal.meta.training import distances_of
+from hypogoal.evaluation.nearness import distances_of
 
 pytestmark = pytest.mark.atari
 

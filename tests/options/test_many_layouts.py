@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import corridor_env
@@ -18,7 +19,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import play
 from hypogoal.evaluation.zero_shot import alone, shortest_ways
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds
-from hypogoal.meta.training import start_arguments
+from hypogoal.meta.training import Setup, make_engine
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.loop import OptionLoop
@@ -155,7 +156,9 @@ def test_the_setting_says_how_many_or_which() -> None:
     for text in ("200", "", "two", "0"):
         with pytest.raises(UserError):
             layout_seeds(text)
+    about, config = {"sub_goals": ["left-end"], "members": 1, "domain_config": {}}, TrainOptionsConfig.of(layouts="2")
     with pytest.raises(UserError, match="plays one layout"):
-        start_arguments(own_domain.DOMAIN, TrainOptionsConfig(layouts="2"), 1, 0)
-    assert start_arguments(corridor_env.DOMAIN, TrainOptionsConfig(layouts="2"), 1, 0)["layouts"].seeds == (100, 101)
+        make_engine(Setup(own_domain.DOMAIN, about, Path(), config, 0))
+    layouts = make_engine(Setup(corridor_env.DOMAIN, about, Path(), config, 0)).layouts
+    assert layouts is not None and layouts.seeds == (100, 101)
     assert Corridor(1).layouts is None

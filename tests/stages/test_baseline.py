@@ -14,12 +14,14 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Step
+from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings, PPOSettings
-from hypogoal.meta.training import cut
+from hypogoal.learners.config import WorldConfig
+from hypogoal.learners.world import make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
 EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 6_000, ("dqn", "tuned"): 12_000}
@@ -204,8 +206,6 @@ def test_it_plays_in_the_agents_world(tmp_path):
 
 def test_a_cap_that_is_a_whole_number_of_steps_is_that_many():
     """2.2 times 25 steps is 55; floating point makes it a little more, and the next whole number 56."""
-    engine = DoorKeyEngine(8, 1)
-    assert engine.shortest_path() == 25
+    assert DoorKeyEngine(8, 1).shortest_path() == 25
     for cap, steps in ((2.2, 55), (2.21, 56), (1.0, 25)):
-        cut(engine, cap)
-        assert engine.max_steps == steps
+        assert make_engine(DOMAIN, {}, WorldConfig(layout_seed=8, cap=cap), 1).max_steps == steps

@@ -19,7 +19,7 @@ from hypogoal.domains.doorkey.env import SUB_GOALS
 from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 from hypogoal.evaluation.selection import practised
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.meta.training import assemble
+from hypogoal.meta.training import Setup, assemble
 
 FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
 
@@ -121,7 +121,7 @@ def test_oracles_of_some_sub_goals_are_of_those(own_run: Path) -> None:
     """Spec E6: one option for each of the ensemble's sub-goals, in its order, and no other."""
     about = {**open_artefact(own_run / "ensemble").config, "sub_goals": ["go-to-goal", "collect-red-key"]}
     config = TrainOptionsConfig.of(termination="oracle")
-    loop = assemble(DOMAIN, own_run / "ensemble", about, config, seed=0)
+    loop = assemble(Setup(DOMAIN, about, own_run / "ensemble", config, seed=0))
     ids = loop.engine.reachable()
     assert ids is not None and loop.terminations.options == 2
     columns = [SUB_GOALS.index("go-to-goal"), SUB_GOALS.index("collect-red-key")]

@@ -1,0 +1,53 @@
+"""How near executions of options come to their true sub-goals, where the domain knows them (Spec F3, H5)."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Domain, Engine
+from hypogoal.learners.world import columns_of
+from hypogoal.meta.training import Setup
+from hypogoal.options.termination import ORACLE
+
+Near = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]]
+Distances = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
+
+
+def nearness(setup: Setup, engine: Engine) -> Near | None:
+    """A function of states (n,) and options (n,): whether these options' true sub-goals hold, or nearly.
+
+    None where the domain lacks a sub-goal of the ensemble, or options end at true sub-goals. Labels of another form
+    than bool (n, G) are a ``UserError``.
+    """
+    domain, sub_goals = setup.domain, setup.source["sub_goals"]
+    labels, shape = engine.labels(engine.ids[:1]), (1, len(domain.sub_goals))
+    if labels.shape != shape or labels.dtype != np.bool_:
+        fault = f"the engine's labels of one state are {labels.dtype} {labels.shape}, not bool {shape}"
+        raise UserError(fault, type(engine).__name__, "Give a truth value for each state and sub-goal.")
+    if setup.config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
+        return None
+    columns = np.repeat(columns_of(domain, sub_goals), setup.members)
+    away = distances_of(domain, sub_goals, setup.members)
+
+    def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
+        holds = engine.labels(ids)[np.arange(len(ids)), columns[options]]
+        if not (domain.measures and engine.position_names):
+            return holds
+        return holds | (away(engine.positions(ids), options) <= domain.near)
+
+    return near
+
+
+def distances_of(domain: Domain, sub_goals: Sequence[str], members: int) -> Distances:
+    """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
+
+    def away(positions: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.int64]:
+        distances = np.zeros(len(options), np.int64)
+        for number, sub_goal in enumerate(sub_goals):
+            of_goal = options // members == number
+            distances[of_goal] = domain.distance_to(sub_goal, positions[of_goal])
+        return distances
+
+    return away

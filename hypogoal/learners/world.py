@@ -1,0 +1,90 @@
+"""The world that an agent plays in, with options or with primitive actions (Spec D4, E5, F5)."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hypogoal.core.config import assigned
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Domain, Engine, require_one_kind
+from hypogoal.learners.config import WorldConfig
+
+
+def played_world(domain: Domain, collected: Mapping[str, Any], config: WorldConfig) -> dict[str, Any]:
+    """The domain's settings with which states were collected, after the changes that the setting ``world`` names."""
+    changes = assigned(config.world)
+    for name in changes:
+        if name not in domain.engine_settings:
+            names = ", ".join(domain.engine_settings) or "none"
+            raise UserError(f"the world of {domain.name} has no such setting", f"world={name}", f"It has {names}.")
+    return {**collected, **domain.world(changes)}
+
+
+def make_engine(
+    domain: Domain, world: Mapping[str, Any], config: WorldConfig, environments: int, **begins: Any
+) -> Engine:
+    """So many environments of a :func:`played_world`; ``begins`` are arguments that say where episodes begin.
+
+    A start that the domain does not name, and a cap where nobody knows the shortest path, are a ``UserError``.
+    """
+    if config.start:
+        check_start(domain, config.start)
+        begins["start"] = config.start
+    arguments = domain.world(world) | begins
+    engine = domain.make_engine(config.layout_seed, environments, config.max_episode_steps, **arguments)
+    require_one_kind(engine)
+    if config.cap:
+        shortest = engine.shortest_path()
+        if shortest is None:
+            raise UserError("this layout's shortest path is not known", f"cap={config.cap:g}", "Give cap=0.")
+        engine.max_steps = math.ceil(round(config.cap * shortest, 9))  # 1.1 * 50 is 55
+    return engine
+
+
+def check_start(domain: Domain, start: str) -> None:
+    """Refuse (``UserError``) a start that the domain does not name."""
+    if not domain.starts:
+        raise UserError(f"{domain.name} has no named starts", f"start={start}", "Leave it out.")
+    for name in start.split(",") if domain.many_starts else [start]:
+        if name not in domain.starts:
+            fault = "unknown start" if name else "where are episodes to begin?"
+            raise UserError(fault, name or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
+
+
+def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
+    """The columns of these sub-goals among the domain's; a ``UserError`` that says ``do`` where it lacks one."""
+    for sub_goal in sub_goals:
+        if sub_goal not in domain.sub_goals:
+            fault, names = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
+            raise UserError(fault, sub_goal, f"It knows of {names}. {do}")
+    return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
+
+
+def write_layout(folder: Path, engine: Engine, config: WorldConfig, seed: int, layouts: str = "") -> None:
+    """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
+
+    Both are null where the engine does not know them; then no episode of random play is played. ``layouts`` are those
+    of many; last comes the step at which each room was first reached, where there are rooms.
+    """
+    success = None
+    if config.random_episodes:
+        success = engine.random_success(config.random_episodes, rng_for(seed, "random-play"))
+    places = {"start": config.start, "layouts": layouts}
+    facts: dict[str, Any] = {
+        **{name: place for name, place in places.items() if place},
+        "layout_seed": config.layout_seed,
+        "shortest_path": engine.shortest_path(),
+        "random_success": success,
+        "random_episodes": 0 if success is None else config.random_episodes,
+    }
+    if "room" in engine.position_names:
+        positions = engine.positions(np.arange(engine.n_states))
+        rooms, first = np.unique(positions[:, engine.position_names.index("room")], return_index=True)
+        steps = np.maximum(first - len(engine.starts) + 1, 0)
+        facts["rooms"] = dict(zip(map(str, rooms.tolist()), steps.tolist(), strict=True))
+    (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")
