@@ -267,7 +267,6 @@ def failing(name: str) -> OSError:
         (RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"), "there is not enough memory", 2),
         (failing("ENOSPC"), "No space left on device: here. Free some disk space", 2),
         (failing("EACCES"), "Permission denied: here. Ask for permission", 2),
-        (failing("EMFILE"), "Too many open files: here. Allow more open files (ulimit -n)", 2),
         (KeyError("x"), "internal error: KeyError: 'x'. Run again with --debug", 1),
     ],
 )

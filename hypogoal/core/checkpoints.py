@@ -40,7 +40,7 @@ class Checkpoints:
     """One state on disk, replaced from time to time; the old file stays until the new one is whole.
 
     As a context, Ctrl-C and SIGTERM wait for the next :meth:`offer`, which saves and raises ``KeyboardInterrupt`` with
-    the signal's number. A second Ctrl-C does not wait. With ``path`` None nothing is ever saved.
+    the signal's number. With ``path`` None nothing is ever saved.
     """
 
     def __init__(self, path: Path | None):
@@ -66,8 +66,6 @@ class Checkpoints:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self._signal = number
-        if number == signal.SIGINT:
-            signal.signal(number, self._handlers[number])
 
     @property
     def saved(self) -> bool:

@@ -20,10 +20,6 @@ class UserError(Exception):
         super().__init__(printable(line))
 
 
-class Killed(UserError):
-    """A process of a stage was killed from outside."""
-
-
 class Complete(UserError):
     """The output to resume is complete and as requested: the command line says so and exits with code 0.
 

@@ -6,7 +6,6 @@ environment. Installed packages with an entry point need neither.
 """
 
 import errno
-import importlib
 import os
 import re
 import shlex
@@ -16,12 +15,14 @@ import traceback
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from hypogoal.core.errors import NumericalError, UserError
 
 TRUST = "--trust"
 VARIABLE = "HYPOGOAL_TRUST"
+NAMES = re.compile(r"--trust|[\w.]+:[^\W\d][\w.]*")
 MOST_QUOTED = 200  # characters of an error
 PACKAGE = str(Path(__file__).parents[1]) + os.sep
 LIBRARIES = (*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), PACKAGE, "<")
@@ -29,15 +30,13 @@ NO_MEMORY = "there is not enough memory. Choose a smaller batch_size, fewer envi
 REMEDIES = {
     errno.ENOSPC: "Free some disk space and run it again.",
     errno.EACCES: "Ask for permission, or choose another path.",
-    errno.EMFILE: "Allow more open files (ulimit -n).",
 }
 _allowed: set[str] = set()  # what the user typed in this process
 
 
 def names_in(text: object) -> list[str]:
     """The names ``module:object`` in a word of a command, as in ``network=mine:net``, and ``--trust``."""
-    parts = [re.sub(r":\d+$", "", part.strip()) for part in re.split("[,=]", str(text))]  # termination=mine:Rule:3
-    return [part for part in parts if ":" in part or part == TRUST]
+    return NAMES.findall(str(text))
 
 
 def allow(texts: Iterable[object]) -> None:
@@ -73,20 +72,16 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
     """
     places = dict(built_in)
     if name not in places:
-        places.update({entry.name: entry.value for entry in metadata.entry_points(group=group)})
-    target = places.get(name, name)
-    if name not in places and ":" not in name:
-        names = ", ".join(sorted(places))
-        do = f"Choose one of {names}, or give module:object." if places else "Give module:object."
-        raise UserError(f"unknown {role}", name, do)
+        places |= {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     if name not in places:
+        if ":" not in name:
+            known = ", ".join([*sorted(places), "module:object"])
+            raise UserError(f"unknown {role}", name, f"Choose one of: {known}.")
         require_trust(name, role)
         if os.getcwd() not in sys.path:
             sys.path.append(os.getcwd())
-    module, _, attribute = target.partition(":")
     try:
-        loaded = importlib.import_module(module)
-        return getattr(loaded, attribute) if attribute else loaded
+        return resolve_name(places.get(name, name))
     except (Exception, SystemExit) as error:
         where = f"{name} {place_of(error)}".strip()
         raise UserError(f"the {role} cannot be loaded: {_line(error)}", where, "--debug shows more.") from error

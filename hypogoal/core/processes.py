@@ -14,7 +14,7 @@ from types import FrameType
 from typing import TypeVar
 
 from hypogoal.core import own_code
-from hypogoal.core.errors import Killed, UserError
+from hypogoal.core.errors import UserError
 
 T = TypeVar("T")
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use
@@ -45,10 +45,7 @@ def cores() -> int:
 
 def allowed(wanted: int) -> int:
     """How many of ``wanted`` processes (0: one per core) a stage may use."""
-    if not wanted:
-        return cores()
-    setting = os.environ.get(CORES, "")
-    return min(wanted, max(1, int(setting))) if setting.isdigit() else wanted
+    return min(wanted, int(os.environ.get(CORES, wanted))) if wanted else cores()
 
 
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
@@ -63,20 +60,17 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
             done(number, task())
         return
     others = set(multiprocessing.active_children())
-    processes: set[BaseProcess] = set()
     # Spawned, not forked: a fork would copy the caller's threads and locks.
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (own_code.environment(),))
     try:
-        futures = {}
-        for number, task in enumerate(tasks):
-            futures[pool.submit(_run, task)] = number
-            processes |= set(multiprocessing.active_children()) - others
+        futures = {pool.submit(_run, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
-        pool.shutdown()  # waits for their exit codes
-        raise _broken(processes) from None
+        fault = "a process was killed by the system, most likely for lack of memory, or could not start"
+        do = "Run fewer at once: --set workers=1. In a script call hypogoal below 'if __name__ == \"__main__\":'."
+        raise UserError(fault, None, do) from None
     except BaseException:
         _terminate(set(multiprocessing.active_children()) - others)
         raise
@@ -111,27 +105,16 @@ def _run(task: Callable[[], T]) -> T:
         raise user_error from error
 
 
-def _broken(processes: Iterable[BaseProcess]) -> Killed:
-    """Why a pool broke."""
-    if 1 in [process.exitcode for process in processes]:
-        do = "In a script call hypogoal below 'if __name__ == \"__main__\":', or give workers=1."
-        return Killed("a process of the stage could not start", None, do)
-    do = f"Run fewer at once: --set workers=1, or {CORES}=1 in the environment."
-    return Killed("a process was killed by the system, most likely for lack of memory", None, do)
-
-
 def _terminate(processes: Iterable[BaseProcess]) -> None:
     """Repeated until none is left.
 
     A process that fails holds the first signal back for a checkpoint that never comes, and then waits for the next task
     behind a lock that a killed process may hold.
     """
-    left = list(processes)
-    while left:
+    while left := [process for process in processes if process.is_alive()]:
         for process in left:
             process.terminate()
         left[0].join(RESEND_SECONDS)
-        left = [process for process in left if process.is_alive()]
 
 
 def peak_memory() -> int:
@@ -144,12 +127,6 @@ def peak_memory() -> int:
     return 1024 * max(kilobytes)
 
 
-def check_device(device: str) -> None:
-    """Refuse (``UserError``) an unknown device; whether this machine has it is not checked."""
-    if device not in DEVICES:
-        raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
-
-
 def prepare(device: str = "auto") -> str:
     """Use one torch thread without denormal numbers; returns ``cpu`` or ``cuda`` (``auto`` is the CPU, decision 26).
 
@@ -160,11 +137,10 @@ def prepare(device: str = "auto") -> str:
     """
     import torch
 
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        os._exit(1)  # it imports a script that calls a stage without main guard: see _broken
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    check_device(device)
+    if device not in DEVICES:
+        raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
     if device == "cuda" and not torch.cuda.is_available():
         installed = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
         raise UserError("torch finds no GPU", installed, "Use --device cpu, or see docs/gpu.md.")

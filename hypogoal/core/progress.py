@@ -1,4 +1,4 @@
-"""Progress on stderr, a bar in a terminal and plain lines elsewhere; and the log of a training."""
+"""Progress on stderr, one line that changes in a terminal and lines elsewhere; and the log of a training."""
 
 import json
 import math
@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.terminal import say, screen
 
-LINE_SECONDS = 10.0  # between plain lines
+LINE_SECONDS = 10.0  # between lines
+REDRAW_SECONDS = 0.2  # of the line in a terminal
 LOOK_SECONDS = 1.0
+WIDTH = 79  # of the line in a terminal
 
 
 class Progress:
@@ -29,31 +30,25 @@ class Progress:
         self.title, self.total, self.quiet = title, total, quiet
         self.done = 0
         self._terminal = sys.stderr.isatty()
-        self._bar = _bar()
-        self._bar.add_task(title, total=total, numbers="")
-        self._task = self._bar.tasks[0]
-        self._said = time.monotonic()
+        self._numbers = ""
+        self.resume(0)
 
     def __enter__(self) -> Self:
-        if self._terminal and not self.quiet:
-            self._bar.start()
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        if self.quiet:
-            return
-        if self._terminal:
-            self._bar.stop()
-        elif kind is None and self.done:
-            self._line(f"done in {duration(self._task.elapsed)}")
+        if kind is None and self.done:
+            self._say(f"done in {duration(time.monotonic() - self._began)}")
+        if self._terminal and not self.quiet:
+            print(file=sys.stderr)
 
     def resume(self, done: int) -> None:
         """``done`` units were done before this moment."""
-        self.done = done
-        self._bar.reset(self._task.id, completed=done)
+        self.done = self._before = done
+        self._began = self._said = time.monotonic()
 
     def advance(self, n: int = 1, **numbers: float) -> None:
-        """``n`` more units are done; ``numbers`` are shown beside the bar, except NaN (not known yet)."""
+        """``n`` more units are done; ``numbers`` are shown beside them, except NaN (not known yet)."""
         self.update(self.done + n, **numbers)
 
     def update(self, done: int, **numbers: float) -> None:
@@ -61,12 +56,15 @@ class Progress:
         self.done = done
         if numbers:
             texts = [f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value)]
-            self._task.fields["numbers"] = " ".join(texts)
-        self._bar.update(self._task.id, completed=done, total=self.total)
-        overdue = time.monotonic() - self._said >= LINE_SECONDS
-        if overdue and done < self.total and not self.quiet and not self._terminal:
-            left = f"{duration(self._task.time_remaining)} left"
-            self._line(" ".join([left, self._task.fields["numbers"]]))
+            self._numbers = " ".join(texts)
+        now = time.monotonic()
+        pause = REDRAW_SECONDS if self._terminal else LINE_SECONDS
+        if now - self._said < pause or done >= self.total:
+            return
+        self._said = now
+        fresh = done - self._before
+        left = duration((now - self._began) * (self.total - done) / fresh) if fresh else "?"
+        self._say(f"{left} left {self._numbers}")
 
     @contextmanager
     def following(self, count: Callable[[], int]) -> Iterator[None]:
@@ -86,28 +84,19 @@ class Progress:
             thread.join()
         self.update(count())
 
-    def _line(self, text: str) -> None:
-        self._said = time.monotonic()
-        say(f"{self.title}: {self.done}/{self.total}, {text}", err=True)
+    def _say(self, text: str) -> None:
+        line = f"{self.title}: {self.done}/{self.total}, {text}"
+        if self.quiet:
+            return
+        if self._terminal:
+            print(f"\r{line[:WIDTH]:{WIDTH}}", end="", file=sys.stderr, flush=True)
+        else:
+            print(line, file=sys.stderr, flush=True)
 
 
-def _bar() -> Any:
-    """rich's bar, which also knows how much time is left where it is not drawn."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=10),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[numbers]}", markup=False),
-        TimeRemainingColumn(),
-        console=screen(err=True),
-    )
-
-
-def duration(seconds: float | None) -> str:
-    """Seconds as ``0:01:30``; None, not known yet, as a question mark."""
-    return "?" if seconds is None else str(timedelta(seconds=round(seconds)))
+def duration(seconds: float) -> str:
+    """Seconds as ``0:01:30``."""
+    return str(timedelta(seconds=round(seconds)))
 
 
 class MetricsLog:
