@@ -13,6 +13,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from math import prod
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,8 +23,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import NO_FILE_NAME, plain_name, plain_names, replacing
-from hypogoal.core.terminal import amount
+from hypogoal.core.files import NO_FILE_NAME, plain_names, replacing
 from hypogoal.observations import (
     NUMBERS,
     DType,
@@ -32,7 +32,6 @@ from hypogoal.observations import (
     digest,
     fields_of,
     numbers_of,
-    spread_rows,
     type_of,
     type_text,
 )
@@ -83,7 +82,7 @@ class Collected:
     unlabelled: States
     heldout: States
     features: tuple[str, ...] = ()
-    channels: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # frames and colours of stacks, by key
+    channels: Mapping[str, Sequence[int]] = field(default_factory=dict)  # frames and colours of stacks, by key
 
 
 class Unmet(UserError):
@@ -92,38 +91,37 @@ class Unmet(UserError):
 
 def leave_out(states: States, *training: Observations) -> States:
     """Spec B3: the states without those that look like one of ``training``, observations (M, ...) each."""
-    digests: set[bytes] = set()
-    for observations in training:
-        digests.update(map(digest, observations))
-    return states.where(np.array([digest(observation) not in digests for observation in states.observations], np.bool_))
+    digests = set(map(digest, chain(*training)))
+    apart = [digest(observation) not in digests for observation in states.observations]
+    return states.where(np.array(apart, np.bool_))
 
 
 def joined(parts: Sequence[States]) -> States:
-    """The states of all parts, with the origins that the first part has."""
+    """The states of all parts, with the origins that all of them have."""
+    if len(parts) == 1:
+        return parts[0]
     observations = np.concatenate([part.observations for part in parts])
     labels = np.concatenate([part.labels for part in parts])
+    shared = set.intersection(*(set(part.origins) for part in parts))
     origins = {}
-    for name in parts[0].origins:
+    for name in sorted(shared):
         origins[name] = np.concatenate([part.origins[name] for part in parts])
     return States(observations, labels, origins)
 
 
-def hard_to_learn(labels: Labels, goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal with few positives, or few negatives, among the labels (N, G)."""
+def doubts_of(labelled: Labels, heldout: Labels, goals: Sequence[str]) -> list[str]:
+    """A line for each sub-goal with few labelled states of a class, or one class only among the held-out states.
+
+    Labels are (N, G) and (M, G).
+    """
     lines = []
-    for goal, column in zip(goals, labels.T, strict=True):
-        positives = int(column.sum())
-        fewest = min(positives, len(column) - positives)
-        if fewest < max(FEW, RARE * len(column)):
-            few = amount(fewest, "positive" if fewest == positives else "negative")
-            lines.append(f"{goal} has {few} among {len(column)} labelled states: classes are unbalanced")
+    for goal, column, judged in zip(goals, labelled.T, heldout.T, strict=True):
+        positives, count = int(column.sum()), len(column)
+        if min(positives, count - positives) < max(FEW, RARE * count):
+            lines.append(f"{goal} has {positives} positives among {count} labelled states: classes are unbalanced")
+        if len(np.unique(judged)) < 2:
+            lines.append(f"{goal} has one class only in the held-out states, so it cannot be judged by them")
     return lines
-
-
-def hard_to_judge(labels: Labels, goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal with one class only among the held-out labels (N, G)."""
-    one_class = [goal for goal, column in zip(goals, labels.T, strict=True) if len(np.unique(column)) < 2]
-    return [f"{goal} has one class only in the held-out states, so it cannot be judged by them" for goal in one_class]
 
 
 def require_classes(labels: Labels, goals: Sequence[str], where: object, do: str) -> None:
@@ -136,15 +134,9 @@ def require_classes(labels: Labels, goals: Sequence[str], where: object, do: str
 
 def require_names(sub_goals: Sequence[str]) -> None:
     """Refuse (``UserError``) an empty list, names that are not plain, and names that differ only in case."""
-    if not sub_goals:
-        raise UserError("there are no sub-goals", None, "Give at least one, with a name.")
-    for name in sub_goals:
-        if not plain_name(name):
-            do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, dot or space first or last."
-            raise UserError("a sub-goal's name must be usable as a file name", repr(name), do)
     if not plain_names(sub_goals):
-        do = "Give them different names; some file systems ignore case."
-        raise UserError("two sub-goals have the same name", ", ".join(sub_goals), do)
+        do = f"Give one or more, different even if case is ignored, without separators and {' '.join(NO_FILE_NAME)}"
+        raise UserError("sub-goals need names that are usable as file names", ", ".join(sub_goals), f"{do}.")
 
 
 @contextlib.contextmanager
@@ -227,38 +219,28 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
     labels = np.asarray(states.labels)
     if labels.dtype != np.bool_:  # NumPy turns the text 'False' into True
         raise UserError(f"the domain's {split} labels are not truth values", labels.dtype, "Give bool (N, sub-goals).")
-    first = None
+    first = file.create_group(f"{split}/{sub_goals[0]}")
+    _write_states(first, states)
     for sub_goal, column in zip(sub_goals, labels.T, strict=True):
-        group = file.create_group(f"{split}/{sub_goal}")
-        if first is None:
-            first = group
-            _write_states(group, states)
-        else:
-            for name in ("observations", "origin"):
-                if name in first:
-                    group[name] = first[name]
-        _write_column(group, "labels", column)
+        group = file.require_group(f"{split}/{sub_goal}")
+        for name in first.keys() - group.keys() - {"labels"}:
+            group[name] = first[name]
+        _store(group, "labels", column)
 
 
 def _write_states(group: Any, states: States) -> None:
-    _store(group, "observations", states.observations, 64, compression="gzip", compression_opts=1)
+    _store(group, "observations", states.observations)
     for name, values in states.origins.items():
-        if not plain_name(name):
-            raise UserError("an origin's name must be usable as a file name", repr(name), "Leave out separators.")
-        _write_column(group, f"origin/{name}", values)
+        _store(group, f"origin/{name}", values)
 
 
-def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
-    """Write one value per state, with checksums: a flipped label, unlike a damaged compressed state, is still valid."""
-    _store(group, name, values, COLUMN_CHUNK, fletcher32=True)
-
-
-def _store(group: Any, name: str, values: NDArray[Any], most: int, **filters: Any) -> None:
-    """Write a dataset in chunks of up to ``most`` states."""
-    if len(values):
-        filters["chunks"] = (min(most, len(values)), *values.shape[1:])
-    else:
-        filters.clear()
+def _store(group: Any, name: str, values: NDArray[Any]) -> None:
+    """Write observations compressed, other values with checksums: a flipped label would still be valid."""
+    filters: dict[str, Any] = {}
+    if len(values) and name == "observations":
+        filters = {"chunks": (min(64, len(values)), *values.shape[1:]), "compression": "gzip", "compression_opts": 1}
+    elif len(values):
+        filters = {"chunks": (min(COLUMN_CHUNK, len(values)),), "fletcher32": True}
     group.create_dataset(name, data=values, **filters)
 
 
@@ -273,7 +255,7 @@ class Dataset:
     sub_goals: tuple[str, ...]
     observation_shape: Shape
     observation_dtype: DType
-    channels: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # see :class:`Collected`
+    channels: Mapping[str, Sequence[int]] = field(default_factory=dict)  # see :class:`Collected`
 
     @property
     def observation_bytes(self) -> int:
@@ -306,25 +288,13 @@ class Dataset:
 
     def unlabelled(self) -> Observations:
         """The unlabelled states: uint8 or float32 (M, *obs)."""
-        with reading(self.path) as file:
-            return self._observations(file["unlabelled"])
+        return self.unlabelled_states().observations
 
-    def unlabelled_origins(self) -> dict[str, Integers]:
-        """The unlabelled states' origins, int64 (M,) by name; empty if the file has none."""
+    def unlabelled_states(self) -> States:
+        """The same with their origins, if the file has any, and no labels, (M, 0)."""
         with reading(self.path) as file:
-            return _origins(file["unlabelled"])
-
-    def some_heldout(self, sub_goal: str, count: int) -> States:
-        """Up to ``count`` held-out states of each class of a sub-goal, spread over the file; reads no others."""
-        with reading(self.path) as file:
-            group = file[f"heldout/{sub_goal}"]
-            labels = _labels(group)
-            picked = []
-            for rows in (np.flatnonzero(labels), np.flatnonzero(~labels)):
-                picked.append(rows[spread_rows(len(rows), count)])
-            rows = np.sort(np.concatenate(picked))
-            origins = {name: values[rows] for name, values in _origins(group).items()}
-            return States(self._observations(group, rows), labels[rows], origins)
+            observations = self._observations(file["unlabelled"])
+            return States(observations, np.zeros((len(observations), 0), np.bool_), _origins(file["unlabelled"]))
 
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""
@@ -344,11 +314,11 @@ class Dataset:
             group = file[f"{split}/{sub_goal}"]
             return States(self._observations(group), _labels(group), _origins(group))
 
-    def _observations(self, group: Any, rows: Any = ()) -> Observations:
+    def _observations(self, group: Any) -> Observations:
         data = group["observations"]
         if data.shape[1:] != self.observation_shape or data.dtype != self.observation_dtype:
             raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
-        values = data[rows]
+        values = data[()]
         if not np.isfinite(numbers_of(values)).all():
             raise ValueError(f"{data.name} has numbers that are not finite")
         return values
@@ -385,11 +355,6 @@ def _names_of_fields(dtype: DType) -> list[str]:
     return names
 
 
-def _channels_in(text: str) -> dict[str, tuple[int, int]]:
-    """Frames and colours of stacks by key, from an attribute."""
-    return {key: (frames, colours) for key, (frames, colours) in json.loads(text).items()}
-
-
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
     with reading(path) as file:
@@ -410,19 +375,7 @@ def open_dataset(path: Path) -> Dataset:
             sub_goals=tuple(json.loads(attributes["sub_goals"])),
             observation_shape=tuple(json.loads(attributes["observation_shape"])),
             observation_dtype=type_of(attributes["observation_dtype"]),
-            channels=_channels_in(attributes.get("channels", "{}")),
+            channels=json.loads(attributes.get("channels", "{}")),
         )
         require_names(dataset.sub_goals)
     return dataset
-
-
-def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, Integers]]:
-    """The unlabelled states (M, *obs) of some files one after another, and the origins that all files have."""
-    datasets = [open_dataset(file) for file in files]
-    states = [dataset.unlabelled() for dataset in datasets]
-    origins = [dataset.unlabelled_origins() for dataset in datasets]
-    shared = set.intersection(*map(set, origins))
-    together = {}
-    for name in sorted(shared):
-        together[name] = np.concatenate([each[name] for each in origins])
-    return states[0] if len(states) == 1 else np.concatenate(states), together

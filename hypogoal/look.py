@@ -2,11 +2,10 @@
 
 import shlex
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from hypogoal.core.artefacts import AGAIN, LOG, MANIFEST, Artefact, Draft
+from hypogoal.core.artefacts import AGAIN, LOG, MANIFEST, Artefact, Draft, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_log, visible
 from hypogoal.core.terminal import drawn
@@ -19,7 +18,7 @@ EVALUATION = "evaluation"
 # Of a training's log, in the order in which they are shown, with their titles.
 LOGGED = {"labelled": "labelled loss"}
 LOGGED |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
-Rows = Sequence[Mapping[str, Any]]
+Details: TypeAlias = dict[str, Any]  # a description
 
 
 def parts_of(path: Path) -> list[Path]:
@@ -47,7 +46,7 @@ def unfinished(path: Path) -> list[str]:
     return lines
 
 
-def describe(path: Path) -> dict[str, Any]:
+def describe(path: Path) -> Details:
     """Kind, numbers, settings and inputs of a data file or an artefact; of a run those of all its parts."""
     parts = parts_of(path)
     if parts != [path]:
@@ -55,16 +54,24 @@ def describe(path: Path) -> dict[str, Any]:
     if path.is_dir():
         return {"path": str(path), "numbers": numbers_of(path), **Artefact(path).manifest.model_dump()}
     dataset = open_dataset(path)
-    details = {"path": str(path), "kind": "data", "numbers": dataset.counts(), "domain": dataset.domain}
-    details["observations"] = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
-    return {**details, "seed": dataset.seed, "config": dataset.config}
+    observations = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
+    return {
+        "path": str(path),
+        "kind": "data",
+        "numbers": dataset.counts(),
+        "domain": dataset.domain,
+        "observations": observations,
+        "seed": dataset.seed,
+        "config": dataset.config,
+    }
 
 
-def numbers_of(path: Path) -> dict[str, Any]:
+def numbers_of(path: Path) -> Details:
     """The numbers of an evaluation or a comparison; of a training the last in its log, means over sub-goals."""
     if (path / METRICS).is_file():
+        open_artefact(path)
         return dict(read_json(path / METRICS, "the numbers are", AGAIN))
-    last = {str(row.get("sub_goal")): row for row in read_log(path / LOG)}
+    last = {row.get("sub_goal"): row for row in read_log(path / LOG)}
     numbers = {}
     for name, title in LOGGED.items():
         values = [row[name] for row in last.values() if isinstance(row.get(name), int | float)]
@@ -73,16 +80,18 @@ def numbers_of(path: Path) -> dict[str, Any]:
     return numbers
 
 
-def outcome(details: Mapping[str, Any]) -> list[str]:
+def outcome(details: Details) -> list[str]:
     """The numbers of what is described, as lines; of a run those of its evaluation."""
     kind, numbers = details["kind"], details.get("numbers", {})
     if kind == "run":
-        evaluations = [part for part in details["parts"] if part["kind"] == EVALUATION]
-        return outcome(evaluations[0]) if evaluations else []
+        evaluations = [outcome(part) for part in details["parts"] if part["kind"] == EVALUATION]
+        return evaluations[0] if evaluations else []
     if kind == "data":
         return count_lines(numbers)
     if kind == EVALUATION:
-        return _summary(numbers, details["path"])
+        from hypogoal.evaluation.questions import summary_table
+
+        return [line.rstrip() for line in drawn(summary_table(numbers), WIDTH).splitlines()]
     if kind == "comparison":
         from hypogoal.evaluation.compare import winners
 
@@ -90,17 +99,7 @@ def outcome(details: Mapping[str, Any]) -> list[str]:
     return []
 
 
-def _summary(numbers: Mapping[str, Any], path: str) -> list[str]:
-    from hypogoal.evaluation.questions import summary_table
-
-    try:
-        table = drawn(summary_table(numbers), WIDTH)
-        return [line.rstrip() for line in table.splitlines()]
-    except (LookupError, TypeError, ValueError, AttributeError):
-        raise UserError("the evaluation's numbers are damaged", path, "Evaluate the run again.") from None
-
-
-def count_lines(counts: Mapping[str, Any]) -> list[str]:
+def count_lines(counts: Details) -> list[str]:
     """The numbers of states of a data file."""
     text = []
     for split in SPLITS:
@@ -109,34 +108,33 @@ def count_lines(counts: Mapping[str, Any]) -> list[str]:
     return [*text, f"{'unlabelled':30} {counts['unlabelled']:7} states"]
 
 
-def lines(details: Mapping[str, Any]) -> list[str]:
+def lines(details: Details) -> list[str]:
     """What it is, a training's numbers, then how it was made, a fact a line; of a run a line for each part."""
     if details["kind"] == "run":
         return [lines(part)[0] for part in details["parts"]]
     facts = dict(details)
-    numbers, config = facts.pop("numbers"), facts.pop("config")
     heading = f"{facts.pop('path')}: {facts.pop('kind')}"
-    logged = [f"{name} {round(value, 4):g}" for name, value in numbers.items() if isinstance(value, float)]
-    text = [f"{heading}; {', '.join(logged)}" if logged else heading]
-    texts: dict[str, Callable[[Any], str]] = {"command": shlex.join, "inputs": _inputs, "files": ", ".join}
+    numbers = facts.pop("numbers").items()
+    logged = [f"{name} {round(value, 4):g}" for name, value in numbers if isinstance(value, float)]
+    text = ["; ".join([heading, ", ".join(logged)]) if logged else heading]
+    config = facts.pop("config")
+    if "inputs" in facts:
+        facts["inputs"] = [f"{entry['kind']} {entry['path']}" for entry in facts["inputs"]]
+        facts["command"] = shlex.join(facts["command"])
+        facts["files"] = [*facts["files"]]
     for name, value in facts.items():
-        as_text = texts.get(name, _typed)
-        text += _wrapped(f"{name}: {as_text(value)}")
+        text += _wrapped(f"{name}: {_typed(value, ', ')}")
     text.append("config:")
     for name, value in config.items():
-        text += _wrapped(f"  {name}={_typed(value)}")
+        text += _wrapped(f"  {name}={_typed(value, ',')}")
     return text
 
 
-def _inputs(entries: Rows) -> str:
-    return ", ".join(f"{entry['kind']} {entry['path']}" for entry in entries)
-
-
-def _typed(value: Any) -> str:
+def _typed(value: Any, comma: str) -> str:
     """A value as one would type it."""
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_typed(part)}" for name, part in value.items())
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+        value = [f"{name} {part}" for name, part in value.items()]
+    return comma.join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _wrapped(line: str) -> list[str]:
@@ -148,29 +146,24 @@ def faults(path: Path) -> list[str]:
     lines = []
     for part in parts_of(path):
         try:
-            lines += [f"{part}: {fault}" for fault in _faults_of(part, path.resolve())]
+            if part.is_file():
+                _read_all(part)
+            else:
+                lines += [f"{part}: {fault}" for fault in Artefact(part).faults(within=path.resolve())]
         except UserError as error:
             lines.append(str(error))
     return lines
 
 
-def _faults_of(part: Path, within: Path) -> list[str]:
-    if part.is_file():
-        _read_all(part)
-        return []
-    return Artefact(part).faults(within)
-
-
 def _read_all(data: Path) -> None:
     dataset = open_dataset(data)
     dataset.unlabelled()
-    dataset.unlabelled_origins()
     for goal in dataset.sub_goals:
         dataset.labelled(goal)
         dataset.heldout(goal)
 
 
-def stale(run: Path) -> list[dict[str, Any]]:
+def stale(run: Path) -> list[Details]:
     """The data files and artefacts of a run, inputs first.
 
     Of each its path, why it is stale (no reasons: it is up to date), and the command that made it.
@@ -180,11 +173,10 @@ def stale(run: Path) -> list[dict[str, Any]]:
     for place in parts:
         _find_reasons(place, reasons)
     rows = []
-    for place, why in reasons.items():
-        if place in parts:
-            command = shlex.join(Artefact(place).manifest.command) if why else ""
-            typed = command if command.startswith("hypogoal ") else ""  # a program's cannot be given again
-            rows.append({"path": str(parts[place]), "reasons": why, "command": typed})
+    for place in [place for place in reasons if place in parts]:
+        command = Artefact(place).manifest.command if reasons[place] else []
+        typed = shlex.join(command) if command[:1] == ["hypogoal"] else ""  # a program's cannot be given again
+        rows.append({"path": str(parts[place]), "reasons": reasons[place], "command": typed})
     return rows
 
 
@@ -203,7 +195,7 @@ def _find_reasons(place: Path, reasons_of: dict[Path, list[str]]) -> list[str]:
     return reasons_of[place]
 
 
-def stale_lines(rows: Rows) -> list[str]:
+def stale_lines(rows: list[Details]) -> list[str]:
     """What :func:`stale` found, as text."""
     text = []
     for row in rows:

@@ -43,36 +43,17 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         dataset.labelled("three")
 
 
-def test_some_heldout_states_are_of_both_classes_and_as_in_the_file(tmp_path: Path) -> None:
-    """So many of each class, or all there are, of every part of the file."""
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, size=(3_000, *SHAPE), dtype=np.uint8)
-    labels = np.stack([rng.random(3_000) < 0.02, np.zeros(3_000, np.bool_)], axis=1)
-    states = States(images, labels, {"layout_seed": np.arange(3_000)})
-    collected = Collected(SHAPE, ("rare", "never"), states, states, states)
-    write_dataset(tmp_path / "data.h5", collected, domain="", config={}, seed=0)
-    dataset = open_dataset(tmp_path / "data.h5")
-    some = dataset.some_heldout("rare", 40)
-    rows = some.origins["layout_seed"]
-    np.testing.assert_array_equal(some.observations, images[rows])
-    np.testing.assert_array_equal(some.labels, labels[rows, 0])
-    assert some.labels.sum() == (~some.labels).sum() == 40 and rows[0] < 300 and rows[-1] > 2_700
-    assert len(dataset.some_heldout("never", 40).labels) == 40
-    assert dataset.some_heldout("rare", 10_000).labels.sum() == labels[:, 0].sum()
-
-
 @pytest.mark.parametrize(
-    ("name", "origin", "labels", "words"),
+    ("name", "labels", "words"),
     [
-        ("../../x", "seed", [[True], [False]], "usable as a file name"),
-        ("a?", "seed", [[True], [False]], "usable as a file name"),
-        ("one", "a/b", [[True], [False]], "usable as a file name"),
-        ("one", "seed", [["True"], ["False"]], "labels are not truth values"),  # NumPy turns 'False' into True
+        ("../../x", [[True], [False]], "usable as a file name"),
+        ("a?", [[True], [False]], "usable as a file name"),
+        ("one", [["True"], ["False"]], "labels are not truth values"),  # NumPy turns 'False' into True
     ],
 )
-def test_what_is_not_written(tmp_path: Path, name: str, origin: str, labels: list[Any], words: str) -> None:
+def test_what_is_not_written(tmp_path: Path, name: str, labels: list[Any], words: str) -> None:
     """Spec G2: names become files and groups; nothing is left behind."""
-    states = States(np.zeros((2, *SHAPE), np.uint8), np.array(labels), {origin: np.arange(2)})
+    states = States(np.zeros((2, *SHAPE), np.uint8), np.array(labels))
     collected = Collected(SHAPE, (name,), states, states, states)
     with pytest.raises(UserError, match=words):
         write_dataset(tmp_path / "data.h5", collected, domain="", config={}, seed=0)

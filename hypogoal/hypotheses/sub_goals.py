@@ -15,7 +15,7 @@ from hypogoal.core.files import read_log
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
-from hypogoal.data import Dataset, joined_unlabelled, open_dataset
+from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
@@ -25,8 +25,9 @@ from hypogoal.hypotheses.teacher import load_teacher
 from hypogoal.hypotheses.thresholds import threshold_rule
 from hypogoal.hypotheses.training import CHECKED_EVERY, Training
 from hypogoal.hypotheses.views import StateOrigins, own_view
+from hypogoal.observations import spread_rows
 
-LOOKED_AT = 100  # held-out states of each class, cheap beside training
+LOOKED_AT = 1_000  # held-out states, cheap beside training
 
 
 def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
@@ -66,16 +67,16 @@ def train_sub_goal(
     prepare()
     dataset = open_dataset(data)
     labelled = dataset.labelled(sub_goal)
-    unlabelled, origins = joined_unlabelled(others or [data])
+    unlabelled = joined([open_dataset(file).unlabelled_states() for file in others or [data]])
     checkpoints = draft.checkpoints(sub_goal)
     saved = checkpoints.load()
     training = Training(
         labelled.observations,
         labelled.labels,
-        unlabelled,
+        unlabelled.observations,
         config,
         seed_for(seed, "ensemble", sub_goal),
-        origins=StateOrigins(labelled.origins, origins),
+        origins=StateOrigins(labelled.origins, unlabelled.origins),
         device=device,
         saved=saved["training"] if saved else None,
     )
@@ -112,7 +113,8 @@ def steps_in(logs: Iterable[Path]) -> int:
 def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dict[str, float]:
     """Best, mean and worst member's balanced accuracy on some held-out states; NaN without states of both classes."""
     try:
-        states = dataset.some_heldout(sub_goal, LOOKED_AT)
+        states = dataset.heldout(sub_goal)
+        states = states.where(spread_rows(len(states.labels), LOOKED_AT))
         predictions = ensemble.predictions(states.observations)
     except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
         return best_mean_worst(np.full(len(ensemble), np.nan))

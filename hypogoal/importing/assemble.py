@@ -12,8 +12,7 @@ from hypogoal.data import (
     Integers,
     Labels,
     States,
-    hard_to_judge,
-    hard_to_learn,
+    doubts_of,
     joined,
     leave_out,
     require_classes,
@@ -65,7 +64,7 @@ def assemble(
     remarks += near_duplicates(
         labelled, heldout, goals, (of_labelled, [test_names[row] for row in heldout.origins[ROW]])
     )
-    remarks += hard_to_learn(labelled.labels, goals) + hard_to_judge(heldout.labels, goals)
+    remarks += doubts_of(labelled.labels, heldout.labels, goals)
     sets = labelled, unlabelled, heldout
     labelled, unlabelled, heldout = [replace(states, origins=_rows(states)) for states in sets]
     shape = labelled.observations.shape[1:]

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -119,15 +120,13 @@ def with_labels(dataset: Dataset, table: Path, sub_goal: str) -> tuple[Collected
     if dataset.sub_goals != (sub_goal,):
         do = f"It has {', '.join(dataset.sub_goals)}."
         raise UserError("a table labels data of one sub-goal, its own", f"{sub_goal}={table}", do)
-    observations, origins = dataset.unlabelled(), dataset.unlabelled_origins()
-    labels = _labels_in(table, observations)
+    unlabelled = dataset.unlabelled_states()
+    labels = _labels_in(table, unlabelled.observations)
+    rows = np.array([*labels])
+    new = replace(unlabelled.where(rows), labels=np.array([*labels.values()])[:, None])
+    rest = unlabelled.where(~np.isin(np.arange(len(unlabelled.labels)), rows))
     labelled, test = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    shared = labelled.origins.keys() & origins.keys()
-    chosen = States(observations, np.zeros((len(observations), 1), np.bool_), origins)
-    new = chosen.where(np.array([*labels]))
-    new = States(new.observations, np.array([*labels.values()])[:, None], new.origins)
-    before = States(labelled.observations, labelled.labels[:, None], {name: labelled.origins[name] for name in shared})
-    rest = chosen.where(~np.isin(np.arange(len(observations)), [*labels]))
+    before = States(labelled.observations, labelled.labels[:, None], labelled.origins)
     heldout = States(test.observations, test.labels[:, None], test.origins)
     features = tuple(dataset.features()) if dataset.observation_dtype == NUMBERS else ()
     shape = dataset.observation_shape

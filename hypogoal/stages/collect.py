@@ -66,13 +66,11 @@ def _doubts(domain: Any, collected: Any) -> list[str]:
     """What may be hard about the states of a domain of the user's own."""
     import numpy as np
 
-    from hypogoal.data import GET_MORE, hard_to_judge, hard_to_learn
+    from hypogoal.data import doubts_of
     from hypogoal.options.config import OptionConfig
 
     labelled = collected.labelled
-    goals = collected.sub_goals
-    lines = [f"{line}. {GET_MORE}" for line in hard_to_learn(labelled.labels, goals)]
-    lines += hard_to_judge(collected.heldout.labels, goals)
+    lines = doubts_of(labelled.labels, collected.heldout.labels, collected.sub_goals)
     steps = labelled.origins.get("step")
     defaults = domain.defaults.get("train-options", {})
     if steps is None or "option_timeout" in defaults:

@@ -307,7 +307,7 @@ def test_what_is_saved_is_what_was_trained(tmp_path: Path) -> None:
     assert artefact.config["view_settings"] == ["localiser_steps=2", "jitter=1"]
     back = read_ensemble(artefact.path, artefact.config, "base")
     dataset = open_dataset(data)
-    split, origins = dataset.labelled("base"), dataset.unlabelled_origins()
+    split, origins = dataset.labelled("base"), dataset.unlabelled_states().origins
     config = resolve(EnsembleConfig, known(EnsembleConfig, artefact.config), stage="train-ensemble")
     seed = seed_for(0, "ensemble", "base")
     direct = train(
@@ -361,7 +361,7 @@ def test_bases_are_recognised_in_rooms_without_labels(tmp_path: Path) -> None:
     dataset = open_dataset(data)
     (goal,) = dataset.sub_goals
     split, unlabelled, heldout = dataset.labelled(goal), dataset.unlabelled(), dataset.heldout(goal)
-    origins = StateOrigins(split.origins, dataset.unlabelled_origins())
+    origins = StateOrigins(split.origins, dataset.unlabelled_states().origins)
     unseen = heldout.where(heldout.origins["seen"] == 0)
 
     def trained(**settings: object) -> tuple[object, float]:

@@ -7,7 +7,7 @@ from command_line import refuses, run
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.data import joined_unlabelled, open_dataset
+from hypogoal.data import joined, open_dataset
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options.visited import Visited
@@ -113,8 +113,9 @@ def test_an_ensemble_learns_from_what_was_visited(corridor_run: Path, tmp_path: 
     both = open_artefact(tmp_path / "both", "ensemble")
     assert [entry.kind for entry in both.manifest.inputs] == ["data", "data", "data"]
     assert both.input("data") == data, "what is evaluated is the data, not what was visited"
-    states, origins = joined_unlabelled([data, options / "visited.h5"])
-    assert len(states) == len(open_dataset(data).unlabelled()) + 5 and origins == {}
+    states = [open_dataset(file).unlabelled_states() for file in (data, options / "visited.h5")]
+    found = joined(states)
+    assert len(found.observations) == len(states[0].observations) + 5 and found.origins == {}
     run("verify", tmp_path)
 
 
