@@ -11,15 +11,36 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.25.0"
 
 if TYPE_CHECKING:
-    from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options, report
-    from hypogoal.api import train_baseline, train_ensemble, train_meta, train_options  # isort: skip
+    from hypogoal.api import compare, load_ensemble, load_options
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium.domain import GymnasiumDomain
     from hypogoal.hypotheses.wrappers import SubgoalReward
+    from hypogoal.made import Made
+    from hypogoal.options.env import OptionEnv
+    from hypogoal.stages.collect import collect
+    from hypogoal.stages.evaluate import evaluate
+    from hypogoal.stages.report import report
+    from hypogoal.stages.train_baseline import train_baseline
+    from hypogoal.stages.train_ensemble import train_ensemble
+    from hypogoal.stages.train_meta import train_meta
+    from hypogoal.stages.train_options import train_options
 
-_LAZY = {
-    "GymnasiumDomain": "hypogoal.domains.gymnasium.domain",
-    "UserError": "hypogoal.core.errors",
+_HOMES = {  # where each name is imported from on first use
+    "GymnasiumDomain": "domains.gymnasium.domain",
+    "Made": "made",
+    "OptionEnv": "options.env",
+    "SubgoalReward": "hypotheses.wrappers",
+    "UserError": "core.errors",
+    "collect": "stages.collect",
+    "compare": "api",
+    "evaluate": "stages.evaluate",
+    "load_ensemble": "api",
+    "load_options": "api",
+    "report": "stages.report",
+    "train_baseline": "stages.train_baseline",
+    "train_ensemble": "stages.train_ensemble",
+    "train_meta": "stages.train_meta",
+    "train_options": "stages.train_options",
 }
 __all__ = [
     "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "UserError", "__version__", "collect", "compare",
@@ -29,10 +50,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        importlib.import_module("hypogoal.envs")
-        return getattr(importlib.import_module(_LAZY.get(name, "hypogoal.api")), name)
-    raise AttributeError(f"module 'hypogoal' has no attribute {name!r}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'hypogoal' has no attribute {name!r}")
+    importlib.import_module("hypogoal.envs")
+    return getattr(importlib.import_module(f"hypogoal.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""The Python interface: run stages, load what was trained, predict, play options as actions of an environment.
+"""The functions of the Python interface that are no stages: compare runs, load ensembles and options.
 
 The functions of the stages do what their commands do, see :mod:`hypogoal.stages`. They take ``out``, a command's
 options (``preset``, ``seed``, ``device``, ``force``, ``resume``, ``quiet``, inputs such as ``options``) and any setting
@@ -10,38 +10,13 @@ from pathlib import Path
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.processes import own_settings
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.hypotheses.wrappers import SubgoalReward, ensemble_at
+from hypogoal.hypotheses.wrappers import ensemble_at
 from hypogoal.made import Made
-from hypogoal.options.env import OptionEnv, Options
+from hypogoal.options.env import Options
 from hypogoal.options.learner import make_policies
 from hypogoal.options.termination import rule_of, set_thresholds
 from hypogoal.stages import Place
-from hypogoal.stages.collect import collect
-from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import report
-from hypogoal.stages.train_baseline import train_baseline
-from hypogoal.stages.train_ensemble import train_ensemble
-from hypogoal.stages.train_meta import train_meta
-from hypogoal.stages.train_options import train_options
-
-__all__ = [
-    "GymnasiumDomain",
-    "Made",
-    "OptionEnv",
-    "SubgoalReward",
-    "collect",
-    "compare",
-    "evaluate",
-    "load_ensemble",
-    "load_options",
-    "report",
-    "train_baseline",
-    "train_ensemble",
-    "train_meta",
-    "train_options",
-]
 
 
 @own_settings()

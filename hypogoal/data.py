@@ -136,7 +136,7 @@ def require_names(sub_goals: Sequence[str]) -> None:
     """Refuse (``UserError``) an empty list, names that are not plain, and names that differ only in case."""
     if not plain_names(sub_goals):
         do = f"Give one or more, different even if case is ignored, without separators and {' '.join(NO_FILE_NAME)}"
-        raise UserError("sub-goals need names that are usable as file names", ", ".join(sub_goals), f"{do}.")
+        raise UserError("sub-goals need different names that are usable as file names", ", ".join(sub_goals), f"{do}.")
 
 
 @contextlib.contextmanager

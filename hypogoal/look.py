@@ -133,7 +133,7 @@ def lines(details: Details) -> list[str]:
 def _typed(value: Any, comma: str) -> str:
     """A value as one would type it."""
     if isinstance(value, dict):
-        value = [f"{name} {part}" for name, part in value.items()]
+        return ", ".join(f"{name} {_typed(part, comma)}" for name, part in value.items())
     return comma.join(map(str, value)) if isinstance(value, list) else str(value)
 
 

@@ -63,13 +63,16 @@ def type_text(dtype: DType) -> str:
 
 
 def type_of(text: str) -> DType:
-    """The type that :func:`type_text` wrote."""
+    """The type that :func:`type_text` wrote; anything else is a ``ValueError``."""
     if text in KINDS:
         return KINDS[text]
     fields = {}
-    for key, (kind, shape) in json.loads(text).items():
-        fields[key] = (KINDS[kind], tuple(shape))
-    return mixed_type(fields)
+    try:
+        for key, (kind, shape) in json.loads(text).items():
+            fields[key] = (KINDS[kind], tuple(shape))
+        return mixed_type(fields)
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise ValueError(f"observations of type {text}") from None
 
 
 def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations:

@@ -46,8 +46,8 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "labels", "words"),
     [
-        ("../../x", [[True], [False]], "usable as a file name"),
-        ("a?", [[True], [False]], "usable as a file name"),
+        ("../../x", [[True], [False]], "usable as file names"),
+        ("a?", [[True], [False]], "usable as file names"),
         ("one", [["True"], ["False"]], "labels are not truth values"),  # NumPy turns 'False' into True
     ],
 )
@@ -85,7 +85,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "not complete": (attribute("complete", False), "not complete"),
     "no domain": (lambda file: file.attrs.pop("domain"), "'domain'"),
     "sub-goals that are no JSON": (attribute("sub_goals", "{"), "cannot be read"),
-    "names that are none": (attribute("sub_goals", json.dumps(["../x"])), "usable as a file name"),
+    "names that are none": (attribute("sub_goals", json.dumps(["../x"])), "usable as file names"),
     "a type that is none": (attribute("observation_dtype", "int7"), "int7"),
     "floats": (instead(OBSERVATIONS, data=np.zeros((7, *SHAPE))), f"{OBSERVATIONS} is float64"),
     "another shape": (instead(OBSERVATIONS, data=np.zeros((7, 9), np.uint8)), f"{OBSERVATIONS} is uint8 (7, 9)"),

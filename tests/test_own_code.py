@@ -59,19 +59,18 @@ def labelling_all(value: Any) -> GymnasiumDomain:
 STEP = "the environment's step gave something else than Gymnasium says"
 FITS_NOT = "an observation that does not fit its space"
 MALFORMED: list[tuple[Any, str]] = [
-    *((giving(1, value), STEP) for value in (None, "1", NAN, 1j, np.ones(2))),
-    *((giving(2, value), STEP) for value in (None, "False", 2, np.array([True, False]))),
+    *((giving(1, value), STEP) for value in (None, NAN, np.ones(2))),
+    *((giving(2, value), STEP) for value in ("False", 2)),
     (giving(3, None), STEP),
     (giving(4, None), STEP),
     (with_methods(step=lambda self, action: CorridorEnv.step(self, action)[:4]), STEP),
-    (giving(0, lambda image: image.astype(np.float32)), FITS_NOT),
     (giving(0, lambda image: image[:-1]), FITS_NOT),
     (with_methods(reset=lambda self, **_: np.zeros((2, 48, 48), np.uint8)), "reset gave something else"),
     (with_methods(reset=lambda self, **_: (1, {})), FITS_NOT),
     (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none of Gymnasium's: NoneType"),  # type: ignore[arg-type, return-value]
-    *((labelling(value), "the label of odd is no truth value") for value in (None, "no", 2, NAN, object())),
+    *((labelling(value), "the label of odd is no truth value") for value in ("no", NAN)),
     (labelling_all({"left-end": True, "odd": None}), "the label of odd is no truth value"),
-    *((labelling_all(value), "the function of all labels gave") for value in (None, {"left-end": True})),
+    (labelling_all({"left-end": True}), "the function of all labels gave"),
 ]
 
 
@@ -121,16 +120,15 @@ LINE = raising.__code__.co_firstlineno + 2
 PLACES: dict[str, tuple[Callable[..., GymnasiumDomain], list[str]]] = {
     "make": (lambda leave: GymnasiumDomain(leave, SUB_GOALS), COLLECT),
     "reset": (lambda leave: with_methods(reset=leave), COLLECT),
-    "step": (lambda leave: with_methods(step=leave), COLLECT),
     "label": (lambda leave: GymnasiumDomain(CorridorEnv, {"odd": leave}), COLLECT),
     "policy": (lambda leave: GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=leave), COLLECT),
     "success": (lambda leave: GymnasiumDomain(CorridorEnv, SUB_GOALS, success=leave), BASELINE),
-    "step of an agent": (lambda leave: with_methods(step=leave), BASELINE),
+    "step": (lambda leave: with_methods(step=leave), BASELINE),
 }
+ERRORS = [ValueError("why\nand where"), SystemExit(0), OSError(errno.ENOENT, "no", "x")]
 
 
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("error", [ValueError("why\nand where"), SystemExit(0), OSError(errno.ENOENT, "no", "x")])
+@pytest.mark.parametrize(("place", "error"), [*zip(PLACES, ERRORS * 2, strict=True)])
 def test_what_is_raised_has_a_place(place: str, error: BaseException, told: Callable[..., str]) -> None:
     """Spec G2: nobody takes a program that ended for one that succeeded."""
     domain, words = PLACES[place]
@@ -139,8 +137,8 @@ def test_what_is_raised_has_a_place(place: str, error: BaseException, told: Call
 
 
 HONEST = [
-    *(giving(1, kind) for kind in (np.float32, np.array, torch.tensor, bool)),
-    *(giving(2, kind) for kind in (np.bool_, np.array, torch.tensor, int)),
+    *(giving(1, kind) for kind in (np.array, torch.tensor, bool)),
+    *(giving(2, kind) for kind in (np.bool_, int)),
     GymnasiumDomain(CorridorEnv, {name: lambda env, label=label: int(label(env)) for name, label in SUB_GOALS.items()}),  # type: ignore[misc]
 ]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, ClassVar, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, create_model, field_validator
 from pydantic.fields import FieldInfo
@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 from hypogoal.core.errors import UserError
 
 C = TypeVar("C", bound="Config")
+Values: TypeAlias = Mapping[str, Any]  # of settings, by name
 DOMAIN = "doorkey"  # its presets and defaults hold if no domain is named
 PRESETS = Path(__file__).parents[1] / "presets"
 MODELS = {  # by stage; collect's are its domain's, those of run its experiment's
@@ -143,7 +144,7 @@ def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]
     return dict(tables.get(stage, {}))
 
 
-def resolve(model: type[C], *layers: Mapping[str, Any], stage: str) -> C:
+def resolve(model: type[C], *layers: Values, stage: str) -> C:
     """The settings of ``stage``, of the model and of the parts that its settings choose; later layers win.
 
     None stands for a value that is not given. The last layer is what the user typed: there a setting of a part that is
@@ -163,12 +164,12 @@ def resolve(model: type[C], *layers: Mapping[str, Any], stage: str) -> C:
         raise _refusal(chosen, whole, error, stage) from None
 
 
-def known(model: type[Config], values: Mapping[str, Any]) -> dict[str, Any]:
+def known(model: type[Config], values: Values) -> dict[str, Any]:
     """The values of a manifest or data file that the model or a part of it has: earlier versions had others, too."""
     return {name: values[name] for name in _with_parts(model).model_fields if name in values}
 
 
-def described(model: type[Config], *layers: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
+def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str, Any]]:
     """Every setting of the model, then of its parts; a layer has values that replace defaults, and their source."""
     every = _with_parts(model)
     defaults = resolve(every, *(values for values, _ in layers), {}, stage="").model_dump(mode="json")
@@ -196,7 +197,7 @@ def described(model: type[Config], *layers: tuple[Mapping[str, Any], str]) -> li
     return rows
 
 
-def as_toml(stage: str, rows: Iterable[Mapping[str, Any]]) -> str:
+def as_toml(stage: str, rows: Iterable[Values]) -> str:
     """Settings as :func:`described` has them, as a preset to edit."""
     lines = [f"[{stage}]"]
     for row in rows:
@@ -244,7 +245,7 @@ def _details(field: FieldInfo) -> Details:
     return extra.get("details", Details())
 
 
-def _with_parts(model: type[C], values: Mapping[str, Any] | None = None) -> type[C]:
+def _with_parts(model: type[C], values: Values | None = None) -> type[C]:
     """The model with the parts that ``values`` choose; without ``values`` with all parts."""
     parts = []
     for name, models in model.PARTS.items():
