@@ -263,20 +263,18 @@ class Dataset:
         return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     def features(self) -> list[str]:
-        """The names of an observation's numbers, in order; ``x0``, ``x1``, ... if the file has no names.
+        """The names of an observation's numbers, in order: the file's own, else ``x[0]``, ``x[1]``, ...
 
         Of a mixed observation ``key[0]``, ``key[1]``, ..., and a picture's key alone.
         """
-        if self.observation_dtype.names:
-            return _names_of_fields(self.observation_dtype)
-        count = prod(self.observation_shape)
         with reading(self.path) as file:
-            if "features" not in file:
-                return [f"x{number}" for number in range(count)]
-            names = json.loads(file["features"][()])
-            if len(names) != count:
-                raise ValueError(f"{len(names)} names for {count} features")
-            return [str(name) for name in names]
+            if "features" in file:
+                return [*json.loads(file["features"][()])]
+        names = []
+        for key, (kind, shape) in fields_of(self.observation_shape, self.observation_dtype).items():
+            size = prod(shape) if kind == NUMBERS else 1
+            names += [f"{key or 'x'}[{place}]" for place in range(size)] if size > 1 else [key]
+        return names
 
     def labelled(self, sub_goal: str) -> States:
         """The labelled states of one sub-goal."""
@@ -345,14 +343,6 @@ def _column(group: Any, name: str) -> NDArray[Any]:
     if values.shape != (states,):
         raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
     return values
-
-
-def _names_of_fields(dtype: DType) -> list[str]:
-    names = []
-    for key, (kind, shape) in fields_of((), dtype).items():
-        size = prod(shape) if kind == NUMBERS else 1
-        names += [f"{key}[{place}]" for place in range(size)] if size > 1 else [key]
-    return names
 
 
 def open_dataset(path: Path) -> Dataset:

@@ -23,14 +23,16 @@ Shape: TypeAlias = tuple[int, ...]
 KINDS: dict[str, DType] = {"uint8": PICTURE, "float32": NUMBERS}
 Observations: TypeAlias = NDArray[Any]  # (N, *shape), of any of these types
 Fields: TypeAlias = dict[str, tuple[DType, Shape]]  # by key
-Standard: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]  # mean and deviation of numbers
+Floats: TypeAlias = NDArray[np.float32]
+Standard: TypeAlias = tuple[Floats, Floats]  # mean and deviation of numbers
 DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
 MOST_ROWS = 20_000  # states from which mean and deviation are computed
 
 
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
     """16 bytes that identify an observation among those of its shape and type, together with its labels."""
-    return blake2b(observation.tobytes() + labels, digest_size=16).digest()
+    content = observation.tobytes() + labels
+    return blake2b(content, digest_size=16).digest()
 
 
 def fields_of(shape: Shape, dtype: DType) -> Fields:
@@ -42,14 +44,20 @@ def fields_of(shape: Shape, dtype: DType) -> Fields:
 
 def values_in(shape: Shape, dtype: DType) -> int:
     """How many values an observation has, bytes of pictures and numbers."""
-    return sum(prod(size) for _, size in fields_of(shape, dtype).values())
+    sizes = [prod(size) for _, size in fields_of(shape, dtype).values()]
+    return sum(sizes)
 
 
 def mixed_type(fields: Fields) -> DType:
     """The type of observations with these parts, sorted by key; malformed ones are a ``ValueError``."""
-    if not plain_names(list(fields)) or not all(min(shape, default=0) > 0 for _, shape in fields.values()):
+    if not plain_names([*fields]):
         raise ValueError(f"malformed observations: {fields}")
-    return np.dtype([(key, dtype.str, shape) for key, (dtype, shape) in sorted(fields.items())])
+    parts = []
+    for key, (dtype, shape) in sorted(fields.items()):
+        if min(shape, default=0) <= 0:
+            raise ValueError(f"malformed observations: {fields}")
+        parts.append((key, dtype.str, shape))
+    return np.dtype(parts)
 
 
 def type_text(dtype: DType) -> str:
@@ -81,21 +89,25 @@ def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations
     for key, values in parts.items():
         array = np.asarray(values)
         arrays[key] = array.astype(NUMBERS) if array.dtype == np.float64 else array
-    stored = mixed_type({key: (array.dtype, array.shape[1:]) for key, array in arrays.items()})
-    lengths = set(map(len, arrays.values()))
-    if len(lengths) > 1 or stored != (dtype or stored):
-        raise ValueError(f"{type_text(stored)}, of lengths {lengths}")
+    fields = {key: (array.dtype, array.shape[1:]) for key, array in arrays.items()}
+    stored = mixed_type(fields)
+    if dtype is not None and stored != dtype:
+        raise ValueError(type_text(stored))
+    lengths = {len(array) for array in arrays.values()}
+    if len(lengths) > 1:
+        raise ValueError(f"states of lengths {lengths}")
     states = np.empty(lengths.pop(), stored)
     for key, array in arrays.items():
         states[key] = array
     return states
 
 
-def numbers_of(observations: Observations) -> NDArray[np.float32]:
+def numbers_of(observations: Observations) -> Floats:
     """All numbers of observations (N, ...), in a row each, float32 (N, D)."""
     count = len(observations)
+    fields = fields_of(observations.shape[1:], observations.dtype)
     rows = [np.zeros((count, 0), NUMBERS)]
-    for key, (dtype, shape) in fields_of(observations.shape[1:], observations.dtype).items():
+    for key, (dtype, shape) in fields.items():
         if dtype == NUMBERS:
             values = observations[key] if key else observations
             rows.append(values.reshape(count, prod(shape)))
@@ -111,14 +123,17 @@ def standard_of(shape: Shape, *observations: Observations) -> Standard:
     mean = sample.mean(0, dtype=np.float64)
     deviation = sample.std(0, dtype=np.float64)
     varies = deviation > 1e-6 * np.abs(mean)
-    return mean.astype(NUMBERS), np.where(varies, deviation, 1.0).astype(NUMBERS)
+    scale = np.where(varies, deviation, 1.0)
+    return mean.astype(NUMBERS), scale.astype(NUMBERS)
 
 
 def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
     """Numbers (N, *shape), arrays or tensors, in deviations from their mean (*shape)."""
-    return ((observations - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS)
+    deviations = (observations - mean) / deviation
+    return deviations.clip(-DEVIATIONS, DEVIATIONS)
 
 
 def spread_rows(count: int, most: int) -> NDArray[np.int64]:
     """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+    rows = np.linspace(0, count - 1, min(count, most))
+    return rows.astype(np.int64)

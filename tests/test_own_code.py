@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from hypogoal.core import own_code
 from hypogoal.core.checkpoints import PACE
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.data import open_dataset
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 
@@ -151,19 +150,6 @@ def test_numbers_of_any_library_are_numbers(own: GymnasiumDomain) -> None:
         for one, other in zip(plain.step(row)[:4], engine.step(row)[:4], strict=True):
             assert one.dtype == other.dtype
             np.testing.assert_array_equal(one, other)
-
-
-def test_actions_of_any_library_are_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written = []
-    for number, kind in enumerate((int, np.int8, torch.tensor)):
-        policy = lambda env, observation, rng, kind=kind: kind(rng.integers(2))  # noqa: E731
-        own = GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=policy)
-        monkeypatch.setattr(sys.modules[__name__], "OWN", own, raising=False)
-        out = tmp_path / f"{number}.h5"
-        run("collect", NAME, *settings("steps=200", "heldout_seeds=4,5"), "-q", "--out", out)
-        written.append(open_dataset(out).unlabelled())
-    for other in written[1:]:
-        np.testing.assert_array_equal(written[0], other)
 
 
 def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:

@@ -15,7 +15,7 @@ import pytest
 from toy_data import reseal
 
 from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, Draft, create, open_artefact
-from hypogoal.core.errors import Complete, NumericalError, UserError
+from hypogoal.core.errors import Complete, UserError
 from hypogoal.data import create_hdf5
 from hypogoal.evaluation.run import find_artefacts
 
@@ -177,19 +177,20 @@ def test_what_was_begun_otherwise_is_not_continued(tmp_path: Path, change: dict[
 
 def test_other_versions_and_damaged_drafts_are_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another torch need not give the same bytes; another number of processes does."""
+    out = tmp_path / "meta"
     with pytest.raises(KeyError):
-        stop(tmp_path / "meta", KeyError(), config={"workers": 4})
-    assert finish(tmp_path / "meta", config={"workers": 1}, resume=True) == 1
-    with pytest.raises(KeyError):
-        stop(tmp_path / "other", KeyError())
+        stop(out, KeyError(), config={"workers": 4})
     with monkeypatch.context() as patch:
         patch.setattr("hypogoal.core.artefacts.versions", lambda: {"torch": "9.9"})
         with pytest.raises(UserError, match="begun with torch="):
-            finish(tmp_path / "other", resume=True)
+            finish(out, resume=True)
+    begun = Draft(out).begun.read_text()
     for text, words in (("{", "not valid JSON"), ('{"identity": {}}', "format 3, this is None")):
-        Draft(tmp_path / "other").begun.write_text(text)
+        Draft(out).begun.write_text(text)
         with pytest.raises(UserError, match=words):
-            finish(tmp_path / "other", resume=True)
+            finish(out, resume=True)
+    Draft(out).begun.write_text(begun)
+    assert finish(out, config={"workers": 1}, resume=True) == 1
 
 
 def test_nothing_is_lost_by_mistake(tmp_path: Path) -> None:
@@ -210,9 +211,8 @@ def test_nothing_is_lost_by_mistake(tmp_path: Path) -> None:
     assert open_artefact(out) and os.listdir(tmp_path) == ["meta"]
 
 
-def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path) -> None:
     """No output of another kind, no file of others', no input, however wrong the --out."""
-    monkeypatch.chdir(tmp_path)
     finish(tmp_path / "ensemble", kind="ensemble")
     finish(tmp_path / "unreadable")
     (tmp_path / "unreadable" / MANIFEST).write_text("{")
@@ -221,31 +221,19 @@ def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path, monkeypatch
     for name in ("mine/thesis.txt", "foreign.h5"):
         (tmp_path / name).write_text("precious")
     before = contents(tmp_path)
-    names = [("ensemble", "meta"), ("ensemble", DATA), ("unreadable", "meta"), ("mine", "meta")]
-    names += [("foreign.h5", DATA), ("foreign.h5", "meta")]
-    for name, kind in names:
-        with pytest.raises(UserError, match="what is there is not of kind"):
-            finish(tmp_path / name, kind=kind, force=True)
+    for name in ("ensemble", "unreadable", "mine", "foreign.h5"):
+        for kind in {"meta", DATA} if name != "unreadable" else {"meta"}:
+            with pytest.raises(UserError, match="what is there is not of kind"):
+                finish(tmp_path / name, kind=kind, force=True)
     for out, path in (("ensemble", "link"), ("link", "ensemble"), (".", "ensemble")):
         with pytest.raises(UserError, match="would replace an input"):
-            finish(Path(out), kind="ensemble", inputs=[tmp_path / path], force=True)
+            finish(tmp_path / out, kind="ensemble", inputs=[tmp_path / path], force=True)
     assert contents(tmp_path) == before
     (tmp_path / "empty").mkdir()
     finish(tmp_path / "empty")
     reseal(tmp_path / "empty", seed="damaged")
     finish(tmp_path / "empty", force=True)
     assert open_artefact(tmp_path / "empty").seed == 7
-
-
-def test_a_link_and_the_current_folder_can_be_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("near", "far", "here"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "near" / "meta").symlink_to(tmp_path / "far" / "there")
-    finish(tmp_path / "near" / "meta")
-    assert os.listdir(tmp_path / "near") == ["meta"] and open_artefact(tmp_path / "far" / "there")
-    monkeypatch.chdir(tmp_path / "here")
-    finish(Path("."))
-    assert open_artefact(tmp_path / "here") and sorted(os.listdir(tmp_path)) == ["far", "here", "near"]
 
 
 def test_a_data_file_is_renamed_when_whole(tmp_path: Path) -> None:
@@ -275,15 +263,13 @@ def test_a_data_file_is_renamed_when_whole(tmp_path: Path) -> None:
     assert os.listdir(out.parent) == ["data.h5"]
 
 
-NOTE = ["the last checkpoint is kept: give the same command with --resume to continue"]
-
-
 def test_what_stops_a_stage_says_how_to_continue(tmp_path: Path) -> None:
-    errors = [KeyboardInterrupt(2), NumericalError("a loss is NaN"), MemoryError(), OSError(errno.ENOSPC, "full")]
-    for number, error in enumerate(errors):
+    for number, error in enumerate([KeyboardInterrupt(2), OSError(errno.ENOSPC, "full")]):
         with pytest.raises(type(error)) as caught:
             stop(tmp_path / str(number), error)
-        assert caught.value.__notes__ == NOTE
+        assert caught.value.__notes__ == [
+            "the last checkpoint is kept: give the same command with --resume to continue"
+        ]
         with pytest.raises(type(error)) as caught:
             stop(tmp_path / "early", type(error)(*error.args), checkpoint=False)
         assert not hasattr(caught.value, "__notes__")

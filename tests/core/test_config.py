@@ -26,7 +26,7 @@ from hypogoal.core.config import (
     setting,
 )
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import defaults_of, settings_of
+from hypogoal.domains.base import settings_of
 from hypogoal.experiments.named import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
@@ -202,16 +202,6 @@ def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> N
     model = config_class_of(stage)
     assert all(row["meaning"] for row in described(model))
     assert resolve(model, model().model_dump(mode="json"), {}, stage=stage) == resolve(model, stage=stage)
-
-
-@pytest.mark.parametrize("stage", ["train-options", "train-meta"])
-def test_what_was_published_keeps_its_settings(stage: str) -> None:
-    """Spec D3: DoorKey's own defaults end exploration early and update often; presets of published results do not."""
-    published = {"paper": (8_000, 4), "choosing": (8_000, 16), "demo": (8_000, 16)}
-    for name, values in {None: (2_000, 8), "figure6": (2_000, 8), **published}.items():
-        config = settings_of(stage, "doorkey", name)
-        assert (config.epsilon_steps, config.update_interval) == values
-    assert defaults_of("doorkey", stage) == {"epsilon_steps": 2_000, "update_interval": 8}
 
 
 def test_the_paper_preset_has_the_papers_tables() -> None:

@@ -12,12 +12,10 @@ import time
 from pathlib import Path
 
 import pytest
-from rich.table import Table
 
 from hypogoal.core import progress
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.core.terminal import drawn
 from hypogoal.stages import outcome_of
 
 
@@ -83,18 +81,6 @@ def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(UserError, match=r"pip install 'hypogoal\[tensorboard\]'"):
         MetricsLog(tmp_path / "log.jsonl", tmp_path / "board")
-
-
-def test_a_table_as_text_is_shown_nowhere_else(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same text in a terminal with colours and in a pipe; brackets are text."""
-    table = Table("a", "b")
-    table.add_row("1", "[bold]")
-    plain = drawn(table, 40)
-    assert "│ 1 │ [bold]" in plain
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    assert drawn(table, 40) == plain and capsys.readouterr().out == ""
 
 
 def test_an_error_is_one_line_of_signs_that_can_be_printed() -> None:

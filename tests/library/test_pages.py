@@ -74,13 +74,7 @@ def test_the_page_of_own_domains_shows_a_test_that_runs(monkeypatch: pytest.Monk
     """docs/own-domain.md: the test for one's own test-suite, of a smaller domain than the page's."""
     monkeypatch.delenv("HYPOGOAL_TRUST", raising=False)
     monkeypatch.setitem(sys.modules, "unlock_pickup", own_domain)
+    [code] = [block for block in blocks(ROOT / "docs" / "own-domain.md", "python") if "check_domain" in block]
     space: dict[str, object] = {}
-    exec(
-        compile(
-            next(block for block in blocks(ROOT / "docs" / "own-domain.md", "python") if "check_domain" in block),
-            "own-domain.md",
-            "exec",
-        ),
-        space,
-    )
+    exec(compile(code, "own-domain.md", "exec"), space)
     space["test_my_domain"]()  # type: ignore[operator]
