@@ -21,7 +21,7 @@ from hypogoal.experiments.experiment import (
 )
 
 
-@experiment("doorkey", stages=("collect", "train-baseline"))
+@experiment("doorkey")
 def choosing_baselines(
     *,
     layouts: Layouts = LAYOUTS,

@@ -38,10 +38,7 @@ STEPS, PRACTICE = 1_500_000, 40_000  # of an agent, of which its options practis
 PAPERS = {"ppo-paper": "--agent ppo --set setting=paper", "dqn-paper": "--agent dqn --set setting=paper"}
 
 
-@experiment(
-    "doorkey",
-    stages=("collect", "train-ensemble", "train-options", "train-meta", "train-baseline"),
-)
+@experiment("doorkey")
 def figure6(
     *,
     layouts: Layouts = LAYOUTS,

@@ -23,7 +23,7 @@ from hypogoal.experiments.experiment import (
 METHODS = {"dbat-k3": "--diversity dbat --members 3", "none-k3": "--diversity none --members 3"}
 
 
-@experiment("doorkey", stages=("collect", "train-ensemble", "train-meta"))
+@experiment("doorkey")
 def preference(
     *,
     layouts: Layouts = tuple(range(300, 334)),

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,16 +28,6 @@ from hypogoal.core.errors import UserError, printable
 from hypogoal.core.terminal import say
 
 MAKE, LOOK, OWN = "Make", "Look", "Own data and code"  # groups of commands
-STAGES = {  # in their order; a command is loaded when it is called
-    "collect": "Collect labelled, unlabelled and held-out states.",
-    "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
-    "train-options": "Learn an option (a policy) for every member.",
-    "train-meta": "Learn from the reward which options to choose.",
-    "train-baseline": "Train PPO or DQN on primitive actions, to compare.",
-    "evaluate": "Compute every number of a run: accuracy, curves, choices.",
-    "report": "Draw the report of an evaluated run: one HTML file.",
-    "audit": "How often, and where, do policies fool a success classifier?",
-}
 EXPERIMENTS = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
     "module:function."
@@ -49,8 +38,8 @@ class Commands(TyperGroup):
     """The commands; those of stages are made when they are called, since their settings take time to load."""
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
-        if words[0] in STAGES:
-            return words[0], stage_command(words[0]), words[1:]
+        if words[0] in stages.LISTED:
+            return words[0], stages.load_stage(words[0]).command, words[1:]
         return super().resolve_command(context, words)
 
 
@@ -76,19 +65,12 @@ def _in_lists() -> None:
     """Stands for a stage where commands are listed."""
 
 
-def stage_command(name: str) -> Any:
-    """The command of a stage, whose module is loaded."""
-    folder = "tools" if name == "audit" else "stages"
-    import_module(f"hypogoal.{folder}.{name.replace('-', '_')}")
-    return stages.STAGES[name].command()
-
-
 def list_stage(name: str, panel: str) -> None:
     """List a stage among the commands."""
-    app.command(name, help=STAGES[name], rich_help_panel=panel)(_in_lists)
+    app.command(name, help=stages.LISTED[name], rich_help_panel=panel)(_in_lists)
 
 
-for _name in STAGES:
+for _name in stages.LISTED:
     if _name != "audit":
         list_stage(_name, MAKE)
 
@@ -150,8 +132,8 @@ def _commands() -> Any:
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
     every = {name: command for name, command in _commands().commands.items() if not command.hidden}
-    for name in STAGES:
-        every[name] = stage_command(name)
+    for name in stages.LISTED:
+        every[name] = stages.load_stage(name).command
     return every
 
 
@@ -173,7 +155,7 @@ def _called(words: list[str]) -> int:
 def _advice(error: Any) -> str:
     """What to do about words that a command does not take; settings are often mistaken for options."""
     stage = getattr(getattr(error, "ctx", None), "info_name", "") or ""
-    if hasattr(error, "possibilities") and stage in STAGES:
+    if hasattr(error, "possibilities") and stage in stages.LISTED:
         return f"Settings are given as --set KEY=VALUE; 'hypogoal config {stage}' lists them."
     return f"See 'hypogoal {stage} --help'." if stage not in ("", "hypogoal") else "See 'hypogoal --help'."
 
@@ -223,19 +205,21 @@ def run(
     --set takes settings of the experiment, and STAGE.KEY=VALUE.
     """
     from hypogoal import look
-    from hypogoal.experiments import run as experiments
+    from hypogoal.experiments.plan import plan
+    from hypogoal.experiments.run import in_part
+    from hypogoal.experiments.run import run as run_cells
 
     out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
-    cells, workers = experiments.plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
+    cells, workers = plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
     if dry_run:
-        for cell in experiments.in_part(cells, from_, only):
+        for cell in in_part(cells, from_, only):
             say(shlex.join(["hypogoal", *cell.command(out)]))
         return
     if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
         processes.prepare(device)
-    experiments.run(
+    run_cells(
         cells,
         out,
         workers=workers,
@@ -287,9 +271,8 @@ def verify(path: Made, as_json: Json = False) -> None:
     Reads every file, and those inputs that lie within PATH. What is still being made is named, not checked.
     """
     from hypogoal import look
-    from hypogoal.experiments.sweep import in_the_making
 
-    faults, notes = look.faults(path), in_the_making(path)
+    faults, notes = look.faults(path), look.in_the_making(path)
     state = "whole so far" if notes else "whole"
     verdict = f"{path}: {state if look.parts_of(path) else 'nothing is complete yet'}"
     echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [verdict]), *notes])
@@ -301,9 +284,8 @@ def verify(path: Made, as_json: Json = False) -> None:
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
     """Say what is stale or unfinished, why, and which commands renew it."""
     from hypogoal import look
-    from hypogoal.experiments.sweep import in_the_making
 
-    notes = in_the_making(path)
+    notes = look.in_the_making(path)
     rows = look.stale(path)
     echo(rows, as_json, [*notes, *look.stale_lines(rows)])
 
@@ -323,7 +305,7 @@ def config(
     from hypogoal.experiments.named import config_class_of
 
     if stage is None:
-        helps = STAGES | {"run": "Run all cells of an experiment."}
+        helps = stages.LISTED | {"run": "Run all cells of an experiment."}
         echo(list(TABLES), as_json, [f"{name:15}{helps[name]}" for name in TABLES])
         return
     rows = described(config_class_of(stage, domain), *layers_of(stage, domain, preset))

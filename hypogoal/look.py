@@ -5,6 +5,7 @@ import textwrap
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from hypogoal.cells import read_plan, status_lines
 from hypogoal.core.artefacts import AGAIN, LOG, MANIFEST, Artefact, Draft, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_log, visible
@@ -44,6 +45,11 @@ def unfinished(path: Path) -> list[str]:
             state = "in progress" if draft.is_locked else "interrupted; its command with --resume continues it"
             lines.append(f"{out}: {state}")
     return lines
+
+
+def in_the_making(path: Path) -> list[str]:
+    """A line for each output at or below a path that is not complete; of a run how far it is."""
+    return status_lines(path) if read_plan(path) else unfinished(path)
 
 
 def describe(path: Path) -> Details:

@@ -133,7 +133,7 @@ def test_versions_of_python_are_those_that_are_tested() -> None:
         ("import torch", {"torch"}, set()),  # the check sees it
         ("import hypogoal, hypogoal.cli", {"typer"}, HEAVY),
         (HELP, {"typer"}, HEAVY),
-        ("import hypogoal.experiments.run", set(), {"torch"}),
+        ("import hypogoal.experiments.plan, hypogoal.experiments.run", set(), {"torch"}),
         ("import hypogoal.stages.train_ensemble, hypogoal.stages.train_meta", set(), {"scipy"}),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -15,7 +14,6 @@ from hypogoal.core import own_code
 from hypogoal.core.checkpoints import ANEW, Resumable
 from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
-from hypogoal.core.processes import CORES
 from hypogoal.data import Collected
 from hypogoal.domains.observations import reading_of
 from hypogoal.observations import PICTURE, Observations, Standard
@@ -507,7 +505,4 @@ def settings_of(
     """
     model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
     *defaults, of_preset = [values for values, _ in layers_of(stage, domain, preset_name)]
-    layers = [*defaults, of_preset, inherited or {}, typed or {}]
-    if CORES in os.environ:  # a cell of an experiment, which tells all cells alike, controls among them
-        layers.append({})
-    return resolve(model, *layers, stage=stage)
+    return resolve(model, *defaults, of_preset, inherited or {}, typed or {}, stage=stage)

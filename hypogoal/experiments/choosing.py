@@ -1,6 +1,6 @@
 """Does choosing decide? Options learned in the plain world, chosen in one where a wrong key ends the episode.
 
-``hypogoal run doorkey --preset choosing --out runs/choosing``. The preset has the worlds. Planned options beside the
+``hypogoal run choosing --out runs/choosing``. The preset has the worlds. Planned options beside the
 learned ones say what the hypotheses are worth, whatever learning makes of them. The evaluation's 'What choosing is
 worth' compares the agent with uniform-random choice among its own options.
 """
@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.experiment import Command, Layouts, Paired, Seeds, Value, agents_of, experiment, explained
+from hypogoal.cells import Value
+from hypogoal.experiments.experiment import Command, Layouts, Paired, Seeds, agents_of, experiment, explained
 
 METHODS = {
     "dbat": "--diversity dbat --members 6",
@@ -19,7 +20,7 @@ METHODS = {
 LAYOUTS = (70100, 70101, 70102, 70103, 70105, 70107, 70109, 70110, 70111, 70112)  # solvable without a wrong key
 
 
-@experiment("doorkey", stages=("collect", "train-ensemble", "train-options", "train-meta"))
+@experiment("doorkey", preset="choosing")
 def choosing(
     *,
     layouts: Layouts = LAYOUTS,

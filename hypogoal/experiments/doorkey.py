@@ -7,17 +7,8 @@ from collections.abc import Callable, Iterator
 from itertools import product
 from typing import Annotated, Any
 
-from hypogoal.experiments.experiment import (
-    Command,
-    Layouts,
-    Names,
-    Paired,
-    Seeds,
-    Value,
-    agents_of,
-    experiment,
-    explained,
-)
+from hypogoal.cells import Value
+from hypogoal.experiments.experiment import Command, Layouts, Names, Paired, Seeds, agents_of, experiment, explained
 
 CONTROLS = {"random": "--set chooser=random", "oracle": "--set termination=oracle"}
 BASELINES = {
@@ -29,10 +20,7 @@ Controls = Annotated[Names, explained("controls beside the agent", source="ours:
 Baselines = Annotated[Names, explained("agents on primitive actions", source="paper, Figure 6", choices=BASELINES)]
 
 
-@experiment(
-    "doorkey",
-    stages=("collect", "train-ensemble", "train-options", "train-meta", "train-baseline"),
-)
+@experiment("doorkey")
 def doorkey(
     stage: Callable[[str], Any],
     *,

@@ -2,7 +2,7 @@
 
 ::
 
-    @experiment("doorkey", stages=("collect", "train-ensemble"))
+    @experiment("doorkey")
     def members(*, seeds: Annotated[tuple[int, ...], explained("run seeds", low=0)] = (0, 1)):
         yield "data", "collect doorkey"
         for seed in seeds:
@@ -15,20 +15,20 @@ import inspect
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
 
+from hypogoal.cells import Value, reason
+from hypogoal.core import own_code
 from hypogoal.core.config import Config, integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load, names_in, require_trust
 
 MEND = "Mend the experiment, see docs/formats.md."
 
-Value = str | int | float
 Names: TypeAlias = tuple[str, ...]
 Integers: TypeAlias = tuple[int, ...]
 
@@ -58,28 +58,20 @@ class Experiment:
     name: str
     function: Callable[..., Iterable[Any]]  # of the settings, by keyword; yields Command or its fields
     model: type[RunConfig]  # the settings of ``hypogoal run``: those of all experiments, and the function's
-    domain: str | None = None  # whose presets and settings its stages take; None: each command says all itself
-    stages: tuple[str, ...] = ()  # whose settings can be changed for all commands
+    domain: str | None = None  # whose presets have settings of this experiment
+    preset: str | None = None  # if no other is given
+    given: Mapping[str, Any] = field(default_factory=dict)  # settings, unless others are given
 
     def commands(self, config: RunConfig, stage: Callable[[str], Any]) -> list[Command]:
         """What the function yields; ``stage`` gives a stage's settings. What is no command is a ``UserError``."""
         settings = config.model_dump(exclude={*RunConfig.model_fields})
         if "stage" in inspect.signature(self.function).parameters:
             settings["stage"] = stage
-        rows = [*self.function(**settings)]
         try:
-            return COMMANDS.validate_python(rows)
+            return COMMANDS.validate_python([*self.function(**settings)])
         except ValidationError as error:
             problem = f"an experiment yields (name, command) or (name, command, columns) ({reason(error)})"
             raise UserError(problem, self.name, MEND) from None
-
-
-def reason(error: Exception) -> str:
-    """What is wrong, in one line."""
-    if not isinstance(error, ValidationError):
-        return str(error)
-    fault = error.errors()[0]
-    return f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}"
 
 
 def explained(meaning: str, **limits: Any) -> Any:
@@ -92,47 +84,39 @@ Seeds = Annotated[Integers, explained("run seeds, each with ensembles of its own
 Paired = Annotated[bool, explained("each layout with the seed at its place in the list, instead of all with all")]
 
 
-def experiment(domain: str, *, stages: Sequence[str]) -> Callable[[Callable[..., Iterable[Any]]], Experiment]:
-    """Makes a function an experiment on ``domain``.
+def experiment(domain: str | None = None, **more: Any) -> Callable[[Callable[..., Iterable[Any]]], Experiment]:
+    """Makes a function an experiment on ``domain``, whose presets then may have settings of it; ``more``: a preset.
 
-    Presets, ``--device`` and settings of ``stages`` then apply to all its commands, and it may ask for the settings of
-    a stage: ``def mine(stage, *, ...)`` has ``stage("train-meta").steps``.
+    It may ask for the settings of a stage: ``def mine(stage, *, ...)`` has ``stage("train-meta").steps``.
     """
 
     def decorated(function: Callable[..., Iterable[Any]]) -> Experiment:
-        return _experiment_of(function, domain, stages)
+        hints = get_type_hints(function, include_extras=True)
+        fields: dict[str, Any] = {}
+        for name, parameter in inspect.signature(function).parameters.items():
+            if name == "stage":
+                continue
+            if name not in hints or parameter.default is parameter.empty or name in RunConfig.model_fields:
+                where = f"{function.__name__}: {name}"
+                raise UserError("this argument cannot be a setting", where, "Give it a type and a default.")
+            fields[name] = (hints[name], parameter.default)
+        return Experiment(function.__name__.replace("_", "-"), function, _model_of(fields), domain, **more)
 
     return decorated
 
 
+def _model_of(fields: Mapping[str, Any]) -> type[RunConfig]:
+    return create_model("RunConfig", __base__=RunConfig, __doc__=RunConfig.__doc__, **fields)
+
+
 def load_experiment(name: str) -> Experiment:
     """The experiment ``module:function``; the user must have given the name or allowed it, else a ``UserError``."""
-    target = load(name, "experiment", "hypogoal.experiments", {})
+    target = own_code.load(name, "experiment", "hypogoal.experiments", {})
     if isinstance(target, Experiment):
         return target
     if not inspect.isgeneratorfunction(target):
         raise UserError("the object is not an experiment", name, "Give a generator of (name, command).")
-    return _experiment_of(target)
-
-
-def _experiment_of(
-    function: Callable[..., Iterable[Any]], domain: str | None = None, stages: Sequence[str] = ()
-) -> Experiment:
-    """A function as an experiment whose settings are those that its signature describes."""
-    hints = get_type_hints(function, include_extras=True)
-    fields: dict[str, Any] = {}
-    for name, parameter in inspect.signature(function).parameters.items():
-        if name == "stage":
-            continue
-        if name not in hints or parameter.default is parameter.empty or name in RunConfig.model_fields:
-            where = f"{function.__name__}: {name}"
-            raise UserError("this argument cannot be a setting", where, "Give it a type and a default.")
-        fields[name] = (hints[name], parameter.default)
-    return Experiment(function.__name__.replace("_", "-"), function, _model_of(fields), domain, (*stages,))
-
-
-def _model_of(fields: Mapping[str, Any]) -> type[RunConfig]:
-    return create_model("RunConfig", __base__=RunConfig, __doc__=RunConfig.__doc__, **fields)
+    return experiment()(target)
 
 
 def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> list[tuple[int, int]]:
@@ -160,23 +144,33 @@ class _Cells(BaseModel):
         return f"{self.name}/{values}" if values else self.name
 
 
-class _File(BaseModel):
+class _File(RunConfig):
     """A user's experiment in TOML."""
 
-    model_config = ConfigDict(extra="forbid")
-
     format: Literal[1]
-    axes: dict[str, list[Value] | str] = {}
+    axes: dict[str, list[Value] | str] = Field(default_factory=dict)
     cells: list[_Cells]
-    workers: int = 0
-    evaluate: bool = True
+
+    def commands(self, axes: Mapping[str, Sequence[Value]]) -> Iterator[Command]:
+        """In a command ``{AXIS}`` is its value, ``{NAME}`` the output of the cells of that name for the same values."""
+        for row in self.cells:
+            for values in product(*(axes[axis] for axis in row.axes)):
+                point = dict(zip(row.axes, values, strict=True))
+                known: dict[str, Value] = {}
+                for other in self.cells:
+                    if point.keys() >= {*other.axes}:
+                        known[other.name] = f"@{other.at(point)}"
+                words = [word.format_map(known | point) for word in shlex.split(row.command)]
+                for name in own_code.names_in(",".join(words)):
+                    own_code.require_trust(name, "setting")
+                yield Command(row.at(point), shlex.join(words), {"group": row.name, **point})
 
 
 def read_toml(path: Path) -> Experiment:
     """The experiment in a TOML file; a ``UserError`` where there is none."""
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
-        fields: dict[str, Any] = {"workers": (int, file.workers), "evaluate": (bool, file.evaluate)}
+        fields: dict[str, Any] = {}
         for name, axis in file.axes.items():
             values: Sequence[Value] = integers(axis) if isinstance(axis, str) else axis
             kind: Any = type(values[0])
@@ -187,24 +181,10 @@ def read_toml(path: Path) -> Experiment:
 
     def commands(**axes: Any) -> list[Command]:
         try:
-            return [*_commands(file, axes)]
+            return [*file.commands(axes)]
         except (LookupError, ValueError, AttributeError) as error:
             problem = f"a command cannot be read, or names neither an axis of its cells nor cells over those ({error})"
             raise UserError(problem, path, MEND) from None
 
-    return Experiment(path.stem, commands, model)
-
-
-def _commands(file: _File, axes: Mapping[str, Sequence[Value]]) -> Iterator[Command]:
-    """In a command ``{AXIS}`` is its value, ``{NAME}`` the output of the cells of that name for the same values."""
-    for row in file.cells:
-        for values in product(*(axes[axis] for axis in row.axes)):
-            point = dict(zip(row.axes, values, strict=True))
-            outputs: dict[str, Value] = {}
-            for other in file.cells:
-                if point.keys() >= {*other.axes}:
-                    outputs[other.name] = f"@{other.at(point)}"
-            words = [word.format_map({**outputs, **point}) for word in shlex.split(row.command)]
-            for name in names_in(",".join(words)):
-                require_trust(name, "setting")
-            yield Command(row.at(point), shlex.join(words), {"group": row.name, **point})
+    given = {"workers": file.workers, "evaluate": file.evaluate}
+    return Experiment(path.stem, commands, model, given=given)

@@ -24,7 +24,7 @@ SUB_GOAL = "what is labelled, a sub-goal of collect montezuma; empty: climb-down
 ORACLE = "options that end at the true sub-goal beside them, on each ladder"
 
 
-@experiment("montezuma", stages=("collect", "train-ensemble", "train-options"))
+@experiment("montezuma")
 def montezuma_ladders(
     *,
     groups: Annotated[Integers, explained("labelled ladder groups (N)", source="Figure 3", low=1, high=7)] = (

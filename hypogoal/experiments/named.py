@@ -1,6 +1,6 @@
 """The experiments that come with hypogoal, by name."""
 
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +13,29 @@ from hypogoal.experiments.experiment import Experiment, load_experiment, read_to
 from hypogoal.experiments.ladders import montezuma_ladders
 from hypogoal.experiments.rooms import rooms
 
-EXPERIMENTS: Mapping[str, Experiment] = {each.name: each for each in (choosing, doorkey, montezuma_ladders, rooms)}
-FIGURES: Mapping[str, tuple[str, str, dict[str, str]]] = {  # experiments at a laptop's size: its preset, and settings
-    "choosing": ("choosing", "choosing", {}),
-    "figure3": ("montezuma-ladders", "figure3", {"ladders": ""}),  # classifiers, without options
-    "figure4": ("montezuma-ladders", "figure4", {}),
-    "figure6": ("doorkey", "figure6", {}),
+EXPERIMENTS = {
+    "doorkey": doorkey,
+    "choosing": choosing,
+    "montezuma-ladders": montezuma_ladders,
+    "rooms": rooms,
+    # At a laptop's size.
+    "figure3": replace(montezuma_ladders, preset="figure3", given={"ladders": ""}),  # classifiers, without options
+    "figure4": replace(montezuma_ladders, preset="figure4"),
+    "figure6": replace(doorkey, preset="figure6"),
 }
-NAMES = tuple(dict.fromkeys([*EXPERIMENTS, *FIGURES]))
 
 
-def find_experiment(name: str, preset: str | None) -> tuple[Experiment, str | None, dict[str, str]]:
-    """The experiment called ``name``, its preset and settings; an unknown one is a ``UserError``.
-
-    It is named, one of the paper's figures, a TOML file, or ``module:function``, which the user must have given.
-    """
+def find_experiment(name: str, preset: str | None) -> Experiment:
+    """The experiment called ``name``, a TOML file, or ``module:function``; an unknown one is a ``UserError``."""
     if (name, preset) == ("doorkey", "choosing"):  # a preset with cells of its own
-        name = "choosing"
-    if name in FIGURES:
-        experiment, size, settings = FIGURES[name]
-        return EXPERIMENTS[experiment], preset or size, settings
+        return choosing
     if name in EXPERIMENTS:
-        return EXPERIMENTS[name], preset, {}
+        return EXPERIMENTS[name]
     if name.endswith(".toml"):
-        return read_toml(Path(name)), preset, {}
+        return read_toml(Path(name))
     if ":" in name:
-        return load_experiment(name), preset, {}
-    do = f"Choose one of {', '.join(NAMES)}, or give a .toml file or module:function."
+        return load_experiment(name)
+    do = f"Choose one of {', '.join(EXPERIMENTS)}, or give a .toml file or module:function."
     raise UserError("unknown experiment", name, do)
 
 
@@ -47,11 +43,11 @@ def config_class_of(stage: str, domain: str = DOMAIN) -> Any:
     """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
     if stage == "collect":
         return load_domain(domain).config_class
-    if stage == "run":
-        for name, experiment in EXPERIMENTS.items():
-            if domain == experiment.domain and name != "choosing":
-                return experiment.model
-        raise UserError("no experiment uses this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
-    if stage not in MODELS:
+    if stage in MODELS:
+        return model_of(stage)
+    if stage != "run":
         raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}, run.")
-    return model_of(stage)
+    for experiment in EXPERIMENTS.values():
+        if experiment.domain == domain:
+            return experiment.model
+    raise UserError("no experiment uses this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")

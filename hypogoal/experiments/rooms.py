@@ -21,7 +21,7 @@ Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles,
 Truths = Annotated[tuple[str, ...], explained("what the reward asks for", choices=("shape", "place"))]
 
 
-@experiment("rooms", stages=("collect", "train-ensemble", "train-meta"))
+@experiment("rooms")
 def rooms(
     *,
     seeds: Rooms = tuple(range(990, 1000)),

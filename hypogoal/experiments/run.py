@@ -1,126 +1,15 @@
-"""From the name of an experiment to its cells, and to their outputs (Spec A6, G4)."""
+"""A run of cells: begun, made anew in part, gone on with (Spec A6, G1, G4)."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cache
-from itertools import pairwise
+import shutil
+from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
-from hypogoal.core.config import DOMAIN, MODELS, STAGES, assigned, described, model_of, resolve
-from hypogoal.core.config import preset as read_preset
+from hypogoal.cells import CELLS, FAILED, PLAN, Cell, read_plan
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import allow
-from hypogoal.domains.base import layers_of, settings_of
+from hypogoal.core.files import replace_text
 from hypogoal.experiments import slurm
-from hypogoal.experiments.named import find_experiment
-from hypogoal.experiments.results import write_results
-from hypogoal.experiments.sweep import Cell, begin, cells_of, read_plan, run_local
-
-
-def plan(
-    name: str,
-    *,
-    preset: str | None = None,
-    assignments: Iterable[str] = (),
-    seeds: str | None = None,
-    device: str = "auto",
-) -> tuple[list[Cell], int]:
-    """The cells of an experiment, and how many run at once (0: as many as can); a ``UserError`` where they cannot be.
-
-    ``assignments`` are ``SETTING=VALUES`` of the experiment and, where it has a domain, ``STAGE.KEY=VALUE``; so have
-    ``preset`` and ``device`` to have one. ``seeds`` are the run seeds, ``0-9``.
-    """
-    experiment, preset, fixed = find_experiment(name, preset)
-    if experiment.domain is None and (preset or device != "auto"):
-        problem = "an experiment of your own takes no preset and no device"
-        raise UserError(problem, preset or device, "Write --preset and --device into its commands.")
-    domain = experiment.domain or DOMAIN
-    of_run = {"seeds" if "seeds" in experiment.model.model_fields else "seed": seeds, **fixed}
-    of_stage: dict[str, dict[str, str]] = {stage: {} for stage in experiment.stages}
-    for key, value in assigned(assignments).items():
-        stage, dot, rest = key.partition(".")
-        stage = stage.replace("_", "-")
-        if not dot:
-            of_run[key] = value
-        elif stage in of_stage:
-            of_stage[stage][rest] = value
-        else:
-            do = f"It may be one of: {', '.join(of_stage) or 'none, its commands say all'}."
-            raise UserError("no such stage in --set", stage, do)
-    config = resolve(experiment.model, read_preset(preset, "run", domain), of_run, stage="run")
-
-    @cache
-    def settings(stage: str) -> Any:
-        return settings_of(stage, domain, preset, of_stage.get(stage, {}))
-
-    def shared(words: Sequence[str]) -> list[str]:
-        """What all commands of a stage are given, but where a command's own option says otherwise."""
-        if words[0] not in experiment.stages:
-            return []
-        more = ["--preset", preset] if preset else []
-        if device != "auto" and words[0] in MODELS:
-            more += ["--device", device]
-        names = _known(words, domain, preset, of_stage[words[0]])
-        for key, value in of_stage[words[0]].items():
-            if key in names and f"--{key.replace('_', '-')}" not in words:
-                more += ["--set", f"{key}={value}"]
-        return more
-
-    commands = experiment.commands(config, settings)
-    cells = cells_of(commands, shared, short=experiment.domain is not None, evaluate=config.evaluate)
-    _check_settings(cells)
-    return cells, config.workers
-
-
-def _known(words: Sequence[str], domain: str, preset: str | None, shared: Mapping[str, str]) -> Collection[str]:
-    """The settings that a command's stage has where those ``shared`` by all and the command's own hold."""
-    stage = words[0]
-    if stage not in MODELS:
-        return shared
-    layers = [values for values, _ in layers_of(stage, domain, preset)]
-    _, typed = _given(words)
-    return type(resolve(model_of(stage), *layers, shared, typed, {}, stage=stage)).model_fields
-
-
-@cache
-def _names_of(stage: str) -> frozenset[str]:
-    """Every setting that a stage can have."""
-    return frozenset(row["name"] for row in described(model_of(stage)))
-
-
-def _given(words: Sequence[str]) -> tuple[str | None, dict[str, str]]:
-    """The preset and the settings in the words of a command; ``--set`` wins over options."""
-    names = _names_of(words[0])
-    preset, options, assignments = None, {}, []
-    for option, value in pairwise(words):
-        name = option.removeprefix("--").replace("-", "_")
-        if option == "--set":
-            assignments.append(value)
-        elif option == "--preset":
-            preset = value
-        elif option.startswith("--") and name in names:
-            options[name] = value
-    return preset, options | assigned(assignments)
-
-
-def _check_settings(cells: Sequence[Cell]) -> None:
-    """Refuse (``UserError``) settings that the stages of cells cannot have, before the first cell starts."""
-    domains: dict[str, str] = {}  # of cells
-    for cell in cells:
-        domain = next((domains[need] for need in cell.needs), DOMAIN)
-        source = "".join(cell.words[1:2])
-        if cell.stage in ("collect", "train-baseline") and source[:1] not in ("", "-"):
-            domain = source
-        domains[cell.name] = domain
-        try:
-            if cell.stage in MODELS:
-                allow(cell.words)  # a TOML file's are allowed already, the others are of code that the user gave
-                preset, typed = _given(cell.words)
-                settings_of(cell.stage, domain, preset, typed)
-            elif cell.stage not in (*STAGES, "evaluate", "report"):
-                raise UserError("this is no stage", cell.stage, f"Choose one of {', '.join(STAGES)}.")
-        except UserError as error:
-            raise UserError(f"{cell.name}: {error.what}", error.where, error.do) from None
+from hypogoal.experiments.local import run_local
 
 
 def run(
@@ -154,17 +43,17 @@ def run(
         slurm.submit(todo, out, workers, sbatch, say)
         return
     try:
-        failed = run_local(todo, out, workers=workers, say=say)
+        run_local(todo, out, workers=workers, say=say)
     except KeyboardInterrupt as error:
         error.add_note("what is done is kept: give the same command with --resume to go on")
         raise
-    left = [cell.name for cell in todo if not cell.is_done(out)]
+    left = [cell for cell in todo if not cell.is_done(out)]
+    failed = [cell for cell in left if cell.state(out) == FAILED]
     if left:
-        first = next((cell.name for cell in todo if cell.name in failed), left[0])
-        problem = f"{len(failed)} of {len(cells)} cells failed, {len(left)} are not made"
-        do = "Mend it, then give the same command with --resume: what is done is kept."
-        raise UserError(f"{problem}; {first}", failed.get(first, "it needs what is not made"), do)
-    write_results(cells, out)
+        first = [*failed, *left][0]
+        why = first.last_words(out) if failed else "it needs what is not made"
+        problem = f"{len(failed)} of {len(cells)} cells failed, {len(left)} are not made; {first.name}"
+        raise UserError(problem, why, "Mend it, then give the same command with --resume: what is done is kept.")
 
 
 def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[Cell]:
@@ -179,3 +68,44 @@ def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[
         if from_ and not names.isdisjoint(cell.needs):
             names.add(cell.name)
     return [cell for cell in cells if cell.name in names]
+
+
+def begin(cells: Sequence[Cell], run: Path, anew: Sequence[Cell] = ()) -> None:
+    """Write the plan, and remove what cells to be made ``anew`` made. A run that has made others is a ``UserError``."""
+    ours = {cell.name: cell for cell in cells}
+    renewed = {cell.name for cell in anew}
+    for old in read_plan(run):
+        if not (old.is_derived or old.name in renewed):
+            _check_same(old, ours.get(old.name), run)
+    discard(anew, run)
+    todo = [cell for cell in cells if not cell.is_done(run)]
+    if not all(cell.is_derived for cell in todo):
+        discard([cell for cell in cells if cell.is_derived], run)  # they are of less than there will be
+    for cell in todo:
+        cell.log(run).parent.mkdir(parents=True, exist_ok=True)
+        cell.log(run, "code").unlink(missing_ok=True)
+    replace_text(run / PLAN, CELLS.dump_json([*cells], indent=1).decode() + "\n")
+
+
+def _check_same(old: Cell, new: Cell | None, run: Path) -> None:
+    """Refuse (``UserError``) a plan that lacks a cell of which there is something, or has other words for it."""
+    if not (old.is_done(run) or old.draft(run).folder.exists()):
+        return
+    do = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
+    if new is None:
+        raise UserError(f"the run here has a cell that this one lacks: {old.name}", run, do)
+    for first, second in zip_longest(old.words, new.words, fillvalue=""):
+        if first != second:
+            raise UserError(f"{old.name} was begun with {first!r}, not {second!r}", run, do)
+
+
+def discard(cells: Sequence[Cell], run: Path) -> None:
+    """Remove what cells made or began; one that is being made is a ``UserError``."""
+    for cell in cells:
+        if cell.draft(run).is_locked:
+            raise UserError(f"another process makes {cell.name}", run, "Wait until it is done, or end it.")
+    for cell in cells:
+        for folder in (cell.draft(run).folder, run / cell.place):
+            shutil.rmtree(folder, ignore_errors=True)
+        if cell.stage == "collect":
+            (run / cell.place).unlink(missing_ok=True)

@@ -10,13 +10,13 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from hypogoal.cells import Cell
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.core.own_code import environment
-from hypogoal.experiments.sweep import THREADS, Cell
+from hypogoal.experiments.local import surroundings
 
 JOBS = "slurm/jobs"  # the numbers of the jobs last submitted, the last of them first: scancel $(cat ...)
 
@@ -35,7 +35,6 @@ trap 'stop; exit 143' TERM
 {python} -P -m hypogoal "$@" >>"$log.log" 2>&1 & cell=$!
 wait "$cell"; code=$?; echo "$code" >"$log.code"; exit "$code"
 """
-GATHER = "#!/bin/sh\ncd {here} && exec {python} -P -m hypogoal.experiments.results {run}\n"
 
 
 def check_free(run: Path, *, is_wanted: bool) -> None:
@@ -45,33 +44,46 @@ def check_free(run: Path, *, is_wanted: bool) -> None:
     jobs = run / JOBS
     if jobs.exists() and shutil.which("squeue"):
         numbers = ",".join(jobs.read_text().split())
-        alive = _output("squeue", "--me", "--noheader", "--format=%A", f"--jobs={numbers}").stdout.split()
+        alive = _asked("squeue", "--me", "--noheader", "--format=%A", f"--jobs={numbers}").stdout.split()
         if alive:
             raise UserError("this run is in Slurm's queue", run, f"Wait, or end it: scancel {' '.join({*alive})}")
 
 
 def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], say: Callable[[str], None]) -> None:
-    """Submit an array for each stage of these cells at a depth; a last job writes ``results.csv``.
+    """Submit an array for each stage of these cells at a depth.
 
     At most ``cap`` cells of an array run at once; 0 is no limit. ``options`` are of ``sbatch``. Every node must see
     the run's folder under the same path. A refusal by Slurm is a ``UserError``.
     """
     folder = run.resolve() / "slurm"
     folder.mkdir(exist_ok=True)
-    values = {"here": str(Path.cwd()), "python": sys.executable, "run": str(run)}
+    output = f"--output={str(folder).replace('%', '%%')}/%x-%A-%a.out"
+    here, python = shlex.quote(os.getcwd()), shlex.quote(sys.executable)
     jobs: list[str] = []
     job_of: dict[str, str] = {}
     for name, part in _arrays(cells).items():
-        listed = folder / f"{name}.txt"
-        replace_text(listed, "".join(f"{shlex.join(_line(cell, run))}\n" for cell in part))
+        listed, script = folder / f"{name}.txt", folder / f"{name}.sh"
+        replace_text(listed, "".join(_line(cell, run) for cell in part))
+        replace_text(script, SCRIPT.format(here=here, python=python, cells=shlex.quote(str(listed))))
         needs: set[str] = set()
         for cell in part:
             needs |= {job_of[need] for need in cell.needs if need in job_of}
-        size = f"--array=0-{len(part) - 1}" + (f"%{cap}" if cap else "")
-        job = _sbatch(folder / f"{name}.sh", SCRIPT, {**values, "cells": str(listed)}, needs, [size, *options], jobs)
+        words = [f"--job-name={run.resolve().name}-{name}", output, f"--array=0-{len(part) - 1}"]
+        if cap:
+            words[-1] += f"%{cap}"
+        if needs:
+            words.append(f"--dependency=afterany:{':'.join(sorted(needs))}")
+        done = _asked("sbatch", "--parsable", *words, *options, str(script))
+        last = done.stdout.splitlines()[-1:]  # a banner may come before
+        job = "".join(last).partition(";")[0]
+        if done.returncode or not job.isdigit():
+            queued = f"Queued are {' '.join(jobs)}: end them with scancel. " if jobs else ""
+            problem = f"Slurm refuses {name} ({done.stderr or done.stdout})"
+            raise UserError(problem, None, f"{queued}Change the options and give --resume.")
+        jobs.insert(0, job)
+        replace_text(run / JOBS, "\n".join(jobs) + "\n")
         job_of |= dict.fromkeys([cell.name for cell in part], job)
         say(f"job {job}: {name}, {len(part)} cells")
-    _sbatch(folder / "gather.sh", GATHER, values, {*jobs}, [], jobs)
 
 
 def _arrays(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
@@ -84,30 +96,13 @@ def _arrays(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
     return dict(sorted(arrays.items()))
 
 
-def _line(cell: Cell, run: Path) -> list[str]:
+def _line(cell: Cell, run: Path) -> str:
     """What the batch script needs of a cell."""
-    return [str(cell.log(run).with_suffix("")), str(cell.draft(run).checkpoint), *cell.command(run), "--resume"]
+    log = cell.log(run).with_suffix("")
+    return shlex.join([str(log), str(cell.draft(run).checkpoint), *cell.command(run), "--resume"]) + "\n"
 
 
-def _sbatch(
-    script: Path, text: str, values: Mapping[str, str], needs: set[str], options: Sequence[str], jobs: list[str]
-) -> str:
-    """Submit a script that waits for the jobs ``needs``; its number, which is put first in ``jobs`` and their file."""
-    replace_text(script, text.format(**{name: shlex.quote(value) for name, value in values.items()}))
-    name = f"--job-name={script.parents[1].name}-{script.stem}"
-    output = f"--output={str(script.parent).replace('%', '%%')}/%x-%A-%a.out"
-    after = [f"--dependency=afterany:{':'.join(sorted(needs))}"] if needs else []
-    done = _output("sbatch", "--parsable", name, output, *after, *options, str(script))
-    number = done.stdout.split()[-1].partition(";")[0] if done.stdout.strip() else ""  # a banner may come before
-    if done.returncode or not number.isdigit():
-        queued = f"Queued are {' '.join(jobs)}: end them with scancel. " if jobs else ""
-        problem = f"Slurm refuses {script.stem} ({done.stderr or done.stdout})"
-        raise UserError(problem, None, f"{queued}Change the options and give --resume.")
-    jobs.insert(0, number)
-    replace_text(script.parents[1] / JOBS, "\n".join(jobs) + "\n")
-    return number
-
-
-def _output(*words: str) -> subprocess.CompletedProcess[str]:
-    exported = {**dict.fromkeys(THREADS, "1"), **os.environ, **environment()}
-    return subprocess.run(words, capture_output=True, text=True, check=False, env=exported)
+def _asked(*words: str) -> subprocess.CompletedProcess[str]:
+    """What a command of Slurm's says; jobs inherit its environment."""
+    with surroundings():
+        return subprocess.run(words, capture_output=True, text=True, check=False)

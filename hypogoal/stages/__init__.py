@@ -11,6 +11,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,7 +32,17 @@ Place = str | os.PathLike[str]
 DOMAINS = "doorkey, montezuma, rooms, or module:object."
 WIDTH = 100  # of tables
 NO_SETTINGS = ("preset", "seed", "device")  # options that a stage without settings leaves out
-STAGES: dict[str, "Stage"] = {}  # by command, those that were imported
+LISTED = {  # every stage in its order, in a line; it is loaded when it is called
+    "collect": "Collect labelled, unlabelled and held-out states.",
+    "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
+    "train-options": "Learn an option (a policy) for every member.",
+    "train-meta": "Learn from the reward which options to choose.",
+    "train-baseline": "Train PPO or DQN on primitive actions, to compare.",
+    "evaluate": "Compute every number of a run: accuracy, curves, choices.",
+    "report": "Draw the report of an evaluated run: one HTML file.",
+    "audit": "How often, and where, do policies fool a success classifier?",
+}
+STAGES: dict[str, "Stage"] = {}  # by command, those that were loaded
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
 Preset = Annotated[str | None, Option("--preset", help="demo, paper, or your .toml file.")]
@@ -128,6 +139,15 @@ class Done:
     path: Path | None = None  # where to look, if not where the stage says by default
 
 
+def load_stage(name: str) -> "Stage":
+    """The stage of a command; an unknown one is a ``UserError``."""
+    if name not in LISTED:
+        raise UserError("this is no stage", name, f"Choose one of {', '.join(LISTED)}.")
+    folder = "tools" if name == "audit" else "stages"
+    import_module(f"hypogoal.{folder}.{name.replace('-', '_')}")
+    return STAGES[name]
+
+
 def stage(example: str, **more: Any) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
     """Make a function a stage; ``example`` and ``more`` are of :class:`Stage`."""
 
@@ -191,16 +211,28 @@ class Stage:
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         return called
 
-    def command(self) -> Any:
-        """The command of the command line."""
+    def parsed(self, words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The arguments and options in the words of its command, and the settings that they give; nothing is run."""
+        with self.command.make_context(self.name, [*words]) as context:
+            values = dict(context.params)
+        return values, self._typed(values)
+
+    def _typed(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Take the settings out of the ``values`` of options; ``--set`` wins."""
         from hypogoal.core.config import assigned
 
+        chosen = {name: values.pop(name) for name in self.often}
+        typed = {name: value for name, value in chosen.items() if value is not None}
+        return typed | assigned(values.pop("set_", None) or ())
+
+    @functools.cached_property
+    def command(self) -> Any:
+        """The command of the command line."""
+
         def called(**values: Any) -> None:
+            typed = self._typed(values)
             source = values.pop(self.source.name)
             out = values.pop("out")
-            chosen = {name: values.pop(name) for name in self.often}
-            typed = {name: value for name, value in chosen.items() if value is not None}
-            typed |= assigned(values.pop("set_", None) or ())
             call, done = self.run(source, out, values, typed)
             if not call.quiet:
                 for line in done.lines:

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hypogoal import cells
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import drawn
@@ -23,14 +24,13 @@ def evaluate(
     """Compute every number of a run: accuracy, curves, choices.
 
     ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them. ``out`` gets ``metrics.json``,
-    ``numbers.csv`` and ``arrays.h5``.
+    ``numbers.csv``, ``arrays.h5`` and, of a run of an experiment, ``results.csv``.
     """
     from hypogoal.core.processes import prepare
     from hypogoal.data import create_hdf5
     from hypogoal.evaluation import questions
     from hypogoal.evaluation.judging import cases_of
     from hypogoal.evaluation.run import find
-    from hypogoal.experiments.sweep import unmade
     from hypogoal.meta.config import layout_seeds
 
     prepare()
@@ -56,10 +56,11 @@ def evaluate(
             questions.judge_ensembles(work, cases)
             questions.answer(work)
             missing = questions.missing(work)
-            if left := unmade(run):
+            if left := cells.unmade(run):
                 missing.append(f"{len(left)} of the run's cells are not done; the first is {left[0]}")
             metrics = questions.metrics_of(work, settings, data, missing)
         questions.write(draft.files, metrics, work.rows)
+        cells.write_results(run, draft.files)
     table = drawn(questions.summary_table(metrics), WIDTH).splitlines()
     is_of_run = call.out == run / "evaluation"
     return Done(table, ("report", run) if is_of_run else ("show", call.out))

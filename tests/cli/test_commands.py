@@ -11,6 +11,7 @@ import pytest
 from command_line import refuses, run
 
 from hypogoal import cli
+from hypogoal.stages import LISTED
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = cli.commands()
@@ -42,7 +43,7 @@ def test_help_ends_with_an_example_that_can_be_typed(name: str) -> None:
     text = run(name, "--help").out
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     assert max(map(len, text.splitlines())) <= 80
-    assert lines[1] == cli.STAGES.get(name, lines[1])
+    assert lines[1] == LISTED.get(name, lines[1])
     assert lines[-2] == "Example:" and lines[-1].startswith(f"hypogoal {name} ")
     options = {option for parameter in COMMANDS[name].params for option in parameter.opts}
     assert {word for word in lines[-1].split() if word.startswith("--")} <= options

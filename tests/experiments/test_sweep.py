@@ -16,9 +16,11 @@ import pytest
 from command_line import fails, refuses, run
 from toy import SMALL, write_toy
 
+from hypogoal.cells import read_plan, status_lines
 from hypogoal.core.artefacts import Draft
-from hypogoal.experiments.run import plan
-from hypogoal.experiments.sweep import begin, read_plan, run_local, state_of, status_lines
+from hypogoal.experiments.local import run_local
+from hypogoal.experiments.plan import plan
+from hypogoal.experiments.run import begin
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0
@@ -50,7 +52,7 @@ def bytes_of(out: Path) -> dict[str, bytes]:
 
 
 def states(out: Path) -> dict[str, str]:
-    return {cell.name: state_of(cell, out) for cell in read_plan(out)}
+    return {cell.name: cell.state(out) for cell in read_plan(out)}
 
 
 def made(out: Path) -> dict[str, int]:
@@ -105,8 +107,7 @@ def test_forked_and_fresh_cells_make_the_same_bytes(whole: Path, tmp_path: Path)
     chain = cells[:3]
     begin(chain, tmp_path / "fresh")
     said: list[str] = []
-    failed = run_local(chain, tmp_path / "fresh", workers=2, say=said.append, forked=False)
-    assert failed == {}
+    run_local(chain, tmp_path / "fresh", workers=2, say=said.append, forked=False)
     assert [line.split()[0] for line in said if " ...; " in line] == [cell.name for cell in chain]
     fresh, forked = bytes_of(tmp_path / "fresh"), bytes_of(whole / "out")
     assert fresh == {name: forked[name] for name in fresh} and len(fresh) > 8
@@ -202,7 +203,7 @@ def test_a_stage_made_again_may_have_other_settings(whole: Path, out: Path) -> N
     run("run", toy, "--out", out, "--from", "train-meta", "-q")
     assert renewed(before, out) == ["agent/seed-0", "agent/seed-1", "evaluation", "report"]
     run("run", toy, "--out", out, "--resume", "--seed", "0-2", "-q")
-    assert "agent/seed-2,train-meta,agent,2," in (out / "results.csv").read_text()
+    assert "agent/seed-2,train-meta,agent,2," in (out / "evaluation" / "results.csv").read_text()
 
 
 def test_what_a_run_refuses(whole: Path, out: Path, tmp_path: Path) -> None:

@@ -14,12 +14,13 @@ from command_line import refuses, run
 from openings import agrees
 from toy_data import reseal
 
+from hypogoal.cells import Cell
 from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.run import read_evaluation, thresholds_of
-from hypogoal.experiments.sweep import Cell, begin
+from hypogoal.experiments.run import begin
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import report
