@@ -103,7 +103,11 @@ def read_plan(run: Path) -> list[Cell]:
         return CELLS.validate_json(path.read_bytes())
     except ValidationError as error:
         problem = f"the plan is damaged, or of another version ({reason(error)})"
-        raise UserError(problem, path, "Remove it: what is complete is kept.") from None
+        raise UserError(
+            problem,
+            path,
+            "Remove it: what is complete is kept.",
+        ) from None
 
 
 def reason(error: Exception) -> str:

@@ -205,21 +205,20 @@ def run(
     --set takes settings of the experiment, and STAGE.KEY=VALUE.
     """
     from hypogoal import look
-    from hypogoal.experiments.plan import plan
-    from hypogoal.experiments.run import in_part
-    from hypogoal.experiments.run import run as run_cells
+    from hypogoal.experiments import plan as plans
+    from hypogoal.experiments import run as runs
 
     out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
-    cells, workers = plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
+    cells, workers = plans.plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
     if dry_run:
-        for cell in in_part(cells, from_, only):
+        for cell in runs.in_part(cells, from_, only):
             say(shlex.join(["hypogoal", *cell.command(out)]))
         return
     if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
         processes.prepare(device)
-    run_cells(
+    runs.run(
         cells,
         out,
         workers=workers,
@@ -299,24 +298,24 @@ def config(
     as_json: Json = False,
 ) -> None:
     """List every setting of a stage: default, unit, meaning, source."""
-    from hypogoal.core.config import TABLES, as_toml, described
-    from hypogoal.core.files import replace_text
-    from hypogoal.domains.base import layers_of, load_domain
+    from hypogoal.core import config as settings
+    from hypogoal.domains import base as domains
     from hypogoal.experiments.named import config_class_of
 
     if stage is None:
         helps = stages.LISTED | {"run": "Run all cells of an experiment."}
-        echo(list(TABLES), as_json, [f"{name:15}{helps[name]}" for name in TABLES])
+        names = list(settings.TABLES)
+        echo(names, as_json, [f"{name:15}{helps[name]}" for name in names])
         return
-    rows = described(config_class_of(stage, domain), *layers_of(stage, domain, preset))
-    if not load_domain(domain).starts:
+    rows = settings.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
+    if not domains.load_domain(domain).starts:
         rows = [row for row in rows if row["name"] != "start"]  # it would be refused
     if write is None:
         echo(rows, as_json, _setting_lines(rows))
         return
     if write.exists() or write.suffix != ".toml":
         raise UserError("a preset needs a new .toml file", write, "Choose another name.")
-    replace_text(write, as_toml(stage, rows))
+    write.write_text(settings.as_toml(stage, rows), encoding="utf-8")
     say(write)
 
 
@@ -477,21 +476,20 @@ def check(
     changes how, as for 'collect'.
     """
     from hypogoal import check as contracts
-    from hypogoal.core.config import assigned
-    from hypogoal.diversity import load_objective
-    from hypogoal.domains.base import load_domain, settings_of
+    from hypogoal.core import config as settings
+    from hypogoal.domains import base as domains
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
     verdicts: list[Any] = []
     observations: tuple[Any, ...] = ()
     if domain is not None:
-        loaded = load_domain(domain)
-        settings = settings_of("collect", domain, typed=assigned(set_ or ()))
-        verdicts.append(contracts.check_domain(loaded, settings, layout_seed=layout_seed, seed=seed))
+        loaded = domains.load_domain(domain)
+        chosen = domains.settings_of("collect", domain, typed=settings.assigned(set_ or ()))
+        verdicts.append(contracts.check_domain(loaded, chosen, layout_seed=layout_seed, seed=seed))
         observations = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
-        verdicts.append(contracts.check_objective(load_objective(diversity)))
+        verdicts.append(contracts.check_objective(diversity))
     if network is not None:
         verdicts.append(contracts.check_network(network, *observations))
     broken = False

@@ -3,6 +3,8 @@
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -10,11 +12,11 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from hypogoal.check.verdict import Verdict, promise, verdicts
-from hypogoal.core.config import MODELS, model_of, resolve
+from hypogoal.core.config import STAGES, model_of, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GET_MORE, Collected, Unmet, require_classes, require_names
-from hypogoal.domains.base import Domain, Engine, Step
+from hypogoal.data import GET_MORE, Unmet, require_classes, require_names, write_dataset
+from hypogoal.domains.base import Domain, Engine, check_step
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
 STATE_NOW = "A label is a function of the state now: count, keep and draw nothing in it."
@@ -28,7 +30,7 @@ def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, se
     (None: the defaults). ``seed`` is for both. A sub-goal that play does not reach is a warning.
     """
     laws = [_Played.settings, _Played.gymnasium] if domain.has_env else [_Played.settings]
-    laws += [_Played.steps, _Played.observations, _Played.labels, _Played.two_engines, _Played.restore, _Played.collect]
+    laws += [_Played.observations, _Played.steps, _Played.labels, _Played.two_engines, _Played.restore, _Played.collect]
     return verdicts(laws, _Played(domain, config, layout_seed, seed))
 
 
@@ -41,120 +43,143 @@ class _Played:
     layout_seed: int
     seed: int
 
-    def settings(self) -> str:
-        """Names of sub-goals become files; its own settings have defaults; each stage takes those it gets."""
+    def settings(self) -> None:
+        """Names of sub-goals can be those of files, and each stage takes the defaults for it."""
         domain = self.domain
         require_names(tuple(domain.sub_goals))
         self.config = self.config or resolve(domain.config_class, stage="collect")
-        models = {"collect": domain.config_class} | {stage: model_of(stage) for stage in MODELS}
         for stage, values in domain.defaults.items():
             text = f"defaults are for {stage!r}, which is not a stage"
-            promise(stage in models, text, f"The stages are {', '.join(models)}.")
-            resolve(models[stage], values, {}, stage=stage)
-        return f"defaults for {', '.join(domain.defaults) or 'no stage'}"
+            promise(
+                stage in STAGES,
+                text,
+                f"The stages are {', '.join(STAGES)}.",
+            )
+            model = domain.config_class if stage == "collect" else model_of(stage)
+            resolve(model, values, {}, stage=stage)
 
-    def gymnasium(self) -> str:
-        """Gymnasium's own checker, but for rendering, and for closing, which makes the environment again."""
+    def gymnasium(self) -> None:
+        """Gymnasium's checker finds nothing, but for rendering, and closing, which makes the environment again."""
         warnings.filterwarnings("ignore", ".*is different from the unwrapped version")  # wrappers are the point
-        env = self.domain.make_env()
-        check_env(env, skip_render_check=True, skip_close_check=True)
-        return f"{env.observation_space}, {env.action_space}"
-
-    def steps(self) -> str:
-        """Arrays of the right type and shape, finite rewards, episodes that end in time."""
-        engine, domain, ended = self.make_engine(), self.domain, 0
-        types = {"next_ids": np.int64, "rewards": np.float32, "images": domain.observation_dtype}
-        shapes = {"images": domain.observation_shape, "labels": (len(domain.sub_goals),)}
-        for actions in self.actions(engine):
-            elapsed = engine.elapsed + 1
-            step = engine.step(actions)
-            for name, values in _shown(engine, step).items():
-                _require_array(name, values, types.get(name, np.bool_), COUNT, *shapes.get(name, ()))
-            finite = bool(np.isfinite(step.rewards).all())
-            promise(finite, f"rewards are {step.rewards}", "Give finite numbers.")
-            over = step.terminated | step.truncated
-            cut = bool(over[elapsed >= MAX_STEPS].all())
-            promise(cut, "an episode went on after max_steps", "Truncate it there.")
-            counted = np.array_equal(engine.elapsed, np.where(over, 0, elapsed))
-            promise(counted, f"elapsed is {engine.elapsed}, ended {over}", "Count the steps of each episode.")
-            ended += int(over.sum())
-        return f"{STEPS} at random in {COUNT} environments, {ended} episodes ended"
+        check_env(self.domain.make_env(), skip_render_check=True, skip_close_check=True)
 
     def observations(self) -> str:
-        """Written into ``out``, too."""
+        """Of the domain's type and shape, also written into ``out``."""
         engine = self.make_engine()
         images = engine.images(engine.ids)
+        self.require_observations("images", images, COUNT)
         out = np.zeros_like(images)
         engine.images(engine.ids, out)
-        filled = np.array_equal(images, out)
-        promise(filled, "images(ids, out) does not fill out", "Write the images into it.")
+        promise(
+            np.array_equal(images, out),
+            "images(ids, out) does not fill out",
+            "Write the images into it.",
+        )
         if self.domain.doubt:
             warnings.warn(self.domain.doubt, stacklevel=1)
         return f"{images.dtype} {images.shape[1:]}"
 
-    def labels(self) -> str:
-        """The same when computed twice; a warning where observations do not show them."""
+    def steps(self) -> None:
+        """Well-formed, counted, and episodes end in time."""
+        engine = self.make_engine()
+        for actions in self.actions(engine):
+            elapsed = engine.elapsed + 1
+            step = engine.step(actions)
+            check_step(engine, step)
+            over = step.terminated | step.truncated
+            promise(
+                over[elapsed >= MAX_STEPS].all(),
+                "an episode went on after max_steps",
+                "Truncate it there.",
+            )
+            counted = np.array_equal(engine.elapsed, np.where(over, 0, elapsed))
+            promise(
+                counted,
+                f"elapsed is {engine.elapsed}, ended {over}",
+                "Count the steps of each episode.",
+            )
+
+    def labels(self) -> None:
+        """The same when asked twice in the same state."""
         engine, goals = self.make_engine(), np.array(self.domain.sub_goals)
-        seen: dict[bytes, set[bytes]] = {}
+        seen = set()
         for actions in self.actions(engine):
             engine.step(actions)
             labels = engine.labels(engine.ids)
+            _require_array("labels", labels, np.bool_, COUNT, len(goals))
             changed = (engine.labels_now() != labels).any(0)
             text = f"asked twice in the same state, labels differ: {', '.join(goals[changed])}"
-            promise(not changed.any(), text, STATE_NOW)
+            promise(
+                not changed.any(),
+                text,
+                STATE_NOW,
+            )
             for image, row in zip(engine.images(engine.ids), labels, strict=True):
-                seen.setdefault(image.tobytes(), set()).add(row.tobytes())
-        ambiguous = sum(len(rows) > 1 for rows in seen.values())
-        if ambiguous:
-            text = f"{ambiguous} of {len(seen)} observations have different labels: no classifier can tell them apart"
+                seen.add((image.tobytes(), row.tobytes()))
+        images = {image for image, _ in seen}
+        if len(images) < len(seen):
+            text = f"{len(images)} observations have {len(seen)} different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=1)
-        return f"the same when asked twice, in {len(seen)} observations"
 
-    def two_engines(self) -> str:
-        first = self.make_engine()
-        _require_same(first, self.make_engine(), self.actions(first), SEEDED)
-        return f"the same for {STEPS} steps of layout_seed {self.layout_seed}"
+    def two_engines(self) -> None:
+        """Of the same layout seed: the same actions show the same."""
+        _require_same(self.make_engine(), self.make_engine(), self.actions, SEEDED)
 
-    def restore(self) -> str:
+    def restore(self) -> str | None:
         """A restored engine goes on as the one whose snapshot it got."""
         saved, restored = self.make_engine(), self.make_engine()
         if not saved.resumes:
             warnings.warn("it has no snapshot and restore: training on it cannot be resumed", stacklevel=1)
             return "not looked at"
-        actions = self.actions(saved)
-        for row in actions:
-            saved.step(row)
+        for actions in self.actions(saved):
+            saved.step(actions)
         restored.restore(saved.snapshot())
-        _require_same(saved, restored, actions, "After restore() it is another: save all that the next steps need.")
-        return f"the same for {STEPS} steps after it"
+        _require_same(
+            saved, restored, self.actions, "After restore() it is another: save all that the next steps need."
+        )
+        return None
 
     def collect(self) -> str:
-        """States of the right type and shape, the same for the same seed, of both classes."""
+        """Can be stored, fits the domain, the same file for the same seed, of both classes."""
         domain, goals = self.domain, tuple(self.domain.usual_sub_goals)
-        try:
-            first, again = self.collected(), self.collected()
-        except Unmet as error:
-            warnings.warn(str(error), stacklevel=1)
-            return "not looked at: play did not reach the states"
-        same = tuple(first.sub_goals) == goals
-        promise(same, f"sub_goals are {first.sub_goals}, not {goals}", "Give the domain's, in their order.")
+        config, progress = domain.small(self.config), Progress("check", total=1, quiet=True)
+        files = []
+        with TemporaryDirectory() as folder:
+            place = Path(folder, "data.h5")
+            for _ in range(2):
+                try:
+                    found = domain.collect(config, self.seed, progress)
+                except Unmet as error:
+                    warnings.warn(str(error), stacklevel=1)
+                    return "not looked at: play did not reach the states"
+                write_dataset(place, found, domain=domain.name, config={}, seed=self.seed)
+                files.append(place.read_bytes())
+        promise(
+            files[0] == files[1],
+            f"states differ when collected again with seed {self.seed}",
+            SEEDED,
+        )
+        text = f"sub_goals are {found.sub_goals}, not {goals}"
+        promise(
+            tuple(found.sub_goals) == goals,
+            text,
+            "Give the domain's, in their order.",
+        )
         for name in ("labelled", "unlabelled", "heldout"):
-            states, others = getattr(first, name), getattr(again, name)
-            count = len(states.labels)
-            promise(count > 0, f"there are no {name} states", "Collect some: other seeds, or more steps.")
-            _require_array(name, states.observations, domain.observation_dtype, count, *domain.observation_shape)
-            _require_array(f"labels of {name}", states.labels, np.bool_, count, len(goals))
-            same = np.array_equal(states.labels, others.labels)
-            same &= np.array_equal(states.observations, others.observations)
-            promise(same, f"{name} states differ when collected again with seed {self.seed}", SEEDED)
-        require_classes(first.labelled.labels, goals, "collect", GET_MORE)
-        counts = zip(goals, first.labelled.labels.sum(0), strict=True)
-        positives = ", ".join(f"{count} {goal}" for goal, count in counts)
-        return f"positives of {len(first.labelled.labels)}: {positives}"
+            observations = getattr(found, name).observations
+            promise(
+                len(observations),
+                f"there are no {name} states",
+                "Collect some: other seeds, or more steps.",
+            )
+            self.require_observations(name, observations, len(observations))
+        require_classes(found.labelled.labels, goals, "collect", GET_MORE)
+        labels = found.labelled.labels
+        return f"{len(labels)} labelled states, positives of each sub-goal: {labels.sum(0)}"
 
-    def collected(self) -> Collected:
-        config = self.domain.small(self.config)
-        return self.domain.collect(config, self.seed, Progress("check", total=1, quiet=True))
+    def require_observations(self, name: str, values: Any, count: int) -> None:
+        """Refuse anything but so many observations of the domain's type and shape."""
+        _require_array(name, values, self.domain.observation_dtype, count, *self.domain.observation_shape)
 
     def make_engine(self) -> Engine:
         starts = self.domain.starts
@@ -166,24 +191,31 @@ class _Played:
         return rng_for(self.seed, "check").integers(engine.n_actions, size=(STEPS, COUNT))
 
 
-def _shown(engine: Engine, step: Step) -> dict[str, Any]:
-    """All that a step shows, by name."""
-    parts = {name: values for name, values in step._asdict().items() if values is not None}
-    images = engine.images(step.next_ids)
-    return {**parts, "images": images, "labels": engine.labels(step.next_ids)}
-
-
-def _require_same(first: Engine, second: Engine, actions: NDArray[np.int64], do: str) -> None:
+def _require_same(first: Engine, second: Engine, actions: Any, do: str) -> None:
     """Two engines show the same."""
-    for number, row in enumerate(actions, 1):
-        left, right = _shown(first, first.step(row)), _shown(second, second.step(row))
-        for name in left.keys() - {"next_ids"}:
-            promise(np.array_equal(left[name], right[name]), f"{name} differ in step {number}", do)
+    for number, row in enumerate(actions(first), 1):
+        left, right = _shown(first, row), _shown(second, row)
+        for name, values in left.items():
+            promise(
+                np.array_equal(values, right[name]),
+                f"{name} differ in step {number}",
+                do,
+            )
+
+
+def _shown(engine: Engine, actions: NDArray[np.int64]) -> dict[str, Any]:
+    """All that a step shows, by name."""
+    parts = engine.step(actions)._asdict()
+    ids = parts.pop("next_ids")
+    return {**parts, "images": engine.images(ids), "labels": engine.labels(ids)}
 
 
 def _require_array(name: str, value: Any, dtype: Any, *shape: int) -> None:
-    """Refuse anything but a NumPy array of this type and shape."""
+    """Refuse anything but an array of this type and shape."""
     actual = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
     wanted = f"{np.dtype(dtype)} {shape}"
-    fits = isinstance(value, np.ndarray) and actual == wanted
-    promise(fits, f"{name}: {actual} instead of {wanted}", "Give a NumPy array of that type and shape.")
+    promise(
+        actual == wanted,
+        f"{name}: {actual} instead of {wanted}",
+        "Give a NumPy array of that type and shape.",
+    )

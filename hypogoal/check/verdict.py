@@ -32,20 +32,22 @@ class Verdict:
         return [verdict, *(f"warn {self.name}: {text}" for text in self.warnings)]
 
 
-def promise(kept: bool, fault: str, do: str) -> None:
+def promise(kept: object, fault: str, do: str) -> None:
     """Raise a ``UserError`` unless a promise is ``kept``."""
     if not kept:
         raise UserError(fault, do=do)
 
 
-def verdicts(laws: Iterable[Callable[[Any], str]], subject: Any) -> Iterator[Verdict]:
-    """The verdict on each law, a function of what is checked that returns what it saw, or raises what is wrong."""
+def verdicts(laws: Iterable[Callable[[Any], str | None]], subject: Any) -> Iterator[Verdict]:
+    """The verdict on each law, a function of what is checked that raises what is wrong.
+
+    It may return what it saw; else what its docstring says is so.
+    """
     for law in laws:
-        ok = True
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                text = law(subject)
+                ok, text = True, law(subject) or str(law.__doc__)
             except UserError as error:
                 ok, text = False, str(error)
             except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code raises

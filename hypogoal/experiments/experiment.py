@@ -15,6 +15,7 @@ import inspect
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -71,7 +72,11 @@ class Experiment:
             return COMMANDS.validate_python([*self.function(**settings)])
         except ValidationError as error:
             problem = f"an experiment yields (name, command) or (name, command, columns) ({reason(error)})"
-            raise UserError(problem, self.name, MEND) from None
+            raise UserError(
+                problem,
+                self.name,
+                MEND,
+            ) from None
 
 
 def explained(meaning: str, **limits: Any) -> Any:
@@ -98,7 +103,11 @@ def experiment(domain: str | None = None, **more: Any) -> Callable[[Callable[...
                 continue
             if name not in hints or parameter.default is parameter.empty or name in RunConfig.model_fields:
                 where = f"{function.__name__}: {name}"
-                raise UserError("this argument cannot be a setting", where, "Give it a type and a default.")
+                raise UserError(
+                    "this argument cannot be a setting",
+                    where,
+                    "Give it a type and a default.",
+                )
             fields[name] = (hints[name], parameter.default)
         return Experiment(function.__name__.replace("_", "-"), function, _model_of(fields), domain, **more)
 
@@ -115,7 +124,11 @@ def load_experiment(name: str) -> Experiment:
     if isinstance(target, Experiment):
         return target
     if not inspect.isgeneratorfunction(target):
-        raise UserError("the object is not an experiment", name, "Give a generator of (name, command).")
+        raise UserError(
+            "the object is not an experiment",
+            name,
+            "Give a generator of (name, command).",
+        )
     return experiment()(target)
 
 
@@ -125,7 +138,11 @@ def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> 
         return list(product(layouts, seeds))
     if len(layouts) != len(seeds):
         problem = f"{len(layouts)} layouts cannot be paired with {len(seeds)} seeds"
-        raise UserError(problem, None, "Give as many of both, or paired=false for every layout with every seed.")
+        raise UserError(
+            problem,
+            None,
+            "Give as many of both, or paired=false for every layout with every seed.",
+        )
     return list(zip(layouts, seeds, strict=True))
 
 
@@ -168,7 +185,7 @@ class _File(RunConfig):
 
 def read_toml(path: Path) -> Experiment:
     """The experiment in a TOML file; a ``UserError`` where there is none."""
-    try:
+    with _readable(path):
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
         fields: dict[str, Any] = {}
         for name, axis in file.axes.items():
@@ -176,15 +193,22 @@ def read_toml(path: Path) -> Experiment:
             kind: Any = type(values[0])
             fields[name] = (tuple[kind, ...], tuple(values))
         model = _model_of(fields)
-    except (OSError, ValueError, LookupError, NameError) as error:
-        raise UserError(f"the experiment cannot be read ({reason(error)})", path, MEND) from None
 
     def commands(**axes: Any) -> list[Command]:
-        try:
+        with _readable(path):
             return [*file.commands(axes)]
-        except (LookupError, ValueError, AttributeError) as error:
-            problem = f"a command cannot be read, or names neither an axis of its cells nor cells over those ({error})"
-            raise UserError(problem, path, MEND) from None
 
     given = {"workers": file.workers, "evaluate": file.evaluate}
     return Experiment(path.stem, commands, model, given=given)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, LookupError, NameError, AttributeError) as error:
+        raise UserError(
+            f"the experiment cannot be read ({reason(error)})",
+            path,
+            MEND,
+        ) from None

@@ -89,7 +89,11 @@ def plan(
     stages = dict.fromkeys(cell.stage for cell in cells)
     for stage in of_stage:
         if stage not in stages:
-            raise UserError("no such stage in --set", stage, f"This run has {', '.join(stages)}.")
+            raise UserError(
+                "no such stage in --set",
+                stage,
+                f"This run has {', '.join(stages)}.",
+            )
     if config.evaluate:
         everything = [cell.name for cell in cells]
         cells.append(Cell(name="evaluation", words=["evaluate", "@."], needs=everything))
@@ -107,7 +111,11 @@ def _cells_of(commands: Sequence[Command], shared: _Shared, *, is_short: bool) -
     for name, command, columns in commands:
         folder = name.partition("/")[0]
         if name in cells or folder in TAKEN:
-            raise UserError("a cell needs a name of its own", name, f"Give each value once. {MEND}")
+            raise UserError(
+                "a cell needs a name of its own",
+                name,
+                f"Give each value once. {MEND}",
+            )
         try:
             words = shlex.split(command)
             outputs = filter(None, map(OUTPUT.search, words))
@@ -122,12 +130,24 @@ def _cells_of(commands: Sequence[Command], shared: _Shared, *, is_short: bool) -
                 columns=dict(columns),
             )
         except UserError as error:
-            raise UserError(f"{name}: {error.what}", error.where, error.do) from None
+            raise UserError(
+                f"{name}: {error.what}",
+                error.where,
+                error.do,
+            ) from None
         except ValidationError as error:
-            raise UserError(f"the cell's name becomes a file's ({reason(error)})", name, MEND) from None
+            raise UserError(
+                f"the cell's name becomes a file's ({reason(error)})",
+                name,
+                MEND,
+            ) from None
         except (ValueError, KeyError) as error:
             problem = f"the command cannot be read, or reads what no cell before it makes ({error})"
-            raise UserError(problem, name, MEND) from None
+            raise UserError(
+                problem,
+                name,
+                MEND,
+            ) from None
         cells[name] = cell
         domains[cell.name] = domain
     return [*cells.values()]

@@ -11,6 +11,8 @@ from hypogoal.core.files import replace_text
 from hypogoal.experiments import slurm
 from hypogoal.experiments.local import run_local
 
+OTHERWISE = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
+
 
 def run(
     cells: Sequence[Cell],
@@ -31,10 +33,18 @@ def run(
     """
     chosen = in_part(cells, from_, only)
     if out.exists() and not out.is_dir():
-        raise UserError("a run needs a folder, this is a file", out, "Choose another --out.")
+        raise UserError(
+            "a run needs a folder, this is a file",
+            out,
+            "Choose another --out.",
+        )
     if out.exists() and not (force or resume or from_ or only):
         do = "Give --resume to finish it, --from STAGE to make a part anew, --force to make all anew."
-        raise UserError("the run exists already", out, do)
+        raise UserError(
+            "the run exists already",
+            out,
+            do,
+        )
     slurm.check_free(out, is_wanted=sbatch is not None)
     anew = [] if resume else [*chosen, *read_plan(out)] if force else chosen
     begin(cells, out, anew)
@@ -53,7 +63,11 @@ def run(
         first = [*failed, *left][0]
         why = first.last_words(out) if failed else "it needs what is not made"
         problem = f"{len(failed)} of {len(cells)} cells failed, {len(left)} are not made; {first.name}"
-        raise UserError(problem, why, "Mend it, then give the same command with --resume: what is done is kept.")
+        raise UserError(
+            problem,
+            why,
+            "Mend it, then give the same command with --resume: what is done is kept.",
+        )
 
 
 def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[Cell]:
@@ -63,7 +77,11 @@ def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[
     names = {cell.name for cell in cells if cell.stage == (from_ or only)}
     if not names or (from_ and only):
         stages = ", ".join(dict.fromkeys(cell.stage for cell in cells))
-        raise UserError("--from or --only needs one stage of the run", f"{from_ or only}", f"Choose one of {stages}.")
+        raise UserError(
+            "--from or --only needs one stage of the run",
+            f"{from_ or only}",
+            f"Choose one of {stages}.",
+        )
     for cell in cells:  # those that a cell needs are before it
         if from_ and not names.isdisjoint(cell.needs):
             names.add(cell.name)
@@ -72,38 +90,44 @@ def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[
 
 def begin(cells: Sequence[Cell], run: Path, anew: Sequence[Cell] = ()) -> None:
     """Write the plan, and remove what cells to be made ``anew`` made. A run that has made others is a ``UserError``."""
-    ours = {cell.name: cell for cell in cells}
+    ours = {cell.name: cell.words for cell in cells}
     renewed = {cell.name for cell in anew}
     for old in read_plan(run):
-        if not (old.is_derived or old.name in renewed):
-            _check_same(old, ours.get(old.name), run)
+        is_begun = old.is_done(run) or old.draft(run).folder.exists()
+        if not is_begun or old.is_derived or old.name in renewed:
+            continue
+        if old.name not in ours:
+            raise UserError(
+                f"the run here has a cell that this one lacks: {old.name}",
+                run,
+                OTHERWISE,
+            )
+        for before, now in zip_longest(old.words, ours[old.name]):
+            if before != now:
+                raise UserError(
+                    f"{old.name} was begun with {before!r}, not {now!r}",
+                    run,
+                    OTHERWISE,
+                )
     discard(anew, run)
-    todo = [cell for cell in cells if not cell.is_done(run)]
-    if not all(cell.is_derived for cell in todo):
+    if not all(cell.is_derived or cell.is_done(run) for cell in cells):
         discard([cell for cell in cells if cell.is_derived], run)  # they are of less than there will be
-    for cell in todo:
-        cell.log(run).parent.mkdir(parents=True, exist_ok=True)
-        cell.log(run, "code").unlink(missing_ok=True)
+    for cell in cells:
+        if not cell.is_done(run):
+            cell.log(run).parent.mkdir(parents=True, exist_ok=True)
+            cell.log(run, "code").unlink(missing_ok=True)
     replace_text(run / PLAN, CELLS.dump_json([*cells], indent=1).decode() + "\n")
-
-
-def _check_same(old: Cell, new: Cell | None, run: Path) -> None:
-    """Refuse (``UserError``) a plan that lacks a cell of which there is something, or has other words for it."""
-    if not (old.is_done(run) or old.draft(run).folder.exists()):
-        return
-    do = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
-    if new is None:
-        raise UserError(f"the run here has a cell that this one lacks: {old.name}", run, do)
-    for first, second in zip_longest(old.words, new.words, fillvalue=""):
-        if first != second:
-            raise UserError(f"{old.name} was begun with {first!r}, not {second!r}", run, do)
 
 
 def discard(cells: Sequence[Cell], run: Path) -> None:
     """Remove what cells made or began; one that is being made is a ``UserError``."""
     for cell in cells:
         if cell.draft(run).is_locked:
-            raise UserError(f"another process makes {cell.name}", run, "Wait until it is done, or end it.")
+            raise UserError(
+                f"another process makes {cell.name}",
+                run,
+                "Wait until it is done, or end it.",
+            )
     for cell in cells:
         for folder in (cell.draft(run).folder, run / cell.place):
             shutil.rmtree(folder, ignore_errors=True)

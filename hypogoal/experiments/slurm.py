@@ -40,13 +40,21 @@ wait "$cell"; code=$?; echo "$code" >"$log.code"; exit "$code"
 def check_free(run: Path, *, is_wanted: bool) -> None:
     """Refuse (``UserError``) a run whose jobs wait or run and, if Slurm ``is_wanted``, a machine without it."""
     if is_wanted and shutil.which("sbatch") is None:
-        raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
+        raise UserError(
+            "there is no Slurm here (no sbatch)",
+            "--engine slurm",
+            "Use --engine local.",
+        )
     jobs = run / JOBS
     if jobs.exists() and shutil.which("squeue"):
         numbers = ",".join(jobs.read_text().split())
         alive = _asked("squeue", "--me", "--noheader", "--format=%A", f"--jobs={numbers}").stdout.split()
         if alive:
-            raise UserError("this run is in Slurm's queue", run, f"Wait, or end it: scancel {' '.join({*alive})}")
+            raise UserError(
+                "this run is in Slurm's queue",
+                run,
+                f"Wait, or end it: scancel {' '.join({*alive})}",
+            )
 
 
 def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], say: Callable[[str], None]) -> None:
@@ -79,7 +87,11 @@ def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], s
         if done.returncode or not job.isdigit():
             queued = f"Queued are {' '.join(jobs)}: end them with scancel. " if jobs else ""
             problem = f"Slurm refuses {name} ({done.stderr or done.stdout})"
-            raise UserError(problem, None, f"{queued}Change the options and give --resume.")
+            raise UserError(
+                problem,
+                None,
+                f"{queued}Change the options and give --resume.",
+            )
         jobs.insert(0, job)
         replace_text(run / JOBS, "\n".join(jobs) + "\n")
         job_of |= dict.fromkeys([cell.name for cell in part], job)
