@@ -13,7 +13,6 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_end
 
 PLAN = "sweep.json"
 NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's folder
@@ -66,9 +65,14 @@ class Cell(BaseModel):
         """What its attempts printed; with the suffix ``code``, how the last one ended."""
         return run / "logs" / f"{self.name}.{suffix}"
 
+    def log_lines(self, run: Path, suffix: str = "log") -> list[str]:
+        """The lines of :meth:`log`, none where there is none."""
+        path = self.log(run, suffix)
+        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+
     def exit_code(self, run: Path) -> int | None:
         """How its last attempt ended, a signal as a negative number; None if it was not tried or has not ended."""
-        lines = read_end(self.log(run, "code"))
+        lines = self.log_lines(run, "code")
         return int(lines[0]) if lines else None
 
     def state(self, run: Path) -> str:
@@ -81,7 +85,7 @@ class Cell(BaseModel):
 
     def last_words(self, run: Path) -> str:
         """The last line of its log, or how it ended without one; and where the log is."""
-        lines = read_end(self.log(run))
+        lines = self.log_lines(run)
         text = lines[-1].removeprefix("hypogoal: ") if lines else ""
         code = self.exit_code(run)
         if code == 0:

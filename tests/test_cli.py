@@ -5,16 +5,12 @@ import re
 import shutil
 from pathlib import Path
 
-import gymnasium
-import numpy as np
 import pytest
 from command_line import refuses, run
 from shared_runs import DOORKEY_RUN, command
 from toy_data import reseal
 
-import hypogoal
 from hypogoal.core.config import MODELS, described
-from hypogoal.data import open_dataset
 from hypogoal.experiments.named import config_class_of
 
 
@@ -29,16 +25,6 @@ def test_steps_of_both_stages_count(tiny_run: Path) -> None:
     assert layout["layout_seed"] == 100 and layout["shortest_path"] >= 9
 
 
-def test_collected_states_and_members_are_files(tiny_run: Path) -> None:
-    """Spec A1, A2, B3: all states in one file, with their origin; a file of weights per sub-goal."""
-    dataset = open_dataset(tiny_run / "data.h5")
-    counts = dataset.counts()
-    assert counts["labelled"]["go-to-goal"] == {"states": 1640, "positives": 8}
-    assert len(dataset.unlabelled()) == counts["unlabelled"] > 500
-    assert set(dataset.heldout("go-to-goal").origins["layout_seed"]).isdisjoint({0, 1, 2})
-    assert {path.stem for path in (tiny_run / "ensemble").glob("*.safetensors")} == {"collect-red-key", "open-red-door"}
-
-
 def test_show_and_verify(tiny_run: Path, tmp_path: Path) -> None:
     """Spec A6, A8: what is this, is it whole; what a machine is to read is JSON and nothing else."""
     for part, kind in (("data.h5", "data"), ("ensemble", "ensemble"), ("meta", "meta"), ("", "run")):
@@ -47,27 +33,6 @@ def test_show_and_verify(tiny_run: Path, tmp_path: Path) -> None:
         assert "whole" in run("verify", tiny_run / part).out
     said = run("show", tiny_run / "data.h5", "--json", "--pictures", tmp_path)
     assert json.loads(said.out)["kind"] == "data" and str(tmp_path) in said.err
-
-
-def test_python_interface(tiny_run: Path) -> None:
-    """The contract of the Python interface; Spec E1."""
-    ensemble = hypogoal.load_ensemble(tiny_run / "ensemble", "open-red-door")
-    probabilities = ensemble.predict(np.zeros((2, 64, 64, 3), dtype=np.uint8))
-    assert probabilities.shape == (2, 2) and probabilities.dtype == np.float32
-    for part in ("options", "meta"):
-        options = hypogoal.load_options(tiny_run / part)
-        env = hypogoal.OptionEnv(gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=100), options)
-        assert env.action_space == gymnasium.spaces.Discrete(4)
-        env.reset(seed=0)
-        rng = np.random.default_rng(0)
-        for _ in range(5):
-            masks = env.action_masks()
-            assert masks.shape == (4,) and masks.any()
-            observation, _reward, terminated, truncated, info = env.step(int(rng.choice(np.flatnonzero(masks))))
-            assert env.observation_space.contains(observation)
-            assert 1 <= info["duration"] <= 10
-            if terminated or truncated:
-                env.reset()
 
 
 def resumed(folder: Path, name: str, *more: str) -> list[str]:
@@ -166,13 +131,6 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def test_mistakes(places: dict[str, Path], line: str, words: str) -> None:
     """Spec G2: missing input, wrong kind, unknown names, values out of range: one line, nothing written."""
     refuses(words, *line.format(**places).split())
-
-
-def test_a_failed_force_keeps_the_old_artefact(tiny_copy: Path) -> None:
-    """Spec G2: nothing lost."""
-    out = tiny_copy / "ensemble"
-    refuses("no such file", "train-ensemble", tiny_copy / "none.h5", "--out", out, "--force")
-    run("verify", out)
 
 
 @pytest.mark.parametrize("stage", ["collect", *MODELS, "run"])

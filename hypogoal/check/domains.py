@@ -29,7 +29,7 @@ def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, se
     Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
     (None: the defaults). ``seed`` is for both. A sub-goal that play does not reach is a warning.
     """
-    laws = [_Played.settings, _Played.gymnasium] if domain.has_env else [_Played.settings]
+    laws: list[Any] = [_Played.settings, _Played.gymnasium] if domain.has_env else [_Played.settings]
     laws += [_Played.observations, _Played.steps, _Played.labels, _Played.two_engines, _Played.restore, _Played.collect]
     return verdicts(laws, _Played(domain, config, layout_seed, seed))
 

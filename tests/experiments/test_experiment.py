@@ -86,8 +86,6 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
     assert agents[-1].columns == {"group": "agent", "seed": 1, "layout": 212}
     ten = of_toml(tmp_path, TOML, "seed=0-4", "layout=1,5", "evaluate=false")
     assert sum(cell.stage == "train-meta" for cell in ten) == 10 and ten[-1].stage == "train-meta"
-    dotted = of_toml(tmp_path, TOML.replace("--layout-seed {layout} ", "").replace('"210-212"', "[0.1, 1.5]"))
-    assert dotted[3].name == "agent/seed-0-layout-0.1"
     assert len(cells_of(str(ROOT / "examples" / "sweep-doorkey.toml"))) == 1 + 4 + 8 + 4 + 2
 
 
@@ -99,7 +97,6 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
         ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "reads what no cell before it makes"),
         ('"collect doorkey"', "[3]", r"yields \(name, command\)"),
         ('yield "data"', 'yield "../data"', "becomes a file's"),
-        ('yield "data"', 'yield "logs"', "a name of its own"),
         ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "a name of its own"),
         ('{"size": size}', '{"size": []}', r"yields \(name, command\)"),
         ("--members {size}", "--members {size} --set stepps=3", "ensemble/size-1: train-ensemble has no setting"),
@@ -127,7 +124,6 @@ def test_what_is_no_experiment_is_refused_in_one_line(
         ('axes = ["seed"],', "axis = ['seed'],", "axis: "),
         ("{ensemble}", "{ensembles}", "cannot be read"),
         ('axes = ["seed"], command', "command", "cannot be read"),
-        ('axes = ["seed"]', 'axes = ["sed"]', "cannot be read"),
         ("[0, 1]", "[0, 0]", "a name of its own"),
         ("collect doorkey", "collect 'doorkey", "cannot be read"),
         ("cells = [", "cells = [ [", "cannot be read"),
@@ -141,11 +137,22 @@ def test_what_is_no_toml_experiment_is_told_in_one_line(tmp_path: Path, before: 
         of_toml(tmp_path, TOML.replace(before, after))
 
 
-@pytest.mark.parametrize("given", ["seeds=1", "seed=x", "workers=many", "evaluate=perhaps", "train-ensemble.stepz=3"])
+@pytest.mark.parametrize("given", ["seeds=1", "seed=x", "workers=many", "train-ensemble.stepz=3", "bake.steps=3"])
 def test_what_its_settings_cannot_be(tmp_path: Path, given: str) -> None:
-    """Spec G2: types, bounds and names are those of the axes or of the signature."""
+    """Spec G2: types, bounds and names are those of the axes, of the signature and of the stages."""
     with pytest.raises(UserError):
         of_toml(tmp_path, TOML, given)
+
+
+def test_what_is_given_to_all_commands(tmp_path: Path) -> None:
+    """Where a command does not say otherwise: device and preset of stages that have them, settings by stage."""
+    path = tmp_path / "own.toml"
+    path.write_text(TOML.replace("--layout-seed {layout}", "--layout-seed {layout} --steps 9 --device cpu"))
+    given = ["train-ensemble.steps=3", "train-meta.steps=4"]
+    data, ensemble, *_, agent = cells_of(str(path), *given, "evaluate=false", device="cuda", preset="paper")
+    assert data.words[-2:] == ["--preset", "paper"]
+    assert ensemble.words[-6:] == ["--preset", "paper", "--device", "cuda", "--set", "steps=3"]
+    assert agent.words[-2:] == ["--preset", "paper"]
 
 
 def test_a_function_is_the_users_word_only_if_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
