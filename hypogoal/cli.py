@@ -16,7 +16,7 @@ import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer import Argument, Context, Option
@@ -61,18 +61,14 @@ def command(panel: str, example: str, name: str | None = None) -> Any:
     return app.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
 
 
-def _in_lists() -> None:
-    """Stands for a stage where commands are listed."""
+def list_stages(names: Iterable[str], panel: str) -> None:
+    """List stages among the commands."""
+    for name in names:
+        app.command(name, help=stages.LISTED[name], rich_help_panel=panel)(lambda: None)
 
 
-def list_stage(name: str, panel: str) -> None:
-    """List a stage among the commands."""
-    app.command(name, help=stages.LISTED[name], rich_help_panel=panel)(_in_lists)
-
-
-for _name in stages.LISTED:
-    if _name != "audit":
-        list_stage(_name, MAKE)
+*_MADE, _AUDIT = stages.LISTED
+list_stages(_MADE, MAKE)
 
 
 def _version(wanted: bool) -> None:
@@ -113,14 +109,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments is None:
             for number in processes.SIGNALS:  # all is cleaned up: a further signal may end the process at once
                 signal.signal(number, signal.SIG_DFL)
-        notes = notes_of(stop) or ["nothing was half-written"]
         number = stop.args[0] if stop.args else signal.SIGINT
-        return _fail("; ".join(["stopped", *notes]), 128 + number)
+        return _fail("stopped", 128 + number, stop)
     except (Exception, SystemExit) as error:
         if "--debug" in words or (isinstance(error, SystemExit) and not own_code.place_of(error)):
             raise
         line, code = own_code.message(error)
-        return _fail("; ".join([line.rstrip(".") if notes_of(error) else line, *notes_of(error)]), code)
+        return _fail(line, code, error)
 
 
 @functools.cache
@@ -160,13 +155,11 @@ def _advice(error: Any) -> str:
     return f"See 'hypogoal {stage} --help'." if stage not in ("", "hypogoal") else "See 'hypogoal --help'."
 
 
-def notes_of(error: BaseException) -> list[str]:
-    """The notes that were added to an error, each once."""
-    return list(dict.fromkeys(getattr(error, "__notes__", [])))
-
-
-def _fail(message: str, code: int) -> int:
-    say(f"hypogoal: {printable(message)}", err=True)
+def _fail(message: str, code: int, error: BaseException | None = None) -> int:
+    """Say what is wrong, and the notes that were added to the error, each once."""
+    notes = dict.fromkeys(getattr(error, "__notes__", []))
+    line = "; ".join([message.rstrip("."), *notes]) if notes else message
+    say(f"hypogoal: {printable(line)}", err=True)
     return code
 
 
@@ -195,7 +188,9 @@ def run(
         str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it.")
     ] = None,
     only: Annotated[str | None, Option(metavar="STAGE", help="Make this stage again and run no other.")] = None,
-    engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
+    engine: Annotated[
+        Literal["local", "slurm"], Option(help="The cores of this machine, or job arrays of a cluster.")
+    ] = "local",
     sbatch: Annotated[str, Option(help="Options for sbatch, as typed: '--time=4:00:00 --mem=8G'.")] = "",
     quiet: stages.Quiet = False,
     dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands; run none.")] = False,
@@ -209,8 +204,6 @@ def run(
     from hypogoal.experiments import run as runs
 
     out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
-    if engine not in ("local", "slurm"):
-        raise UserError("unknown engine", engine, "Choose local or slurm.")
     cells, workers = plans.plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
     if dry_run:
         for cell in runs.in_part(cells, from_, only):
@@ -227,7 +220,7 @@ def run(
         force=force,
         from_=from_,
         only=only,
-        say=(lambda text: None) if quiet else (lambda text: say(text, err=True)),
+        say=lambda text: None if quiet else say(text, err=True),
     )
     if engine == "slurm" or only or not (out / "report").is_dir():
         say(out)
@@ -255,7 +248,7 @@ def show(
     from hypogoal import look
 
     details = look.describe(path)
-    echo(details, as_json, [] if as_json else [*look.outcome(details), *look.lines(details)])
+    echo(details, as_json, [*look.outcome(details), *look.lines(details)])
     if pictures is not None:
         from hypogoal.evaluation.pictures import write_contact_sheets
 
@@ -329,14 +322,10 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
             default = row["default"]
             if isinstance(default, tuple | list):
                 default = ",".join(map(str, default))
-            head = f"  {row['name']} = {default} {row['unit']}".rstrip()
-            allowed = f"   ({row['allowed']})" if row["allowed"] else ""
-            if len(head + allowed) <= width:
-                yield head + allowed
-            else:
-                yield head
-                yield from wrapped.wrap(allowed.replace("|", "| "))
-            yield from wrapped.wrap(row["meaning"] + (f" [{row['source']}]" if row["source"] else ""))
+            yield f"  {row['name']} = {default} {row['unit']}".rstrip()
+            allowed = f" ({row['allowed']})".replace("|", "| ") if row["allowed"] else ""
+            source = f" [{row['source']}]" if row["source"] else ""
+            yield from wrapped.wrap(f"{row['meaning']}{allowed}{source}")
 
 
 @command(LOOK, "compare runs/mine runs/other --out runs/both")
@@ -481,27 +470,25 @@ def check(
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
-    verdicts: list[Any] = []
+    checks: list[Any] = []
     observations: tuple[Any, ...] = ()
     if domain is not None:
         loaded = domains.load_domain(domain)
         chosen = domains.settings_of("collect", domain, typed=settings.assigned(set_ or ()))
-        verdicts.append(contracts.check_domain(loaded, chosen, layout_seed=layout_seed, seed=seed))
+        checks.append(contracts.check_domain(loaded, chosen, layout_seed=layout_seed, seed=seed))
         observations = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
-        verdicts.append(contracts.check_objective(diversity))
+        checks.append(contracts.check_objective(diversity))
     if network is not None:
-        verdicts.append(contracts.check_network(network, *observations))
-    broken = False
-    for verdict in itertools.chain(*verdicts):
-        broken |= not verdict.ok
+        checks.append(contracts.check_network(network, *observations))
+    for verdict in itertools.chain(*checks):
         for line in verdict.lines:
             say(line)
-    if broken:
-        raise typer.Exit(2)
+        if not verdict.ok:
+            raise typer.Exit(2)
 
 
-list_stage("audit", OWN)
+list_stages([_AUDIT], OWN)
 
 if __name__ == "__main__":
     sys.exit(main())

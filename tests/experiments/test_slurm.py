@@ -41,7 +41,11 @@ def test_scripts_and_what_is_asked_of_sbatch(tmp_path: Path, monkeypatch: pytest
     asked = (tmp_path / "asked").read_text().splitlines()
     waits = [line.split("--dependency=afterany:")[-1].split()[0] for line in asked[2:]]
     assert waits == ["1", "3", "1:2:3:4", "5"]
-    assert "--array=0-2%7 --time=4:00:00 --mem=2G" in asked[3] and "/50%%A run/slurm/%x-%A-%a.out" in asked[3]
+    assert (
+        "--array=0-2%7" in asked[3]
+        and "--time=4:00:00 --mem=2G" in asked[3]
+        and "/50%%A run/slurm/%x-%A-%a.out" in asked[3]
+    )
     assert (out / "slurm" / "jobs").read_text().split() == ["6", "5", "4", "3", "2", "1"]
     for script in (out / "slurm").glob("*.sh"):
         subprocess.run(["sh", "-n", str(script)], check=True)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from toy import SMALL, write_toy
 
 from hypogoal.cells import read_plan, status_lines
 from hypogoal.core.artefacts import Draft
-from hypogoal.experiments.local import run_local
+from hypogoal.experiments.local import PRELOADED, run_local
 from hypogoal.experiments.plan import plan
 from hypogoal.experiments.run import begin
 
@@ -109,6 +110,7 @@ def test_forked_and_fresh_cells_make_the_same_bytes(whole: Path, tmp_path: Path)
     said: list[str] = []
     run_local(chain, tmp_path / "fresh", workers=2, say=said.append, forked=False)
     assert [line.split()[0] for line in said if " ...; " in line] == [cell.name for cell in chain]
+    assert all(map(find_spec, PRELOADED))
     fresh, forked = bytes_of(tmp_path / "fresh"), bytes_of(whole / "out")
     assert fresh == {name: forked[name] for name in fresh} and len(fresh) > 8
 
@@ -216,7 +218,7 @@ def test_what_a_run_refuses(whole: Path, out: Path, tmp_path: Path) -> None:
         (["--out", out, "--resume", "--set", "seed=x"], "seed"),
         (["--out", out, "--from", "train-option"], "needs one stage of the run: train-option. Choose one of collect,"),
         (["--out", out, "--from", "collect", "--only", "evaluate"], "needs one stage of the run"),
-        (["--out", out, "--resume", "--engine", "cloud"], "unknown engine: cloud"),
+        (["--out", out, "--resume", "--engine", "cloud"], "'cloud' is not one of 'local', 'slurm'"),
         (["--out", there], "this is a file"),
     ):
         refuses(told, "run", toy, "-q", *words)
