@@ -205,7 +205,8 @@ def write_dataset(path: Path, collected: Collected, *, domain: str, config: Mapp
         attributes["channels"] = json.dumps(dict(collected.channels))
     with create_hdf5(path) as file:
         for name, value in attributes.items():
-            file.attrs[name] = fixed(value) if isinstance(value, str) else value
+            stored = fixed(value) if isinstance(value, str) else value
+            file.attrs[name] = stored
         _write_split(file, "labelled", collected.labelled, collected.sub_goals)
         _write_split(file, "heldout", collected.heldout, collected.sub_goals)
         _write_states(file.create_group("unlabelled"), collected.unlabelled)
@@ -238,9 +239,11 @@ def _store(group: Any, name: str, values: NDArray[Any]) -> None:
     """Write observations compressed, other values with checksums: a flipped label would still be valid."""
     filters: dict[str, Any] = {}
     if len(values) and name == "observations":
-        filters = {"chunks": (min(64, len(values)), *values.shape[1:]), "compression": "gzip", "compression_opts": 1}
+        chunk = (min(64, len(values)), *values.shape[1:])
+        filters = {"chunks": chunk, "compression": "gzip", "compression_opts": 1}
     elif len(values):
-        filters = {"chunks": (min(COLUMN_CHUNK, len(values)),), "fletcher32": True}
+        chunk = (min(COLUMN_CHUNK, len(values)),)
+        filters = {"chunks": chunk, "fletcher32": True}
     group.create_dataset(name, data=values, **filters)
 
 
@@ -292,7 +295,8 @@ class Dataset:
         """The same with their origins, if the file has any, and no labels, (M, 0)."""
         with reading(self.path) as file:
             observations = self._observations(file["unlabelled"])
-            return States(observations, np.zeros((len(observations), 0), np.bool_), _origins(file["unlabelled"]))
+            none = np.zeros((len(observations), 0), np.bool_)
+            return States(observations, none, _origins(file["unlabelled"]))
 
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""

@@ -39,7 +39,11 @@ def fields_of(shape: Shape, dtype: DType) -> Fields:
     """Type and shape of an observation's parts by key; of one that is not mixed, its only part's, without a key."""
     if not dtype.names:
         return {"": (dtype, shape)}
-    return {key: (dtype[key].base, dtype[key].shape) for key in dtype.names}
+    fields = {}
+    for key in dtype.names:
+        part = dtype[key]
+        fields[key] = (part.base, part.shape)
+    return fields
 
 
 def values_in(shape: Shape, dtype: DType) -> int:
@@ -66,7 +70,8 @@ def type_text(dtype: DType) -> str:
         return str(dtype)
     parts = {}
     for key, (kind, shape) in fields_of((), dtype).items():
-        parts[key] = [str(kind), list(shape)]
+        name = str(kind)
+        parts[key] = [name, list(shape)]
     return json.dumps(parts)
 
 
@@ -88,7 +93,9 @@ def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations
     arrays = {}
     for key, values in parts.items():
         array = np.asarray(values)
-        arrays[key] = array.astype(NUMBERS) if array.dtype == np.float64 else array
+        if array.dtype == np.float64:
+            array = array.astype(NUMBERS)
+        arrays[key] = array
     fields = {key: (array.dtype, array.shape[1:]) for key, array in arrays.items()}
     stored = mixed_type(fields)
     if dtype is not None and stored != dtype:
@@ -117,9 +124,9 @@ def numbers_of(observations: Observations) -> Floats:
 def standard_of(shape: Shape, *observations: Observations) -> Standard:
     """Mean and deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary, or without any."""
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
-    if not any(map(len, rows)):
+    sample = np.concatenate([np.zeros((0, *shape), NUMBERS), *rows])
+    if not len(sample):
         return np.zeros(shape, NUMBERS), np.ones(shape, NUMBERS)
-    sample = np.concatenate(rows)
     mean = sample.mean(0, dtype=np.float64)
     deviation = sample.std(0, dtype=np.float64)
     varies = deviation > 1e-6 * np.abs(mean)

@@ -2,6 +2,7 @@
 
 import os
 import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from command_line import refuses, run
 from corridor import Corridor
+from torch import Tensor
 
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.files import replace_text
@@ -23,7 +25,6 @@ from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
 
-TESTS = Path(__file__).parent
 CONFIG = OptionConfig.of(environments=4, warm_up=20, update_interval=4, option_batch=16)
 
 
@@ -40,23 +41,27 @@ def play(loop: OptionLoop, steps: int) -> None:
         loop.step()
 
 
+def stops(update: Callable[[], object], weight: Tensor, spoilt: Tensor, of_gradient: str, of_loss: str) -> None:
+    """The update does, at an infinite gradient of a weight, which stays as it was, and at NaN in a spoilt one."""
+    before = weight.detach().clone()
+    hook = weight.register_hook(lambda gradient: gradient * torch.inf)
+    with pytest.raises(NumericalError, match=of_gradient):
+        update()
+    hook.remove()
+    assert torch.equal(before, weight)
+    spoilt.fill_(torch.nan)
+    with pytest.raises(NumericalError, match=of_loss):
+        update()
+
+
 def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
     """Spec G3: the option, the batch and the step are named; the weights stay as they were."""
     loop = loop_of(Corridor(4))
     play(loop, 20)
-    learner = loop.learner
-    before = {name: value.clone() for name, value in learner.state().items()}
-    hook = learner.online.heads.weight.register_hook(lambda gradient: gradient * torch.inf)
-    with pytest.raises(
-        NumericalError, match=r"a gradient of the options is (nan|inf) in the batch of update \d+, step"
-    ):
-        learner._update()
-    hook.remove()
-    assert all(torch.equal(before[name], value) for name, value in learner.state().items())
-    with torch.no_grad():
-        learner.online.heads.bias.view(2, -1)[1] = torch.nan
-    with pytest.raises(NumericalError, match=r"the loss of options \[1\] is nan in the batch of update \d+"):
-        learner._update()
+    heads = loop.learner.online.heads
+    of_gradient = r"a gradient of the options is (nan|inf) in the batch of update \d+, step"
+    of_loss = r"the loss of options \[1\] is nan in the batch of update \d+"
+    stops(loop.learner._update, heads.weight, heads.bias.detach().view(2, -1)[1], of_gradient, of_loss)
 
 
 @pytest.mark.usefixtures("small_gru")
@@ -72,18 +77,10 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None
     while not learner.members[1].updates:
         loop.step()
     member = learner.members[1]
-    before = [weight.clone() for weight in member.online.parameters()]
-    hook = next(member.online.parameters()).register_hook(lambda gradient: gradient * torch.inf)
-    with pytest.raises(
-        NumericalError, match=r"a gradient of option 1 is (nan|inf) in the batch of its update \d+, its"
-    ):
-        learner._update(1, member)
-    hook.remove()
-    assert all(map(torch.equal, before, member.online.parameters()))
-    with torch.no_grad():
-        list(member.online.parameters())[-1].fill_(torch.nan)
-    with pytest.raises(NumericalError, match=r"the loss of option 1 is nan in the batch of its update \d+, its step"):
-        learner._update(1, member)
+    first, *_, last = member.online.parameters()
+    of_gradient = r"a gradient of option 1 is (nan|inf) in the batch of its update \d+, its"
+    of_loss = r"the loss of option 1 is nan in the batch of its update \d+, its step"
+    stops(lambda: learner._update(1, member), first, last.detach(), of_gradient, of_loss)
 
 
 def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:

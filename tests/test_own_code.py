@@ -224,13 +224,9 @@ def test_in_processes_of_a_stage(data: Path, tmp_path: Path) -> None:
     (tmp_path / "leaves.py").write_text("import sys\nsys.exit(0)\n")
     root, few = Path(__file__).parents[1], settings("steps=5", "workers=2")
     environment = {**os.environ, "PYTHONPATH": f"{root}:{root / 'tests'}", own_code.VARIABLE: "1"}
-    for objective, words in (
-        (
-            "theirs:pair_loss",
-            "has no attribute 'nothing': theirs.py, line 2",
-        ),
-        ("leaves:x", "the diversity objective cannot be loaded: SystemExit: 0: leaves:x leaves.py, line 2"),
-    ):
+    of_module = "the diversity objective cannot be loaded: SystemExit: 0: leaves:x leaves.py, line 2"
+    cases = {"theirs:pair_loss": "has no attribute 'nothing': theirs.py, line 2", "leaves:x": of_module}
+    for objective, words in cases.items():
         command = [sys.executable, "-m", "hypogoal", "train-ensemble", str(data), "--diversity", objective, *few]
         ended = subprocess.run(
             [*command, "--out", "out", "-q"], cwd=tmp_path, env=environment, capture_output=True, text=True

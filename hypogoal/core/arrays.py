@@ -42,7 +42,10 @@ class Columns(Resumable):
     @classmethod
     def zeros(cls, *shape: int) -> Self:
         """So many rows of zeros, for all columns alike."""
-        return cls(**{name: np.zeros(shape, dtype) for name, dtype in cls.types().items()})
+        columns = {}
+        for name, dtype in cls.types().items():
+            columns[name] = np.zeros(shape, dtype)
+        return cls(**columns)
 
     @classmethod
     def cast(cls, *columns: Any) -> Self:
@@ -62,7 +65,10 @@ class Columns(Resumable):
 
     def at(self, rows: Any) -> Self:
         """Some rows, by whatever NumPy takes for an index."""
-        return type(self)(**{name: getattr(self, name)[rows] for name in self.names()})
+        columns = {}
+        for name in self.names():
+            columns[name] = getattr(self, name)[rows]
+        return type(self)(**columns)
 
     def put(self, rows: Any, values: Self) -> None:
         """Write other values into some rows, in place."""

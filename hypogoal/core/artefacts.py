@@ -32,7 +32,7 @@ TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not l
 DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
 SIGNATURES = {DATA: b"\x89HDF\r\n\x1a\n", ARRAYS: b"PK\3\4"}  # how such files begin
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
-NO_RESULT = ("workers", "quiet")  # settings that change no result
+NO_RESULT = ("workers",)  # settings that change no result
 AGAIN = "Make the artefact again."
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
@@ -222,15 +222,12 @@ class Draft:
         """
         lock = FileLock(self.lock, timeout=PATIENCE_SECONDS)
         missing = [folder for folder in self.folder.parents if not folder.exists()]
-        while not lock.is_locked:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            try:
-                lock.acquire()
-            except FileNotFoundError:
-                continue  # its owner has just removed the folder
-            except Timeout:
-                do = "Wait until it is done, or choose another --out."
-                raise UserError("another process is writing this", self.out, do) from None
+        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire()
+        except (Timeout, FileNotFoundError):  # not found: its owner has just removed the folder
+            do = "Wait until it is done, or choose another --out."
+            raise UserError("another process is writing this", self.out, do) from None
         try:
             yield
         finally:
@@ -321,8 +318,7 @@ def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> 
     """Whether the draft is continued, rather than begun anew. May I write here? If not, a ``UserError``."""
     out, kind = draft.out, kind_of(draft.out)
     if kind not in (None, wanted.kind):
-        description = f"of kind {kind!r}" if kind else "none of hypogoal's"
-        raise UserError(f"what is there is not of kind {wanted.kind!r} but {description}", out, AWAY)
+        raise UserError(f"what is there is not of kind {wanted.kind!r}", out, AWAY)
     if draft.is_resumable and resume:
         _refuse_other(_read_manifest(draft.begun, ANEW), wanted, "the unfinished output was begun", out)
         return True

@@ -15,7 +15,15 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, create_model, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    field_validator,
+)
 from pydantic.fields import FieldInfo
 
 from hypogoal.core.errors import UserError
@@ -82,16 +90,21 @@ class Details:
         """Whether the setting may have this value."""
         if self.choices:
             return value in self.choices or (self.own and ":" in value)
-        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+        if self.low is not None and value < self.low:
+            return False
+        return self.high is None or value <= self.high
 
     def __str__(self) -> str:
         """The values allowed, in a few words; empty if all of the setting's type."""
         if self.choices:
-            return "|".join([*map(str, self.choices), *[OWN] * self.own])
-        if self.low is self.high is None:
-            return ""
-        limits = ["" if limit is None else str(limit) for limit in (self.low, self.high)]
-        return " .. ".join(limits).strip()
+            choices = [str(choice) for choice in self.choices]
+            if self.own:
+                choices.append(OWN)
+            return "|".join(choices)
+        low = "" if self.low is None else self.low
+        high = "" if self.high is None else self.high
+        limits = f"{low} .. {high}".strip()
+        return limits if limits != ".." else ""
 
 
 def setting(default: Any, meaning: str, **details: Any) -> Any:
@@ -128,13 +141,16 @@ def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]
     """The table ``[stage]`` of a preset: one of the package, for ``domain`` or else for DoorKey, or a TOML file."""
     if name is None:
         return {}
-    folder = PRESETS / (domain if (PRESETS / domain).is_dir() else DOMAIN)
+    folder = PRESETS / domain
+    if not folder.is_dir():
+        folder = PRESETS / DOMAIN
     path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        names = ", ".join(sorted(file.stem for file in folder.iterdir()))
-        raise UserError("no such preset", name, f"Choose one of {names}, or give a .toml file.") from None
+        names = sorted(file.stem for file in folder.iterdir())
+        do = f"Choose one of {', '.join(names)}, or give a .toml file."
+        raise UserError("no such preset", name, do) from None
     except (OSError, ValueError) as error:
         raise UserError(f"the preset cannot be read ({error})", name, "Mend the file.") from None
     for key in tables:
@@ -154,7 +170,8 @@ def resolve(model: type[C], *layers: Values, stage: str) -> C:
     values: dict[str, Any] = {}
     for layer in layers:
         values |= {name: value for name, value in layer.items() if value is not None}
-    chosen, whole = _with_parts(model, values), _with_parts(model)
+    chosen = _with_parts(model, values)
+    whole = _with_parts(model)
     idle = whole.model_fields.keys() - chosen.model_fields.keys()
     for name in idle.difference(*layers[-1:]):
         values.pop(name, None)
@@ -182,7 +199,8 @@ def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str
         homes = dict.fromkeys(inspect.get_annotations(home), home) | homes
     rows = []
     for name in sorted(every.model_fields, key=lambda name: classes.index(homes[name])):
-        field, details = every.model_fields[name], _details(every.model_fields[name])
+        field = every.model_fields[name]
+        details = _details(field)
         row = {
             "name": name,
             "type": getattr(field.annotation, "__name__", str(field.annotation)),
@@ -201,7 +219,8 @@ def as_toml(stage: str, rows: Iterable[Values]) -> str:
     """Settings as :func:`described` has them, as a preset to edit."""
     lines = [f"[{stage}]"]
     for row in rows:
-        lines.append(f"{row['name']} = {json.dumps(row['default'], ensure_ascii=False)}  # {row['meaning']}")
+        value = json.dumps(row["default"], ensure_ascii=False)
+        lines.append(f"{row['name']} = {value}  # {row['meaning']}")
     return "\n".join(lines) + "\n"
 
 
@@ -216,7 +235,9 @@ def _typed(given: Any, kind: Any) -> Any:
     if get_origin(kind) is tuple:
         kind, *_ = get_args(kind)
         items = _items(given, kind) if isinstance(given, str) else given
-        return [_typed(item, kind) for item in items] if isinstance(items, list | tuple) else items
+        if not isinstance(items, list | tuple):
+            return items
+        return [_typed(item, kind) for item in items]
     if kind in (int, float) and isinstance(given, bool):
         raise ValueError("this must be a number")
     if kind is int and isinstance(given, str) and "e" in given.lower():
@@ -251,16 +272,20 @@ def _with_parts(model: type[C], values: Values | None = None) -> type[C]:
     for name, models in model.PARTS.items():
         value = OWN if values is None else str(values.get(name, model.model_fields[name].default))
         part = models.get(OWN if ":" in value else value)
-        parts += [part] if part else []
+        if part:
+            parts.append(part)
     return _joined(model, *parts)
 
 
 @cache
 def _joined(model: type[C], *parts: type[Config]) -> Any:
     """One model of all fields, ``model``'s first; a part may derive from ``model``."""
-    derived = any(issubclass(part, model) for part in parts)
-    bases: Any = parts if derived else (model, *parts)
-    return create_model(model.__name__, __base__=bases, __doc__=model.__doc__) if parts else model
+    if not parts:
+        return model
+    bases: Any = parts
+    if not any(issubclass(part, model) for part in parts):
+        bases = (model, *parts)
+    return create_model(model.__name__, __base__=bases, __doc__=model.__doc__)
 
 
 def _refusal(model: type[Config], whole: type[Config], error: ValidationError, stage: str) -> UserError:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 def _sequence(seed: int, names: tuple[str | int, ...]) -> np.random.SeedSequence:
     keys = [int(seed)]
     for name in names:
-        keys.append(zlib.crc32(name.encode()) if isinstance(name, str) else int(name))
+        key = zlib.crc32(name.encode()) if isinstance(name, str) else name
+        keys.append(int(key))
     return np.random.SeedSequence(keys)
 
 
@@ -26,7 +27,8 @@ def seed_for(seed: int, *names: str | int) -> int:
 
 def rng_for(seed: int, *names: str | int) -> np.random.Generator:
     """A NumPy generator for the stream called ``names`` of run ``seed``."""
-    return np.random.default_rng(_sequence(seed, names))
+    sequence = _sequence(seed, names)
+    return np.random.default_rng(sequence)
 
 
 def torch_generator(seed: int, *names: str | int) -> torch.Generator:

@@ -21,7 +21,10 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
     if name := _not_finite(tensors):
         raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
-    path.write_bytes(save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}))
+    weights = {}
+    for name, tensor in tensors.items():
+        weights[name] = tensor.detach().cpu().contiguous()
+    path.write_bytes(save(weights))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
@@ -42,13 +45,19 @@ def _not_finite(tensors: Mapping[str, Tensor]) -> str:
     """The name of the first tensor with NaN or Inf; empty if there is none."""
     import torch
 
-    names = [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]
-    return names[0] if names else ""
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            return name
+    return ""
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors whose names begin with a prefix, by the rest of the name."""
-    return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+    found = {}
+    for name, tensor in tensors.items():
+        if name.startswith(prefix):
+            found[name.removeprefix(prefix)] = tensor
+    return found
 
 
 def load_into(module: M, weights: Mapping[str, Tensor], where: str, *, assign: bool = False) -> M:

@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import hypogoal
 from hypogoal.core.config import (
@@ -104,18 +102,6 @@ def test_each_mistake_gets_one_line(value: dict[str, Any], words: str) -> None:
     assert words in line and "\n" not in line and len(line) < 400
 
 
-@given(st.text(max_size=40))
-def test_no_text_crashes_the_parser(text: str) -> None:
-    """Any --set text either resolves or is a UserError of one line."""
-    for key in Example.model_fields:
-        lines = 0
-        try:
-            resolved(f"{key}={text}")
-        except UserError as error:
-            lines = str(error).count("\n")
-        assert lines == 0
-
-
 def test_what_is_no_assignment_or_no_list_is_refused() -> None:
     for text in ("steps", "=3", ""):
         with pytest.raises(UserError, match="--set needs key=value"):
@@ -179,12 +165,6 @@ def test_a_broken_preset_is_one_line(tmp_path: Path, text: str | None, words: st
     for name in [str(file)] if text else [str(file), "nosuch"]:
         with pytest.raises(UserError, match=words):
             preset(name, "collect")
-
-
-def test_a_preset_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
-    (tmp_path / "own.toml").write_text("[collect]\nsteps = 20\n", encoding="utf-8-sig")
-    assert preset(str(tmp_path / "own.toml"), "collect") == {"steps": 20}
-    assert preset(str(tmp_path / "own.toml"), "run") == preset(None, "run") == {}
 
 
 @pytest.mark.parametrize(("domain", "name"), [(file.parent.name, file.stem) for file in sorted(PRESETS.glob("*/*"))])
