@@ -138,7 +138,6 @@ def test_what_is_raised_has_a_place(place: str, error: BaseException, told: Call
 HONEST = [
     *(giving(1, kind) for kind in (np.array, torch.tensor, bool)),
     *(giving(2, kind) for kind in (np.bool_, int)),
-    GymnasiumDomain(CorridorEnv, {name: lambda env, label=label: int(label(env)) for name, label in SUB_GOALS.items()}),  # type: ignore[misc]
 ]
 
 

@@ -37,7 +37,6 @@ class NumericalError(Exception):
 
 def printable(text: str) -> str:
     """A text as one line without control, invisible and bidirectional characters, which are shown as ``?``."""
-    parts = (part.strip() for part in text.splitlines())
-    line = " ".join(filter(None, parts))
-    signs = (sign if sign.isprintable() else "?" for sign in line)
+    line = " ".join(text.split())
+    signs = [sign if sign.isprintable() else "?" for sign in line]
     return "".join(signs)

@@ -74,10 +74,7 @@ def test_white_space_and_took_are_no_change(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"format": 4}, "reads manifests of format 3, this is 4"),
-        (
-            {"format": 2},
-            "this is 2: .*manifest.json. Use the hypogoal that wrote it, or make it again.",
-        ),  # of 0.23 and 0.24
+        ({"format": 2}, "this is 2: .*manifest.json. Use the hypogoal that wrote it, or make it again."),
         ({"seed": "x"}, "'seed' is missing or malformed"),
         ({"inputs": [{"kind": "data"}]}, "'inputs.0.path' is missing or malformed"),
     ],

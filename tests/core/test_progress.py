@@ -85,7 +85,7 @@ def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path, monkeypatch: pyte
 
 def test_an_error_is_one_line_of_signs_that_can_be_printed() -> None:
     """Spec G2: it may quote a file."""
-    assert str(UserError("kind \x1b[2J", "a\nb  c", "Do.")) == "kind ?[2J: a b  c. Do."
+    assert str(UserError("kind \x1b[2J", "a\nb  c", "Do.")) == "kind ?[2J: a b c. Do."
 
 
 def test_a_reader_that_has_enough() -> None:
