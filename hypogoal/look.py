@@ -97,7 +97,8 @@ def outcome(details: Details) -> list[str]:
     if kind == EVALUATION:
         from hypogoal.evaluation.questions import summary_table
 
-        return [line.rstrip() for line in drawn(summary_table(numbers), WIDTH).splitlines()]
+        table = drawn(summary_table(numbers), WIDTH)
+        return [line.rstrip() for line in table.splitlines()]
     if kind == "comparison":
         from hypogoal.evaluation.compare import winners
 
@@ -129,18 +130,20 @@ def lines(details: Details) -> list[str]:
         facts["command"] = shlex.join(facts["command"])
         facts["files"] = [*facts["files"]]
     for name, value in facts.items():
-        text += _wrapped(f"{name}: {_typed(value, ', ')}")
+        text += _wrapped(f"{name}: {_typed(value)}")
     text.append("config:")
     for name, value in config.items():
-        text += _wrapped(f"  {name}={_typed(value, ',')}")
+        text += _wrapped(f"  {name}={_typed(value)}")
     return text
 
 
-def _typed(value: Any, comma: str) -> str:
+def _typed(value: Any) -> str:
     """A value as one would type it."""
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_typed(part, comma)}" for name, part in value.items())
-    return comma.join(map(str, value)) if isinstance(value, list) else str(value)
+        value = [f"{name} {_typed(part)}" for name, part in value.items()]
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return str(value)
 
 
 def _wrapped(line: str) -> list[str]:
