@@ -65,7 +65,8 @@ class States:
     def where(self, kept: NDArray[Any]) -> States:
         """The states that are ``kept``, bool (N,), or the rows of some, int (M,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
-        return States(self.observations[kept], self.labels[kept], origins)
+        observations = self.observations[kept]
+        return States(observations, self.labels[kept], origins)
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,8 @@ def joined(parts: Sequence[States]) -> States:
         return parts[0]
     observations = np.concatenate([part.observations for part in parts])
     labels = np.concatenate([part.labels for part in parts])
-    shared = set.intersection(*(set(part.origins) for part in parts))
+    names = [set(part.origins) for part in parts]
+    shared = set.intersection(*names)
     origins = {}
     for name in sorted(shared):
         origins[name] = np.concatenate([part.origins[name] for part in parts])
@@ -314,7 +316,8 @@ class Dataset:
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {', '.join(self.sub_goals)}.")
         with reading(self.path) as file:
             group = file[f"{split}/{sub_goal}"]
-            return States(self._observations(group), _labels(group), _origins(group))
+            observations = self._observations(group)
+            return States(observations, _labels(group), _origins(group))
 
     def _observations(self, group: Any) -> Observations:
         data = group["observations"]

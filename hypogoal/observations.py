@@ -17,10 +17,14 @@ from numpy.typing import NDArray
 
 from hypogoal.core.files import plain_names
 
-PICTURE, NUMBERS = np.dtype(np.uint8), np.dtype(np.float32)
+PICTURE = np.dtype(np.uint8)
+NUMBERS = np.dtype(np.float32)
 DType: TypeAlias = np.dtype[Any]
 Shape: TypeAlias = tuple[int, ...]
-KINDS: dict[str, DType] = {"uint8": PICTURE, "float32": NUMBERS}
+KINDS: dict[str, DType] = {
+    "uint8": PICTURE,
+    "float32": NUMBERS,
+}
 Observations: TypeAlias = NDArray[Any]  # (N, *shape), of any of these types
 Fields: TypeAlias = dict[str, tuple[DType, Shape]]  # by key
 Floats: TypeAlias = NDArray[np.float32]
@@ -124,9 +128,11 @@ def numbers_of(observations: Observations) -> Floats:
 def standard_of(shape: Shape, *observations: Observations) -> Standard:
     """Mean and deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary, or without any."""
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
-    sample = np.concatenate([np.zeros((0, *shape), NUMBERS), *rows])
+    none = np.zeros((0, *shape), NUMBERS)
+    sample = np.concatenate([none, *rows])
     if not len(sample):
-        return np.zeros(shape, NUMBERS), np.ones(shape, NUMBERS)
+        nothing = np.zeros(shape, NUMBERS)
+        return nothing, nothing + 1
     mean = sample.mean(0, dtype=np.float64)
     deviation = sample.std(0, dtype=np.float64)
     varies = deviation > 1e-6 * np.abs(mean)
@@ -142,5 +148,6 @@ def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
 
 def spread_rows(count: int, most: int) -> NDArray[np.int64]:
     """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
-    rows = np.linspace(0, count - 1, min(count, most))
+    last, wanted = count - 1, min(count, most)
+    rows = np.linspace(0, last, wanted)
     return rows.astype(np.int64)
