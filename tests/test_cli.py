@@ -64,7 +64,7 @@ def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
     refuses(f"{made_with} seed=0, not 3", *resumed(tiny_run, "ensemble", "--seed", "3"))
     refuses(f"{made_with} other inputs", *resumed(tiny_run, "ensemble", "--unlabelled", str(data)))
     refuses("no such file", "train-ensemble", tiny_run / "none.h5", "--out", ensemble, "--resume")
-    refuses("not of kind 'meta' but of kind", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
+    refuses("not of kind 'meta'", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
     refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", meta, "--resume")
     refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
 

@@ -336,16 +336,16 @@ def _refuse_other(before: Manifest, now: Manifest, subject: str, out: Path) -> N
     """Refuse (``UserError``) what differs in a setting that both have, in seed, inputs or versions."""
     old, new = _identity(before), _identity(now)
     for key, value in old.items():
-        if new.get(key, value) != value:
+        if key in new and json.dumps(value) != json.dumps(new[key]):
             other = "other inputs" if key == "inputs" else f"{key}={value}, not {new[key]}"
             raise UserError(f"{subject} with {other}", out, ANEW)
 
 
-def _identity(manifest: Manifest) -> dict[str, str]:
-    """All that determines an output by name, as JSON."""
+def _identity(manifest: Manifest) -> dict[str, Any]:
+    """All that determines an output, by name."""
     inputs = [entry.sha256 for entry in manifest.inputs]
     identity = {"kind": manifest.kind, "seed": manifest.seed, "inputs": inputs, **manifest.versions, **manifest.config}
-    return {key: json.dumps(value) for key, value in identity.items() if key not in NO_RESULT}
+    return {key: value for key, value in identity.items() if key not in NO_RESULT}
 
 
 def _made(out: Path) -> Manifest:

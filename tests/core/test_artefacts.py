@@ -152,7 +152,7 @@ def test_resume_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 OTHERS: list[tuple[dict[str, Any], str]] = [
     ({"seed": 8}, "seed=7, not 8"),
     ({"config": {"steps": 4, "world": {"rooms": 2}}}, "steps=3, not 4"),
-    ({"config": {"steps": 3, "world": {"rooms": 1}}}, 'world={"rooms": 2}, not {"rooms": 1}'),
+    ({"config": {"steps": 3, "world": {"rooms": 1}}}, "world={'rooms': 2}, not {'rooms': 1}"),
     ({"inputs": ["data.h5"]}, "other inputs"),
 ]
 

@@ -83,7 +83,7 @@ def test_a_dataset_is_called_by_where_it_lies(
     [
         ("toy", [], "Give --out DIR/NAME-v0"),
         ("toy-v2", ["--seed", "-1"], "seed"),
-        ("there-v0", [], "none of hypogoal's"),
+        ("there-v0", [], "what is there is not of kind"),
         ("there-v0", ["--force"], "Move it away"),
     ],
 )
