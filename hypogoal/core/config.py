@@ -153,8 +153,8 @@ def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]
         raise UserError("no such preset", name, do) from None
     except (OSError, ValueError) as error:
         raise UserError(f"the preset cannot be read ({error})", name, "Mend the file.") from None
-    for key in tables:
-        if key not in TABLES:
+    for key, table in tables.items():
+        if key not in TABLES or not isinstance(table, dict):
             do = f"{near(key, TABLES)}A preset has tables for {', '.join(TABLES)}."
             raise UserError("no such table in a preset", f"{key} in {name}", do)
     return dict(tables.get(stage, {}))

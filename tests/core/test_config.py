@@ -153,6 +153,7 @@ def test_settings_are_described_with_their_parts() -> None:
         ("[train_ensemble]\nsteps = 3", "no such table in a preset: train_ensemble in .*Did you mean 'train-ensemble'"),
         ("[trane]\nsteps = 3", "A preset has tables for collect, "),
         ("steps = 7\n[train-ensemble]\nmembers = 3", "no such table in a preset: steps in "),
+        ("collect = 3", "no such table in a preset: collect in "),
         ("[collect\n", "the preset cannot be read"),
         ("[collect]\nx = '\udcff'", "the preset cannot be read"),
         (None, "no such preset: .* Choose one of choosing, demo, figure6, paper, or give a .toml file"),
