@@ -44,7 +44,7 @@ def test_groups_pass_together_and_batchnorm_sees_them_apart(name: str, counted: 
     plain = build_network(name, images.shape[1:], torch.Generator().manual_seed(1)).double().train()
     tabled = copy.deepcopy(plain)
     groups = np.array([3, 17, 3, 29, 0]), np.array([31, 2, 8])
-    found = patches.forward(tabled, double_batch(images, plain, *groups), (True, counted))
+    found = patches.forward(tabled, double_batch(images, plain, *groups), counted)
     first, second = (
         plain_or_not(plain, images[group], counts) for group, counts in zip(groups, (True, counted), strict=True)
     )
