@@ -1,159 +1,189 @@
-"""Users' states, checked and split into the sets of a data file."""
+"""Frames, checked and split into the sets of a data file."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import (
-    Collected,
-    Integers,
-    Labels,
-    States,
-    doubts_of,
-    joined,
-    leave_out,
-    require_classes,
-    require_names,
-)
+from hypogoal.data import Collected, Integers, Labels, States, doubts_of, require_classes
 from hypogoal.domains.observations import reading_of
-from hypogoal.importing.duplicates import contradictions, looks_of, near_duplicates
-from hypogoal.importing.parts import Array, Given, Parts
-from hypogoal.importing.taken import Taking
+from hypogoal.importing.episodes import ROLES, Array
+from hypogoal.importing.files import reading
+from hypogoal.importing.states import Frame
+from hypogoal.importing.taken import together
+from hypogoal.observations import digest, packed
 
-ROW = "row"  # the origin of each state: which of the given ones it was
-PLAIN = Taking()
-OTHERS = "Give some of other contexts."
+ROW = "row"  # the origin of each state: its place in its set
+SPLIT = np.array([0.4, 0.4, 0.2])  # shares of episodes that are labelled, unlabelled and held out
+MORE = "Give more, at least three episodes that are labelled; rows and pictures have their sets by name."
+REMARK = "no held-out states were given: {} of the labelled ones are held out, which says nothing about other contexts"
 
 
 def assemble(
-    parts: Parts, sub_goals: Sequence[str] = (), taking: Taking = PLAIN, *, share: float = 0.2, seed: int = 0
+    source: Path,
+    frames: Sequence[Frame],
+    goals: Sequence[str],
+    features: Sequence[str] = (),
+    *,
+    share: float = 0.2,
+    seed: int = 0,
 ) -> tuple[Collected, list[str]]:
     """The states in the form of a data file, and lines on what is allowed but may surprise.
 
-    The name of a single sub-goal is optional. Without held-out states, a ``share`` of each class of the labelled ones,
-    or of their groups, is held out by ``seed``. Unusable states, and a class that is missing or only has pictures that
-    the other class has too, are a ``UserError``.
+    Without held-out states, a ``share`` of each class of the labelled ones, or of their groups, is held out by
+    ``seed``. Unusable states, and a class that is missing or only has states that the other class has too, are a
+    ``UserError``.
     """
-    remarks = _doubts(parts.labelled)
-    labelled = _states(parts.labelled, "labelled", taking)
-    unlabelled = _states(parts.unlabelled, "unlabelled", taking, labelled)
-    goals = _named(sub_goals or parts.sub_goals, labelled.labels.shape[1])
-    names = test_names = parts.labelled.names
-    if parts.features and len(parts.features) != labelled.observations[0].size:
-        counts = f"{len(parts.features)} for {labelled.observations.dtype} {labelled.observations.shape[1:]}"
-        raise UserError("the number of feature names is wrong", counts, "Give one for each.")
-    if parts.heldout:
-        heldout, test_names = _states(parts.heldout, "held-out", taking, labelled), parts.heldout.names
-        remarks += contradictions(joined([labelled, heldout]), goals, [*names, *test_names])
-        heldout = _apart(heldout, [labelled, unlabelled], "held-out", "to learn from", remarks)
-    else:
-        remarks += contradictions(labelled, goals, names)
-        chosen = _held_out(labelled, parts.labelled.groups, share, seed)
-        unlabelled = _without_groups(unlabelled, parts, chosen, remarks)
-        heldout, labelled = labelled.where(chosen), labelled.where(~chosen)
-        heldout = _apart(heldout, [labelled], "held-out", "to learn from", remarks)
-        unlabelled = _apart(unlabelled, [heldout], "unlabelled", "held out", remarks)
-        remark = "no held-out states were given: {} of the labelled ones are held out, which says nothing about {}"
-        remarks.append(remark.format(int(chosen.sum()), "other contexts"))
-    require_classes(labelled.labels, goals, None, "Give states of both kinds.")
-    of_labelled = [names[row] for row in labelled.origins[ROW]]
-    contradictions(labelled, goals, of_labelled)
-    remarks += near_duplicates(
-        labelled, heldout, goals, (of_labelled, [test_names[row] for row in heldout.origins[ROW]])
+    labelled, unlabelled, heldout = split(frames, seed, source)
+    names = [frame.name for frame in frames]
+    first = frames[0]
+    for frame in frames:
+        if frame.seen.keys() != first.seen.keys():
+            fault = "episodes have different observations"
+            raise UserError(fault, f"{first.name}, {frame.name}", "Choose some by --key.")
+    parts, channels, remarks = {}, {}, []
+    for key, state in first.seen.items():
+        states = [frame.seen[key] for frame in frames]
+        short = key.replace("/", ".") if len(first.seen) > 1 else ""
+        parts[short] = together(states, names, key or "the observations")
+        doubt = reading_of(state.shape, state.dtype).doubt
+        if first.channels[key]:
+            channels[short] = first.channels[key]
+        if doubt:
+            remarks.append(doubt)
+    with reading(source, "Give keys that can be file names."):
+        observations = parts[""] if "" in parts else packed(parts)
+    count = observations[0].size
+    if features and len(features) != count:
+        raise UserError(f"{len(features)} names of features do not fit", f"{count} numbers", "Give one for each.")
+    labels = np.array([frame.labels for frame in frames])
+    looks = np.array([digest(state).hex() for state in observations])
+    remarks += contradictions(names, labels, looks, goals, labelled, heldout)
+    learned = np.concatenate([labelled, unlabelled])
+    if not len(heldout):
+        groups = np.array([frame.episode.group for frame in frames])
+        is_held = _held_out(labels[labelled], groups[labelled], looks[labelled], share, seed)
+        heldout, labelled = labelled[is_held], labelled[~is_held]
+        learned = labelled
+        remarks.append(REMARK.format(len(heldout)))
+        of_unlabelled = groups[unlabelled]
+        alike = np.isin(of_unlabelled, groups[heldout]) & (of_unlabelled != "")
+        unlabelled = _without(unlabelled, alike, "unlabelled states are of held-out groups", remarks)
+    alike = np.isin(looks[heldout], looks[learned])
+    heldout = _without(heldout, alike, "held-out states look like ones to learn from", remarks)
+    alike = np.isin(looks[unlabelled], looks[heldout])
+    unlabelled = _without(unlabelled, alike, "unlabelled states look like ones held out", remarks)
+    require_classes(labels[labelled], goals, None, "Give states of both kinds.")
+    remarks += doubts_of(labels[labelled], labels[heldout], goals)
+    sets = []
+    for rows in (labelled, unlabelled, heldout):
+        origins = {ROW: np.arange(len(rows))}
+        sets.append(States(observations[rows], labels[rows], origins))
+    collected = Collected(
+        observations.shape[1:],
+        tuple(goals),
+        *sets,
+        tuple(features),
+        channels,
     )
-    remarks += doubts_of(labelled.labels, heldout.labels, goals)
-    sets = labelled, unlabelled, heldout
-    labelled, unlabelled, heldout = [replace(states, origins=_rows(states)) for states in sets]
-    shape = labelled.observations.shape[1:]
-    channels = {key.replace("/", "."): meaning for key, meaning in parts.channels.items()}
-    return Collected(shape, goals, labelled, unlabelled, heldout, tuple(parts.features), channels), remarks
+    return collected, remarks
 
 
-def _doubts(part: Given) -> list[str]:
-    """Why values may be something else than they are taken for."""
-    readings = [reading_of(values.shape[1:], values.dtype) for values in part.observations.values()]
-    return [reading.doubt for reading in readings if reading.doubt]
+def contradictions(
+    names: Sequence[str],
+    labels: Labels,
+    looks: Array,
+    goals: Sequence[str],
+    labelled: Integers,
+    heldout: Integers,
+) -> list[str]:
+    """A line for each sub-goal with equal states whose labels differ; a ``UserError`` if a class has no others.
+
+    ``names``, ``labels`` (N, G) and ``looks``, equal where states are, are of all states, the last two rows of some.
+    """
+    known = np.concatenate([labelled, heldout])
+    lines = []
+    for goal, column in zip(goals, labels.T, strict=True):
+        positive = column[known]
+        both = np.intersect1d(looks[known[positive]], looks[known[~positive]])
+        if not len(both):
+            continue
+        alike = known[looks[known] == both[0]]
+        example = " and ".join(names[row] for row in alike)
+        clear = labelled[~np.isin(looks[labelled], both)]
+        where = f"without those that have both labels, such as {example}"
+        require_classes(column[clear, None], [goal], where, "Remove the copies whose label is wrong.")
+        fault = f"{len(both)} times equal states have both labels of {goal}"
+        lines.append(f"{fault}: no member can be right about {example}")
+    return lines
 
 
-def _states(part: Given, kind: str, taking: Taking, like: States | None = None) -> States:
-    """Checked states, with their rows as origins; ``like`` are the labelled ones."""
-    pattern = like.observations if like else None
-    observations = taking.observations(part.observations, f"the {kind} observations", pattern)
-    goals = like.labels.shape[1] if like else None
-    if part.labels is None:
-        labels = np.zeros((len(observations), goals or 0), np.bool_)
-    else:
-        labels = _labels(part.labels, len(observations), kind, goals)
-    states = States(observations, labels)
-    return replace(states, origins=_rows(states))
+def split(frames: Sequence[Frame], seed: int, source: Path) -> list[Integers]:
+    """The rows of frames that are labelled, unlabelled and held out.
+
+    Whole episodes whose role is open are drawn for those of the three that have no frames yet, ``SPLIT`` of them each.
+    """
+    sets: dict[str, list[int]] = {role: [] for role in ROLES}
+    free: dict[str, list[int]] = {}
+    for row, frame in enumerate(frames):
+        if frame.role:
+            sets[frame.role].append(row)
+        else:
+            free.setdefault(frame.episode.name, []).append(row)
+    if free:
+        are_empty = [not rows for rows in sets.values()]
+        shares = np.cumsum(SPLIT * are_empty)
+        ends = shares[:2] / shares[2] * len(free)
+        episodes = [*free.values()]
+        order = rng_for(seed, "minari").permutation(len(free))
+        parts = np.split(order, np.round(ends).astype(int))
+        for role, drawn in zip(ROLES, parts, strict=True):
+            for episode in drawn:
+                sets[role] += episodes[episode]
+    needed = ROLES if free else ROLES[:2]
+    for role in needed:
+        if not sets[role]:
+            raise UserError(f"there are no {role} states", source, MORE)
+    return [np.array(rows, np.int64) for rows in sets.values()]
 
 
-def _labels(values: Array, count: int, kind: str, goals: int | None) -> Labels:
-    """Labels bool (count, G) of ``goals`` sub-goals, if these are known."""
-    columns = values if values.ndim > 1 else np.atleast_1d(values)[:, None]
-    if columns.shape != (count, goals or columns.shape[1]) or not columns.size or not np.isin(columns, (0, 1)).all():
-        fault = f"labels of {count} {kind} states are not 0 or 1 for each"
-        do = f"Give ({count},), or ({count}, sub-goals): 1 where the sub-goal holds, 0 where not."
-        raise UserError(fault, f"{values.dtype} {values.shape}", do)
-    return columns.astype(np.bool_)
+def _without(
+    rows: Integers,
+    left: Labels,
+    reason: str,
+    remarks: list[str],
+) -> Integers:
+    """The rows that are not ``left`` out, which is said with the reason; if none is kept: a ``UserError``."""
+    if left.all():
+        raise UserError(f"all {len(rows)} {reason}", None, "Give some of other contexts.")
+    if left.any():
+        remarks.append(f"{left.sum()} of {len(rows)} {reason}: they are left out")
+    return rows[~left]
 
 
-def _rows(states: States) -> dict[str, Integers]:
-    return {ROW: np.arange(len(states.labels), dtype=np.int64)}
-
-
-def _apart(states: States, others: Sequence[States], kind: str, role: str, remarks: list[str]) -> States:
-    """The states of a ``kind`` that equal none of the others, whose ``role`` is for messages; none: a ``UserError``."""
-    kept = leave_out(states, *[other.observations for other in others])
-    count, left = len(states.labels), len(kept.labels)
-    if left < count:
-        remarks.append(f"{count - left} of {count} {kind} states look like one {role}: they are left out")
-    if not left:
-        raise UserError(f"every {kind} state looks like one {role}", None, OTHERS)
-    return kept
-
-
-def _without_groups(unlabelled: States, parts: Parts, chosen: Labels, remarks: list[str]) -> States:
-    """The unlabelled states that are of no held-out group."""
-    if parts.labelled.groups is None or parts.unlabelled.groups is None:
-        return unlabelled
-    kept = ~np.isin(parts.unlabelled.groups, parts.labelled.groups[chosen])
-    if not kept.any():
-        raise UserError("every unlabelled state is of a held-out group", None, OTHERS)
-    if not kept.all():
-        remarks.append(f"{(~kept).sum()} of {len(kept)} unlabelled states are of held-out groups: they are left out")
-    return unlabelled.where(kept)
-
-
-def _named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
-    """The names of ``count`` sub-goals; a ``UserError`` unless there are as many plain, distinct ones."""
-    names = tuple(sub_goals) or (("sub-goal",) if count == 1 else ())
-    if len(names) != count:
-        do = f"Give --sub-goal NAME {count} times, in the order of the labels' columns."
-        raise UserError(f"{count} sub-goals need as many names", ", ".join(names) or None, do)
-    require_names(names)
-    return names
-
-
-def _held_out(states: States, groups: Array | None, share: float, seed: int) -> Labels:
-    """Which states are held out, bool (N,): whole groups, or without groups all that look alike."""
-    labels = states.labels
-    if groups is not None and len(groups) != len(labels):
-        raise UserError(
-            "the groups do not fit the labelled states", f"{len(groups)} for {len(labels)}", "Give one each."
-        )
-    by = looks_of(states.observations) if groups is None else groups
-    _, first, unit = np.unique(by, return_index=True, return_inverse=True)
+def _held_out(
+    labels: Labels,
+    groups: Array,
+    looks: Array,
+    share: float,
+    seed: int,
+) -> Labels:
+    """Which states are held out, bool (N,): whole groups, and without groups all that look alike."""
+    alike = np.where(groups == "", looks, groups)
+    _, first, unit = np.unique(alike, return_index=True, return_inverse=True)
     kinds = labels[first]
-    if groups is not None:  # which labels a group has
-        of_groups = [labels[unit == group] for group in range(len(first))]
-        kinds = np.array([[*some.any(0), *some.all(0)] for some in of_groups])
+    if groups.any():  # which labels a group has
+        rows = []
+        for group in range(len(first)):
+            some = labels[unit == group]
+            rows.append([*some.any(axis=0), *some.all(axis=0)])
+        kinds = np.array(rows)
     order = np.argsort(first)  # each once, in the original order
+    chosen = held_out(kinds[order], share, seed)
     held = np.zeros(len(first), np.bool_)
-    held[order[held_out(kinds[order], share, seed)]] = True
+    held[order[chosen]] = True
     return held[unit]
 
 
@@ -172,6 +202,6 @@ def held_out(labels: Labels, share: float, seed: int) -> Labels:
         chosen[rng.permutation(rows)[:taken]] = True
         due -= taken
     if not chosen.any():
-        fault = f"none of {len(labels)} labelled states, or groups of them, can be held out"
-        raise UserError(fault, f"heldout={share:g}", "Give held-out states, a larger --heldout, or more labelled ones.")
+        do = "Give held-out states, a larger --heldout, or more labelled ones."
+        raise UserError(f"none of {len(labels)} labelled states, or groups of them, can be held out", None, do)
     return chosen

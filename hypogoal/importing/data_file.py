@@ -3,19 +3,17 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from hypogoal.core.artefacts import DATA, create, kind_of
 from hypogoal.core.errors import UserError
-from hypogoal.data import open_dataset, write_dataset
+from hypogoal.data import open_dataset, require_names, write_dataset
 from hypogoal.domains.base import IMPORTED
-from hypogoal.importing.arrays import read_arrays
+from hypogoal.importing.arrays import episodes_of, read_arrays
 from hypogoal.importing.assemble import assemble
-from hypogoal.importing.episodes import recorded_parts
 from hypogoal.importing.labels import rule_of, with_labels
-from hypogoal.importing.pictures import TWO, read_pictures
+from hypogoal.importing.pictures import POSITIVE, read_pictures
 from hypogoal.importing.recordings import reader_of
-from hypogoal.importing.taken import Taking
+from hypogoal.importing.states import frames_of
 
 
 def import_data(
@@ -43,59 +41,75 @@ def import_data(
     Args:
         sub_goals: names, in the order of the labels' columns.
         labels: of episodes, what labels each sub-goal: :func:`hypogoal.importing.labels.rule_of`.
-        keys: parts of the episodes' observations, all by default.
+        keys: parts of the observations, all by default.
         share: of the labelled states, held out where none are given.
-        sides: see :class:`Taking`.
+        sides: most pixels on the longer side of pictures, by key; "" is of all that have none of their own.
         every: take each n-th frame of episodes, and the last.
-        stack: see :class:`Taking`.
+        stack: axes of frames and colours become channels.
         group: the array by which labelled states belong together.
         domain: the environment, for later stages.
 
     Raises:
         UserError: if something cannot be read, or not be used, or ``out`` exists.
     """
-    rules, taking = labels or {}, Taking(sides or {}, stack)
     if not source.exists():
         raise UserError("no such file or folder", source, "Give one that there is.")
+    rules = dict(labels or {})
     inputs = [source] if source.is_file() else []
     with create(out, kind=DATA, config={"domain": domain}, seed=seed, inputs=inputs, force=force) as draft:
         file = draft.files / out.name
         if inputs and kind_of(source) == DATA:
-            if sub_goals or keys or every > 1 or group or taking != Taking() or domain != IMPORTED:
+            if sub_goals or group or keys or sides or stack or every > 1 or domain != IMPORTED:
                 do = "Give --label NAME=TABLE.csv and --out alone."
                 raise UserError("a data file is taken as it is", source, do)
             return _label(source, file, rules, seed)
-        left: Counter[str] = Counter()
-        of_pictures = any((source / kind).is_dir() for kind in TWO)
+        of_pictures = (source / POSITIVE).is_dir()
         reader = None if of_pictures else reader_of(source)
-        if reader is None and (rules or keys or every > 1):
-            raise UserError("this is no recording", source, "--label, --key and --every are for episodes.")
-        if group and (reader or of_pictures):
-            do = "Episodes, and folders within positive/ and negative/, are groups already."
-            raise UserError("--group is for arrays", source, do)
-        remarks: list[str] = []
+        refusals = (
+            (rules and sub_goals, "--label names the sub-goals", "Leave out --sub-goal."),
+            (not reader and (rules or every > 1), "this is no recording", "--label and --every are for episodes."),
+            (group and (reader or of_pictures), "--group is for arrays", "Episodes and folders are groups already."),
+        )
+        for applies, fault, do in refusals:
+            if applies:
+                raise UserError(fault, source, do)
+        left: Counter[str] = Counter()
+        features: list[str] = []
         if reader:
-            by_goal = {goal: rule_of(rule) for goal, rule in rules.items()}
-            recordings = reader(source, keys, left)
-            parts, remarks = recorded_parts(source, recordings, by_goal, taking, keys=keys, every=every, seed=seed)
+            episodes = reader(source, keys, left)
+            goals = [*rules]
         elif of_pictures:
-            parts = read_pictures(source, taking, left)
-            sub_goals = sub_goals or (source.resolve().name,)
+            goals = [*sub_goals] or [source.resolve().name]
+            episodes = read_pictures(source, goals[0], left)
         else:
-            parts = read_arrays(source, group)
-        if left:
-            remarks.append(f"not read: {', '.join(f'{count} {suffix}' for suffix, count in sorted(left.items()))}")
-        collected, more = assemble(parts, sub_goals, taking, share=share, seed=seed)
+            arrays = read_arrays(source, group)
+            goals = [*sub_goals] or arrays["sub_goals"][""].tolist()
+            features = arrays["features"][""].tolist()
+            episodes = episodes_of(arrays, goals, group, source)
+        require_names(goals)
+        by_goal = {goal: rule_of(rules.get(goal, goal)) for goal in goals}  # columns are named after their sub-goals
+        frames = frames_of(
+            source,
+            episodes,
+            by_goal,
+            left,
+            keys=keys,
+            every=every,
+            sides=sides,
+            stack=stack,
+        )
+        collected, remarks = assemble(source, [*frames], goals, features, share=share, seed=seed)
         arguments = {
-            "labels": dict(rules),
-            "resize": dict(taking.sides),
+            "source": source.name,
+            "labels": rules,
+            "resize": sides,
             "every": every if every > 1 else 0,
             "group": group,
         }
-        config: dict[str, Any] = {"source": source.name}
-        config |= {name: value for name, value in arguments.items() if value}
+        config = {name: value for name, value in arguments.items() if value}
         write_dataset(file, collected, domain=domain, config=config, seed=seed)
-        return remarks + more
+        counts = ", ".join(f"{count} {what}" for what, count in sorted(left.items()))
+        return [f"not read: {counts}", *remarks] if left else remarks
 
 
 def _label(source: Path, file: Path, rules: Mapping[str, str], seed: int) -> list[str]:

@@ -1,9 +1,9 @@
 """Files that other programs wrote: which there are, and why one cannot be read."""
 
-import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from glob import iglob
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,22 +11,24 @@ from typing import Any
 from hypogoal.core.errors import UserError
 
 POINTER = b"version https://git-lfs"  # how a file begins that Git LFS has not fetched
+AGAIN = "Write or download it again; hypogoal's page on data of your own says what is read."
 
 
-def files_of(folder: Path, suffixes: Sequence[str], left: Counter[str]) -> list[Path]:
+def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> list[Path]:
     """The visible files with these suffixes in a folder and those below it, sorted, links followed.
 
     ``left`` counts the others by suffix.
     """
     taken = []
-    for place, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in names:
-            suffix = Path(name).suffix.lower()
-            if suffix in suffixes and not name.startswith("."):
-                taken.append(Path(place, name))
-            elif not name.startswith("."):
-                left[suffix or name] += 1
+    for name in iglob("**/*", root_dir=folder, recursive=True):
+        file = folder / name
+        suffix = file.suffix.lower()
+        if file.is_dir():
+            continue
+        if suffix in suffixes:
+            taken.append(file)
+        else:
+            left[suffix or file.name] += 1
     return sorted(taken)
 
 
@@ -40,7 +42,7 @@ def needed(module: str, extra: str) -> Any:
 
 
 @contextmanager
-def reading(path: Path, do: str) -> Iterator[None]:
+def reading(path: Path, do: str = AGAIN) -> Iterator[None]:
     """A block that reads a file of another program: whatever its library raises becomes one line with the cause."""
     try:
         yield

@@ -1,29 +1,42 @@
 """What labels states: the rules of ``--label`` for episodes, and tables that people fill in (Spec I6)."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hypogoal.core.config import near
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load, place_of
-from hypogoal.data import Collected, Dataset, States, joined
-from hypogoal.importing.episodes import Mark, Recording, Rule
+from hypogoal.core.own_code import load
+from hypogoal.data import Collected, Dataset, Labels, joined
+from hypogoal.importing.episodes import Episode
 from hypogoal.importing.files import reading
 from hypogoal.observations import NUMBERS, Observations, digest
 
-LABELS = "hypogoal.labels"  # entry points of label functions
+GROUP = "hypogoal.labels"  # entry points of label functions
 LAST, TABLE = "last:", ".csv"  # how rules begin and end that are neither columns nor code
-SPANS = ("episode", "from", "to")  # columns of a table of positive frames; ``to`` is the first frame behind them
+SPANS = {"episode": str, "from": int, "to": int}  # columns of a table of positive frames; ``to`` is the first behind
 SUCCESS = ("next.success", "success", "next.reward", "reward", "rewards")  # columns that say so, the first there is
 # Columns of a table of states to label: the picture's file, the label (1, 0 or nothing yet), the row among the
 # unlabelled states and its :func:`hypogoal.observations.digest`, how much members disagree.
 COLUMNS = ("name", "label", "row", "digest", "disagreement")
+TRUTHS = {"0": False, "1": True}
+
+
+class Rule(NamedTuple):
+    """What labels a sub-goal.
+
+    Attributes:
+        marks: from an episode to its labels, bool (T,), or to a function of an observation; None: it has no labels.
+        listed: the episodes that a table names, and where.
+    """
+
+    marks: Callable[[Episode], Any]
+    listed: Mapping[str, str] = {}
 
 
 def rule_of(text: str) -> Rule:
@@ -34,84 +47,83 @@ def rule_of(text: str) -> Rule:
     if text.endswith(TABLE):
         return _by_table(Path(text))
     count = text.removeprefix(LAST)
-    if count == text and ":" in text:
-        return Rule(partial(_by_code, load(text, "label function", LABELS, {})))
-    if count == text:
-        return Rule(partial(_by_column, text))
-    if not count.isdecimal() or not int(count):
-        raise UserError("the number of last frames is not above 0", text, "Give last:10, for example.")
-    return Rule(partial(_by_end, int(count)))
+    if count != text and count.isdecimal():
+        return Rule(partial(_by_end, int(count)))
+    if ":" in text:
+        function = load(text, "label function", GROUP, {})
+        return Rule(lambda _: function)
+    return Rule(partial(_by_column, text))
 
 
-def _by_column(name: str, recording: Recording) -> Mark:
-    if name not in recording.columns:
-        do = near(name, recording.columns) or f"Its columns are {', '.join(recording.columns) or 'none'}."
-        others = "last:N, TABLE.csv and module:function label, too."
-        raise UserError(f"no column {name!r} to label by", recording.name, f"{do} {others}")
-    values = np.ravel(recording.columns[name])
-    if values.dtype.kind not in "biuf" or len(values) != recording.length or not np.isfinite(values).all():
-        raise UserError(f"the column {name!r} is not one number for each frame", recording.name, "Give another.")
-    return lambda row, _: bool(values[row] > 0)
+def _by_column(name: str, episode: Episode) -> Labels:
+    """Where a column is above 0."""
+    values = np.ravel(episode.columns.get(name, ()))
+    are_numbers = values.dtype.kind in "biuf" and len(values) == episode.length
+    if not are_numbers or not np.isfinite(values).all():
+        columns = ", ".join(episode.columns) or "none"
+        do = near(name, episode.columns) or f"Its columns are {columns}."
+        fault = f"no column {name!r} with a number for each frame"
+        raise UserError(fault, episode.name, do)
+    return values > 0
 
 
-def _by_end(count: int, recording: Recording) -> Mark:
-    says = [name for name in SUCCESS if name in recording.columns]
-    succeeded = not says or bool((recording.columns[says[0]] > 0).any())
-    return lambda row, _: succeeded and row >= recording.length - count
-
-
-def _by_code(function: Any, _: Recording) -> Mark:
-    def mark(_: int, seen: Any) -> bool:
-        gets = f"It gets a dictionary of {', '.join(seen)}." if isinstance(seen, dict) else "It gets an observation."
-        try:
-            value = function(seen)
-        except Exception as error:
-            fault = f"the label function raised {type(error).__name__}: {error}"
-            raise UserError(fault, place_of(error), gets) from error
-        if np.shape(value) or value not in (0, 1):
-            raise UserError("the label function gave neither True nor False", repr(value), gets)
-        return bool(value)
-
-    return mark
+def _by_end(count: int, episode: Episode) -> Labels:
+    rows = np.arange(episode.length)
+    succeeded = True
+    for name in reversed(SUCCESS):
+        if name in episode.columns:
+            succeeded = np.any(episode.columns[name] > 0)
+    return succeeded & (rows >= episode.length - count)
 
 
 def _by_table(path: Path) -> Rule:
     """Positive frames by a table of ``SPANS``; an episode that it does not list has no labels."""
     rows = read_table(path, SPANS)
 
-    def marks(recording: Recording) -> Mark | None:
-        numbers = {str(number): number for number in range(recording.length + 1)}
-        positive = np.zeros(recording.length, np.bool_)
-        listed = [row for row in rows if row["episode"] == recording.name]
-        for row in listed:
-            first, end = numbers.get(row["from"], -1), numbers.get(row["to"], -1)
-            if not 0 <= first <= end:
-                text = f"{row['from']!r} up to {row['to']!r}"
-                fault = f"a label is of frames {text}, episode {recording.name} has {recording.length}"
-                raise UserError(fault, row["line"], "Give integers, 0 <= from <= to <= its frames.")
+    def marks(episode: Episode) -> Labels | None:
+        positive = np.zeros(episode.length, np.bool_)
+        own = [row for row in rows if row["episode"] == episode.name]
+        for row in own:
+            first, end = row["from"], row["to"]
+            if not 0 <= first <= end <= episode.length:
+                fault = f"a label is of frames {first} up to {end} of {episode.length}"
+                raise UserError(fault, row["line"], "Give 0 <= from <= to <= the episode's frames.")
             positive[first:end] = True
-        return (lambda row, _: bool(positive[row])) if listed else None
+        return positive if own else None
 
     return Rule(marks, {row["episode"]: row["line"] for row in rows})
 
 
-def read_table(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
+def is_marked(mark: Any, row: int, seen: Any) -> bool:
+    """Whether a frame is positive, by what :attr:`Rule.marks` gave."""
+    if not callable(mark):
+        return bool(mark[row])
+    value = mark(seen)
+    if np.shape(value) or value not in (0, 1):
+        do = "It gets an observation, by key if there are several."
+        raise UserError("the label function gave neither True nor False", repr(value), do)
+    return bool(value)
+
+
+def read_table(path: Path, columns: Mapping[str, type]) -> list[dict[str, Any]]:
     """The rows of a CSV file that has these columns, and the ``line`` of each; a byte order mark is left out."""
-    do = f"Give a CSV file, with commas, whose first line names {', '.join(columns)}."
-    with reading(path, do):
-        reader = csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines(), restval="")
-        records = [*reader]
-    missing = [name for name in columns if name not in (reader.fieldnames or ())]
-    if missing:
-        raise UserError(f"the table of labels has no column {missing[0]!r}", path, do)
     rows = []
-    for number, cells in enumerate(records, 2):
-        row = {name: cells[name].strip() for name in columns}
-        rows.append({**row, "line": f"{path}, line {number}"})
+    do = f"Give a CSV file, with commas, whose first line names {', '.join(columns)}."
+    with reading(path, do), path.open(encoding="utf-8-sig", newline="") as text:
+        lines = csv.DictReader(text, restval="")
+        for number, cells in enumerate(lines, 2):
+            row: dict[str, Any] = {"line": f"{path}, line {number}"}
+            for name, kind in columns.items():
+                row[name] = kind(cells[name].strip())
+            rows.append(row)
     return rows
 
 
-def with_labels(dataset: Dataset, table: Path, sub_goal: str) -> tuple[Collected, int]:
+def with_labels(
+    dataset: Dataset,
+    table: Path,
+    sub_goal: str,
+) -> tuple[Collected, int]:
     """The states of a data file, those that a table labels moved to the labelled ones; and how many these are.
 
     ``audit`` proposes the table beside pictures of the states, a person or a script fills it in. One of other data,
@@ -123,32 +135,45 @@ def with_labels(dataset: Dataset, table: Path, sub_goal: str) -> tuple[Collected
     unlabelled = dataset.unlabelled_states()
     labels = _labels_in(table, unlabelled.observations)
     rows = np.array([*labels])
-    new = replace(unlabelled.where(rows), labels=np.array([*labels.values()])[:, None])
-    rest = unlabelled.where(~np.isin(np.arange(len(unlabelled.labels)), rows))
-    labelled, test = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    before = States(labelled.observations, labelled.labels[:, None], labelled.origins)
-    heldout = States(test.observations, test.labels[:, None], test.origins)
-    features = tuple(dataset.features()) if dataset.observation_dtype == NUMBERS else ()
-    shape = dataset.observation_shape
-    sets = joined([before, new]), rest, heldout
-    return Collected(shape, (sub_goal,), *sets, features=features, channels=dataset.channels), len(labels)
+    marks = np.array([*labels.values()])
+    old, heldout = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
+    learned = joined([old, replace(unlabelled.where(rows), labels=marks)])
+    others = np.delete(np.arange(len(unlabelled.labels)), rows)
+    rest = unlabelled.where(others)
+    sets = [
+        replace(learned, labels=learned.labels[:, None]),
+        rest,
+        replace(heldout, labels=heldout.labels[:, None]),
+    ]
+    features: Sequence[str] = ()
+    if dataset.observation_dtype == NUMBERS:
+        features = dataset.features()
+    collected = Collected(
+        dataset.observation_shape,
+        dataset.sub_goals,
+        *sets,
+        tuple(features),
+        dataset.channels,
+    )
+    return collected, len(labels)
 
 
 def _labels_in(table: Path, observations: Observations) -> dict[int, bool]:
     """The labels of unlabelled states, by row."""
-    places = {str(place): place for place in range(len(observations))}
+    places = {digest(state).hex(): place for place, state in enumerate(observations)}
     labels: dict[int, bool] = {}
-    for row in read_table(table, ("label", "row", "digest")):
-        if row["label"] not in ("", "0", "1"):
-            raise UserError("a label is neither 1 nor 0", row["line"], "Leave it empty where it is not known.")
+    for row in read_table(table, {"label": str, "digest": str}):
         if not row["label"]:
             continue
-        place = places.get(row["row"], -1)
-        if place < 0 or digest(observations[place]).hex() != row["digest"]:
-            raise UserError("this state is not of these data", row["line"], "Audit an ensemble of these data again.")
-        if place in labels:
-            raise UserError("the table names a state twice", row["line"], "Leave one of them out.")
-        labels[place] = row["label"] == "1"
+        place = places.get(row["digest"])
+        if place is None:
+            do = "Audit an ensemble of these data again."
+            raise UserError("this state is not of these data", row["line"], do)
+        if place in labels or row["label"] not in TRUTHS:
+            fault = "a label is neither 1 nor 0, or the second of its state"
+            do = "Give each state one label, or leave it empty where that is not known."
+            raise UserError(fault, row["line"], do)
+        labels[place] = TRUTHS[row["label"]]
     if not labels:
         raise UserError("the table has no label yet", table, "Fill in 1 or 0.")
     return labels

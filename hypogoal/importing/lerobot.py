@@ -6,109 +6,109 @@ film an episode begins. The package lerobot is not needed, pyarrow and PyAV are 
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hypogoal.core.errors import UserError
 from hypogoal.data import Integers
-from hypogoal.importing.episodes import AGAIN, Recording
+from hypogoal.importing.episodes import Array, Episode
 from hypogoal.importing.files import needed, reading
-from hypogoal.importing.films import EXTRA, frames_near
-from hypogoal.importing.parts import Array
+from hypogoal.importing.films import EXTRA, frames_of
 from hypogoal.importing.pictures import picture_of
 
 INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
 DO = "Give the folder of a whole LeRobotDataset in format v2.1 or v3.0."
-OWNER, TIME = "episode_index", "timestamp"  # columns of every table
-VIDEO, IMAGE = "video", "image"  # types of features
+OWNER = "episode_index"  # a column of every table
 NUMBERS = ("float", "int", "uint", "bool")  # how the types of all others begin that are read
 
 
-def read_lerobot(source: Path, keys: Sequence[str], left: Counter[str]) -> Iterator[Recording]:
-    """The episodes of a dataset, with ``keys`` of its features, all ``observation*`` if none are given."""
-    with reading(source / INFO, DO):
-        info = json.loads((source / INFO).read_text(encoding="utf-8-sig"))
-        kinds = {key: str(feature["dtype"]) for key, feature in info["features"].items()}
-        version = info["codebase_version"]
-        if version[:2] not in ("v2", "v3"):
-            raise UserError(f"the format {version} is not read", source, DO)
-    seen = [key for key in kinds if key in keys or key.startswith("observation")]
-    numbers = [key for key, kind in kinds.items() if kind.startswith(NUMBERS)]
-    pictures = [key for key in keys or seen if kinds.get(key) == IMAGE]
-    table_of = lru_cache(maxsize=1)(partial(_table, columns=[*numbers, *pictures]))  # episodes of one come together
-    for row in _listed(source, version):
-        with reading(source, DO):
-            places = _Places(source, info, row)
-            file = places.file("data_path", "data", "")
+def read_lerobot(
+    source: Path,
+    keys: Sequence[str],
+    left: Counter[str],
+) -> Iterator[Episode]:
+    """The episodes of a dataset, with ``keys`` of its features beside all ``observation*``."""
+    with reading(source, DO):
+        text = (source / INFO).read_text(encoding="utf-8-sig")
+        info = json.loads(text)
+        table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
+        for row in _listed(source):
+            place = partial(_place, source, info, row)
+            file = place("data_path", "data")
             table = table_of(file)
-            frames = table.filter(np.array(table[OWNER]) == row[OWNER])
-            if len(frames) != row["length"]:
-                fault = f"episode {row[OWNER]} has {len(frames)} frames, {row['length']} are listed"
-                raise UserError(fault, file, AGAIN)
-            values = {}
-            for key in numbers:
-                values[key] = np.array(frames[key].to_pylist()).reshape(len(frames), *info["features"][key]["shape"])
-            read: dict[str, Any] = {key: values[key].__getitem__ for key in seen if key in values}
-            for key in seen:
-                if kinds[key] == VIDEO:
-                    read[key] = partial(places.film, key, values[TIME].ravel())
-                if kinds[key] == IMAGE:
-                    read[key] = partial(_cells, file, frames, key)
-            texts = [key for key in seen if key not in read]
-            yield Recording(str(row[OWNER]), len(frames), read, values, texts)
+            is_own = np.array(table[OWNER]) == row[OWNER]
+            frames = table.filter(is_own)
+            columns = {}
+            seen: dict[str, Any] = {}
+            for key, feature in info["features"].items():
+                kind = feature["dtype"]
+                if kind.startswith(NUMBERS):
+                    values = np.array(frames[key].to_pylist())
+                    columns[key] = values.reshape(len(frames), *feature["shape"])
+                if key not in keys and not key.startswith("observation"):
+                    continue
+                if kind == "video":
+                    film = place("video_path", f"videos/{key}", key)
+                    begin = row.get(f"videos/{key}/from_timestamp", 0.0)
+                    seen[key] = partial(frames_of, film, rate=info["fps"], begin=begin)
+                elif kind == "image":
+                    seen[key] = partial(_cells, file, frames[key])
+                else:
+                    seen[key] = columns.get(key)
+            yield Episode(
+                str(row[OWNER]),
+                len(frames),
+                seen,
+                columns,
+            )
 
 
-def _listed(source: Path, version: str) -> list[dict[str, Any]]:
+def _listed(source: Path) -> list[dict[str, Any]]:
     """What ``meta/`` says of each episode."""
     file = source / EPISODES.with_suffix(".jsonl")
+    if file.exists():
+        text = file.read_text(encoding="utf-8-sig")
+        lines = filter(str.strip, text.splitlines())
+        return [*map(json.loads, lines)]
     rows: list[dict[str, Any]] = []
-    if version.startswith("v2"):
-        with reading(file, DO):
-            lines = file.read_text(encoding="utf-8-sig").splitlines()
-            rows += map(json.loads, filter(str.strip, lines))
-    for table in sorted((source / EPISODES).glob("*/*.parquet")):
-        rows += _table(table).to_pylist()
-    if not rows:
-        raise UserError("the list of episodes is empty", source / EPISODES, DO)
+    files = (source / EPISODES).glob("*/*.parquet")
+    for file in sorted(files):
+        rows += _table(file).to_pylist()
     return rows
 
 
-@dataclass(frozen=True)
-class _Places:
-    """Where the parts of an episode lie: its ``row`` of the list says so in v3.0, its number in v2.1."""
+def _place(
+    source: Path,
+    info: Mapping[str, Any],
+    row: Mapping[str, Any],
+    name: str,
+    head: str,
+    key: str = "",
+) -> Path:
+    """Where an episode's table or film lies: its row of the list says so in v3.0."""
+    size = info.get("chunks_size", 1000)
+    chunk = row.get(f"{head}/chunk_index", row[OWNER] // size)
+    file = row.get(f"{head}/file_index", row[OWNER])
+    place = info[name].format(
+        video_key=key,
+        chunk_index=chunk,
+        file_index=file,
+        episode_chunk=chunk,
+        episode_index=file,
+    )
+    return source / place
 
-    source: Path
-    info: Mapping[str, Any]
-    row: Mapping[str, Any]
 
-    def file(self, template: str, head: str, key: str) -> Path:
-        number = self.row[OWNER]
-        chunk = self.row.get(f"{head}/chunk_index", number // self.info.get("chunks_size", 1000))
-        file = self.row.get(f"{head}/file_index", number)
-        values = {"chunk_index": chunk, "file_index": file, "episode_chunk": chunk, "episode_index": file}
-        return self.source / self.info[template].format(video_key=key, **values)
-
-    def film(self, key: str, times: Array, rows: Integers) -> Iterable[Array]:
-        """Frames of a film, in which the episode begins at some second."""
-        begin = self.row.get(f"videos/{key}/from_timestamp", 0.0)
-        file = self.file("video_path", f"videos/{key}", key)
-        return frames_near(file, (begin + times[rows]).tolist(), 0.5 / self.info["fps"])
-
-
-def _table(file: Path, columns: Sequence[str] | None = None) -> Any:
+def _table(file: Path) -> Any:
     parquet = needed("pyarrow.parquet", EXTRA)
-    with reading(file, AGAIN), file.open("rb") as raw:
-        return parquet.ParquetFile(raw).read(columns=columns, use_threads=False)
+    with reading(file), file.open("rb") as raw:
+        return parquet.ParquetFile(raw).read(use_threads=False)
 
 
-def _cells(file: Path, table: Any, key: str, rows: Integers) -> Iterator[Array]:
+def _cells(file: Path, column: Any, rows: Integers) -> Iterator[Array]:
     """The pictures in cells of a table, ``{bytes, path}``."""
-    for cell in table[key].take(rows).to_pylist():
-        if not cell or not cell["bytes"]:
-            raise UserError(f"the table has no picture for each frame of {key}", file, "Write them into the tables.")
+    for cell in column.take(rows).to_pylist():
         yield picture_of(cell["bytes"], file)

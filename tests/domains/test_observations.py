@@ -21,9 +21,7 @@ from test_numbers import Says
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium.engine import reader_of
-from hypogoal.importing.arrays import parts_of
-from hypogoal.importing.assemble import assemble
-from hypogoal.importing.taken import Taking
+from hypogoal.importing.taken import take
 from hypogoal.observations import PICTURE
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"
@@ -66,15 +64,15 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
 
     An ``AssertionError`` where environment and array differ, or it was guessed.
     """
-    env, states = Constant(shape, dtype), np.ones((2, *shape), dtype)
+    env, state = Constant(shape, dtype), np.ones(shape, dtype)
     wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
-    of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: Taking().all(states, "", "the states"))
+    of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: take(state, "the state"))
     assert bool(of_env) == bool(of_array), (of_env, of_array)
     if of_env:
         assert dtype == "uint8" or (wide and "float" not in dtype), of_env
         return "refused"
-    look, taken = reader_of(env), Taking().all(states, "", "the states")[0]
-    assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
+    look, (taken, _) = reader_of(env), take(state, "the state")
+    assert taken.shape == look.shape and (taken.dtype == look.dtype or look.dtype != PICTURE)
     np.testing.assert_array_equal(look.read(env.reset()[0]), taken)
     if look.dtype == PICTURE:
         assert dtype == "uint8" and len(shape) in (2, 3)
@@ -99,7 +97,7 @@ def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outco
     found = outcome_of(shape, dtype)
     assert words.get(found, found) == outcome.removesuffix(", `(H, W, 1)`")
     if outcome.endswith("`(H, W, 1)`"):
-        assert Taking().all(np.ones((2, *shape), dtype), "", "the states").shape == (2, *shape, 1)
+        assert take(np.ones(shape, dtype), "the state")[0].shape == (*shape, 1)
 
 
 def test_the_table_has_all_types_and_every_outcome() -> None:
@@ -123,8 +121,8 @@ def test_frames_and_colours_are_stacked_in_their_order() -> None:
     for axes in ((2, 0, 1, 3), (2, 3, 0, 1), (0, 1, 3, 2), (3, 0, 1, 2), (3, 2, 0, 1), (0, 1, 2, 3)):
         states = whole.transpose(0, *(axis + 1 for axis in axes))
         with pytest.raises(UserError, match=r"stacks of pictures: .*Give pictures as uint8 .* 'import --stack' puts"):
-            Taking().all(states, "", "the states")
-        np.testing.assert_array_equal(Taking(stack=True).all(states, "", "the states"), wanted)
+            take(states[0], "the state")
+        np.testing.assert_array_equal([take(state, "the state", stack=True)[0] for state in states], wanted)
 
 
 def test_a_dictionary_hides_no_picture() -> None:
@@ -151,4 +149,5 @@ def test_floats_that_may_be_pictures_are_warned_of(tmp_path: Path) -> None:
     labelled, others = dataset.labelled("left-end"), dataset.unlabelled()
     arrays = {"observations": labelled.observations, "labels": labelled.labels, "unlabelled": others[:1]}
     arrays |= {"heldout_observations": others[1:], "heldout_labels": np.arange(len(others) - 1) % 2}
-    assert doubt in assemble(parts_of(arrays, tmp_path))[1]
+    np.savez(tmp_path / "states.npz", **arrays)
+    assert doubt in run("import", tmp_path / "states.npz", "--out", tmp_path / "again.h5", "-q").err

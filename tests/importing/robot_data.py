@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,10 @@ def episode_of(wrist: np.ndarray) -> int:
     return round((float(np.median(wrist)) - 20) / 10)
 
 
-def write_film(path: Path, frames: list[np.ndarray], fps: int = FPS, codec: str = "") -> None:
+def write_film(path: Path, frames: list[np.ndarray], fps: int = FPS) -> None:
     """An mp4 file, by default of the best codec that this build of FFmpeg has."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    codec = codec or next(name for name in ("libx264", "libopenh264", "mpeg4") if name in av.codecs_available)
+    codec = next(name for name in ("libx264", "libopenh264", "mpeg4") if name in av.codecs_available)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=fps)
         stream.height, stream.width = frames[0].shape[:2]
@@ -65,10 +66,8 @@ def columns(episode: int, first: int) -> dict[str, Any]:
         STATE: pa.array(np.stack([at, 1 - at, at**2], 1).tolist(), pa.list_(pa.float32(), 3)),
         "action": pa.array([[0.0, 1.0]] * count, pa.list_(pa.float32(), 2)),
         "timestamp": pa.array((np.arange(count) / FPS).astype(np.float32)),
-        "frame_index": pa.array(np.arange(count)),
         "episode_index": pa.array(np.full(count, episode)),
         "index": pa.array(np.arange(first, first + count)),
-        "task_index": pa.array(np.zeros(count, np.int64)),
         "next.reward": pa.array(success.astype(np.float32)),
         "next.success": pa.array(success),
     }
@@ -80,7 +79,7 @@ def facts(version: str, kind: str) -> dict[str, Any]:
     features |= {STATE: {"dtype": "float32", "shape": [3]}, "action": {"dtype": "float32", "shape": [2]}}
     for name in ("timestamp", "next.reward"):
         features[name] = {"dtype": "float32", "shape": [1]}
-    for name in ("frame_index", "episode_index", "index", "task_index"):
+    for name in ("episode_index", "index"):
         features[name] = {"dtype": "int64", "shape": [1]}
     features["next.success"] = {"dtype": "bool", "shape": [1]}
     files = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -113,46 +112,40 @@ def write_table(path: Path, table: pa.Table) -> None:
     pq.write_table(table, path)
 
 
-def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video", codec: str = "") -> Path:
+def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> Path:
     """A LeRobotDataset; in v3.0 two files share the episodes of each camera, and one table all of them."""
     (folder / "meta").mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps(facts(version, kind)))
-    episodes, first = range(len(LENGTHS)), np.cumsum([0, *LENGTHS]).tolist()
-    cameras = {key: key.rpartition(".")[2] for key in (TOP, WRIST)}
-    tables = []
-    for episode in episodes:
+    first = np.cumsum([0, *LENGTHS]).tolist()
+    tables, listed = [], []
+    for episode, length in enumerate(LENGTHS):
         rows = columns(episode, first[episode])
-        if kind == "image":
-            rows |= {key: cells(camera, episode) for key, camera in cameras.items()}
+        file, row = episode // 3, {"episode_index": episode, "tasks": ["reach"], "length": length}
+        for key in (TOP, WRIST):
+            camera = key.rpartition(".")[2]
+            begin = sum(LENGTHS[3 * file : episode])
+            times = {"from_timestamp": begin / FPS, "to_timestamp": (begin + length) / FPS}
+            films = {"chunk_index": 0, "file_index": file, **times}
+            if kind == "image":
+                rows[key] = cells(camera, episode)
+            elif version == "v2.1":
+                shown = [picture(camera, place, episode) for place in places(episode)]
+                write_film(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", shown)
+            else:
+                row |= {f"videos/{key}/{name}": value for name, value in films.items()}
         tables.append(pa.table(rows))
+        listed.append(row | ({} if version == "v2.1" else {"data/chunk_index": 0, "data/file_index": 0}))
+        if version == "v2.1":
+            write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", tables[-1])
     if version == "v2.1":
-        lines = [{"episode_index": at, "tasks": ["reach"], "length": LENGTHS[at]} for at in episodes]
-        (folder / "meta" / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-        for episode, table in enumerate(tables):
-            write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
-            for key, camera in cameras.items() if kind == "video" else ():
-                frames = [picture(camera, place, episode) for place in places(episode)]
-                write_film(folder / f"videos/chunk-000/{key}/episode_{episode:06d}.mp4", frames, codec=codec)
+        (folder / "meta" / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in listed))
         return folder
-    table = pa.concat_tables(tables)
-    write_table(folder / "data/chunk-000/file-000.parquet", table)
-    listed: list[dict[str, Any]] = []
-    for episode in episodes:
-        row: dict[str, Any] = {"episode_index": episode, "tasks": ["reach"], "length": LENGTHS[episode]}
-        row |= {"data/chunk_index": 0, "data/file_index": 0}
-        row |= {"dataset_from_index": first[episode], "dataset_to_index": first[episode + 1]}
-        for key in cameras if kind == "video" else ():
-            file = episode // 3
-            begin = sum(LENGTHS[3 * file : episode]) / FPS
-            row |= {f"videos/{key}/chunk_index": 0, f"videos/{key}/file_index": file}
-            row |= {f"videos/{key}/from_timestamp": begin, f"videos/{key}/to_timestamp": begin + LENGTHS[episode] / FPS}
-        listed.append(row)
+    write_table(folder / "data/chunk-000/file-000.parquet", pa.concat_tables(tables))
     write_table(folder / "meta/episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(listed))
-    for key, camera in cameras.items() if kind == "video" else ():
-        for file in (0, 1):
-            some = [(at, place) for at in episodes if at // 3 == file for place in places(at)]
-            frames = [picture(camera, place, at) for at, place in some]
-            write_film(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames, codec=codec)
+    for key, file in product((TOP, WRIST), (0, 1) if kind == "video" else ()):
+        some = [(at, place) for at in range(3 * file, 3 * file + 3) for place in places(at)]
+        frames = [picture(key.rpartition(".")[2], place, at) for at, place in some]
+        write_film(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", frames)
     return folder
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,12 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from PIL import Image
+
+from hypogoal.data import Collected
+from hypogoal.importing.arrays import episodes_of, read_arrays
+from hypogoal.importing.assemble import assemble
+from hypogoal.importing.labels import rule_of
+from hypogoal.importing.states import frames_of
 
 SIDE = 48
 KINDS = ("positive", "negative", "unlabelled")
@@ -39,6 +47,17 @@ def arrays(**changes: Any) -> dict[str, Any]:
         "heldout_labels": known,
     }  # fmt: skip
     return {name: value for name, value in (whole | changes).items() if value is not None}
+
+
+def assembled(given: dict[str, Any], group: str = "") -> tuple[Collected, list[str]]:
+    """Arrays as a data file has them, and what is said of them; their one sub-goal is called ``goal``."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "own.npz")
+        np.savez(path, **given)
+        episodes = episodes_of(read_arrays(path, group), ["goal"], group, path)
+        frames = [*frames_of(path, episodes, {"goal": rule_of("goal")}, Counter())]
+        features = [*given.get("features", ())]
+        return assemble(path, frames, ["goal"], features)
 
 
 def save_pictures(folder: Path, *, held: bool = True, change: Callable[[np.ndarray], np.ndarray] = lambda x: x) -> Path:

@@ -11,16 +11,11 @@ import pytest
 from command_line import refuses, run, settings
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import Collected, open_dataset
-from hypogoal.importing.arrays import parts_of
-from hypogoal.importing.assemble import assemble, held_out
-from tests.importing.states import arrays, pictures
+from hypogoal.data import open_dataset
+from hypogoal.importing.assemble import held_out
+from tests.importing.states import arrays, assembled, pictures
 from tests.mixed import FRONT, STATE
 from tests.mixed import arrays as mixed_arrays
-
-
-def assembled(given: dict[str, Any]) -> tuple[Collected, list[str]]:
-    return assemble(parts_of(given, Path("own.npz")))
 
 
 def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
@@ -119,7 +114,7 @@ def test_a_group_is_held_out_whole_or_not_at_all(tmp_path: Path) -> None:
     assert len(found.unlabelled()) == 20 - 2 * len(held)
     refuses("or is it for --group?", "import", tmp_path / "own.npz", "--out", tmp_path / "x.h5", "--group", "tape")
     with pytest.raises(UserError, match="none of 1 labelled states, or groups of them, can be held out"):
-        assemble(parts_of(given | {"take": np.zeros(40)}, tmp_path, "take"))
+        assembled(given | {"take": np.zeros(40)}, "take")
 
 
 def test_held_out_states_that_are_known_are_left_out() -> None:
@@ -130,10 +125,10 @@ def test_held_out_states_that_are_known_are_left_out() -> None:
         heldout_labels=np.concatenate([[0, 1, 0], known, [0, 1, 0, 1]]),
     )
     collected, said = assembled(mixed)
-    assert said == ["7 of 23 held-out states look like one to learn from: they are left out"]
+    assert said == ["7 of 23 held-out states look like ones to learn from: they are left out"]
     np.testing.assert_array_equal(collected.heldout.observations, held)
     np.testing.assert_array_equal(collected.heldout.labels[:, 0], known)
-    with pytest.raises(UserError, match="every held-out state looks like one to learn from"):
+    with pytest.raises(UserError, match="all 40 held-out states look like ones to learn from"):
         assembled(mixed | {"heldout_observations": images, "heldout_labels": arrays()["labels"]})
 
 
@@ -146,65 +141,56 @@ def test_what_looks_alike_is_held_out_together() -> None:
     known = [{image.tobytes() for image in one.observations} for one in sets]
     assert [len(one.labels) for one in sets] == [48, 26, 12] and [len(one) for one in known] == [16, 26, 4]
     assert not (known[0] | known[1]) & known[2]
-    assert "4 of 30 unlabelled states look like one held out: they are left out" in said
-    with pytest.raises(UserError, match="every unlabelled state looks like one held out"):
+    assert "4 of 30 unlabelled states look like ones held out: they are left out" in said
+    with pytest.raises(UserError, match="unlabelled states look like ones held out"):
         assembled(given | {"unlabelled": collected.heldout.observations})
 
 
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unlabelled": None}, "no array 'unlabelled'"),
     ({"unlabelled": None, "unlabeled": pictures(5)[0]}, "unknown array 'unlabeled': .* Did you mean 'unlabelled'"),
-    ({"held_out_labels": np.zeros(3)}, "unknown array 'held_out_labels': .* Did you mean 'heldout_labels'"),
     ({"rewards": np.zeros(3)}, "unknown array 'rewards': .* Known are observations, labels, unlabelled"),
     ({"labels/front": np.zeros(40)}, "unknown array 'labels/front'"),
-    ({"observations/front": np.zeros((40, 4))}, "'observations' is one array and several by key"),
-    ({"heldout_labels": None}, "held-out states need observations and labels"),
-    ({"observations": pictures(40)[0] / 255}, "differ in shape or type from the labelled ones: uint8"),
-    (
-        {"observations": np.full((40, 9), np.nan)},
-        "not finite, or become so or 0 as float32: columns 0, 1, 2, 3 and 5 more",
-    ),
-    ({"features": np.array(["a"])}, "number of feature names is wrong: 1 for uint8"),
+    ({"observations/state": np.zeros((39, 4), np.float32)}, "cannot be read"),
+    ({"unlabelled/arm": np.zeros((20, 4), np.float32)}, "episodes have different observations"),
+    ({"observations/state": np.full((40, 4), np.nan)}, "state have values .* not finite: columns 0, 1, 2, 3, 4 in"),
+    ({"observations/front": np.zeros((40, 3, 48, 48), np.uint8)}, r"observations\[0\]: front have their channels"),
+    ({"heldout_labels": None}, "labels of 16 heldout states and 1 sub-goals are not 0 or 1 for each"),
+    ({"observations": pictures(40)[0] / 255}, "states differ in size or type: unlabelled"),
+    ({"observations": np.full((40, 9), np.nan)}, "differ in size or type"),
+    ({"features": np.array(["a"])}, "1 names of features do not fit"),
     ({"observations": pictures(40)[0].astype(int) * 9}, "could be pictures or numbers.*Give pictures as uint8"),
     ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"frames, first.*stacked frames among the channels"),
     ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"frames, first: uint8 \(12, 48, 48\)"),
     ({"observations": np.zeros((40, 0), np.uint8)}, "neither pictures nor numbers"),
-    ({"observations": np.zeros(40)}, "are not observations"),
-    ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "differ in shape or type from the labelled ones"),
-    ({"unlabelled": pictures(0)[0]}, "the unlabelled observations are empty"),
-    ({"labels": np.arange(39) % 2}, "labels of 40 labelled states are not 0 or 1 for each"),
-    ({"labels": np.zeros(0)}, "labels of 40 labelled states are not 0 or 1 for each"),
-    ({"sub_goals": np.array([b"won"])}, r"sub_goals are \|S3, not texts"),
-    ({"sub_goals": np.array(["a:b"])}, "usable as file names: a:b"),
+    ({"observations": np.zeros(40)}, "differ in size or type"),
+    ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "states differ in size or type"),
+    ({"unlabelled": pictures(0)[0]}, "there are no unlabelled states"),
+    ({"labels": np.arange(39) % 2}, "labels of 40 labelled states and 1 sub-goals are not 0 or 1 for each"),
     ({"labels": np.arange(40) % 3}, "are not 0 or 1 for each: int64"),
     ({"labels": np.full(40, np.nan)}, "are not 0 or 1 for each"),
     ({"labels": np.zeros(40)}, "has no positives among 40 labelled states"),
     ({"labels": np.ones(40)}, "has no negatives among 40 labelled states"),
-    ({"labels": np.stack([np.arange(40) % 2] * 2, 1)}, "2 sub-goals need as many names"),
-    ({"heldout_labels": np.stack([np.arange(16) % 2] * 2, 1)}, "labels of 16 held-out states are not 0 or 1"),
+    ({"labels": np.stack([np.arange(40) % 2] * 2, 1)}, "and 1 sub-goals are not 0 or 1 .* --sub-goal NAME for each"),
 ]
 
 
 @pytest.mark.parametrize(("changes", "message"), WRONG)
 def test_what_is_wrong_with_arrays_is_one_line(changes: dict[str, Any], message: str) -> None:
-    """Spec G2: names, shapes, types, label values."""
+    """Spec G2: names, shapes, types, label values; arrays by key are checked as one is."""
+    given = mixed_arrays() | changes if any("s/" in name or "d/" in name for name in changes) else arrays(**changes)
     with pytest.raises(UserError, match=message):
-        assembled(arrays(**changes))
+        assembled(given)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"observations/state": np.zeros((39, 4), np.float32)}, "the labelled observations do not fit together"),
-        ({"unlabelled/arm": np.zeros((20, 4), np.float32)}, "the unlabelled observations differ in shape or type"),
-        ({"observations/state": np.full((40, 4), np.nan)}, "observations 'state' have numbers that are not finite"),
-        ({"observations/front": np.zeros((40, 3, 48, 48), np.uint8)}, "observations 'front' have their channels"),
-        ({"observations/..": np.zeros((40, 4), np.float32)}, "do not fit together"),
-    ],
-)
-def test_keys_are_checked_as_one_array_is(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        assembled(mixed_arrays() | changes)
+def test_names_are_checked(tmp_path: Path) -> None:
+    """Spec G2: of sub-goals and keys, which become names of files."""
+    for given, said in (
+        (arrays(sub_goals=np.array(["a:b"])), "usable as file names: a:b"),
+        ({name.replace("/state", "/.."): values for name, values in mixed_arrays().items()}, "can be file names"),
+    ):
+        np.savez(tmp_path / "own.npz", **given)
+        refuses(said, "import", tmp_path / "own.npz", "--out", tmp_path / "data.h5")
 
 
 def test_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:

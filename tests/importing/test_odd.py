@@ -9,7 +9,7 @@ import io
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,11 @@ import numpy as np
 from PIL import Image
 
 from hypogoal.core.errors import UserError
-from hypogoal.importing.episodes import recorded_parts
 from hypogoal.importing.labels import rule_of
 from hypogoal.importing.pictures import picture_of
 from hypogoal.importing.recordings import read_robomimic
-from hypogoal.importing.taken import Taking, as_numbers
+from hypogoal.importing.states import Frame, frames_of
+from hypogoal.importing.taken import as_numbers, together
 
 COLOURS = {1: 0, 2: 4, 3: 2, 4: 6}  # PNG's colour type, by channels
 LENGTH = 6  # of an episode
@@ -179,22 +179,22 @@ def outcome_of_recording(seed: int, folder: Path) -> str:
     lengths = {len(values) for name, (values, _) in drawn.items() if name in wanted}
     refused = lengths != {LENGTH} or any(taken is None for taken in wanted.values())
 
-    def read() -> tuple[Sequence[str], Any, list[str]]:
-        rules = {"won": rule_of("rewards")}
-        parts, said = recorded_parts(path, read_robomimic(path, (), Counter()), rules, Taking())
-        return parts.labelled.names, Taking().observations(parts.labelled.observations, "these"), said
+    def read() -> tuple[list[Frame], dict[str, np.ndarray], Counter[str]]:
+        left: Counter[str] = Counter()
+        frames = [*frames_of(path, read_robomimic(path, (), left), {"won": rule_of("rewards")}, left)]
+        names = [frame.name for frame in frames]
+        return frames, {key: together([each.seen[key] for each in frames], names, key) for key in frames[0].seen}, left
 
     seen = told(read)
     assert isinstance(seen, str) == refused, (seed, seen)
     if refused:
         return "refused"
-    frames, observations, said = seen
-    for row, name in enumerate(frames):
+    frames, states, left = seen
+    for row, frame in enumerate(frames):
         for key, values in wanted.items():
-            state = observations[key.replace("/", ".")] if observations.dtype.names else observations
-            right = np.asarray(values)[int(name.rpartition(" ")[2])]
-            np.testing.assert_allclose(state[row], right, rtol=1e-6, err_msg=str(seed))
-    assert bool(said) == (len(wanted) < len(names))
+            right = np.asarray(values)[int(frame.name.rpartition(" ")[2])]
+            np.testing.assert_allclose(states[key][row], right, rtol=1e-6, err_msg=str(seed))
+    assert bool(left) == (len(wanted) < len(names))
     return "right"
 
 
@@ -225,7 +225,7 @@ def outcome_of_cast(seed: int) -> str:
     cast = told(lambda: as_numbers(given, "these"))
     assert isinstance(cast, str) == lost, (seed, kind, cast)
     if isinstance(cast, str):
-        assert f"columns {given.shape[1] - 1}" in cast
+        assert f"columns {given.shape[1] - 1}, 1 in all" in cast
         return "refused"
     np.testing.assert_allclose(cast, given, rtol=1e-6)
     for column in range(given.shape[1]):

@@ -12,8 +12,7 @@ from command_line import refuses, run
 from PIL import Image
 
 from hypogoal.data import open_dataset
-from hypogoal.importing.pictures import read_pictures
-from hypogoal.importing.taken import Taking
+from hypogoal.importing.pictures import picture_of, read_pictures
 from tests.importing.states import SIDE, arrays, pictures, save_minari, save_pictures
 
 
@@ -31,13 +30,13 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     palette = io.BytesIO()
     Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
     for data, said in (
-        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size: positive/zz.png is (48, 20, 3)"),
+        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size or type: positive/zz.png is (48, 20, 3)"),
         (b"no image", "this cannot be read"),
         (saved(pictures(1)[0][0])[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
-        (clear, "the picture is transparent in places"),
-        (palette.getvalue(), "the picture is transparent in places"),
-        (saved(np.zeros((SIDE, SIDE), np.float32), "TIFF"), "the picture has the mode F, neither 8 nor 16 bits"),
+        (clear, "it is transparent in places"),
+        (palette.getvalue(), "it is transparent in places"),
+        (saved(np.zeros((SIDE, SIDE), np.float32), "TIFF"), "it has 32 bits a channel"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n", "git lfs pull"),
     ):
         file.write_bytes(data)
@@ -45,7 +44,7 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
         assert "zz.png" in line
     for other in (file, *(folder / "unlabelled").iterdir()):
         other.unlink()
-    refuses("there are no pictures here", "import", folder, "--out", tmp_path / "data.h5")
+    refuses("there are no unlabelled states", "import", folder, "--out", tmp_path / "data.h5")
 
 
 def test_folders_of_pictures_become_states(tmp_path: Path) -> None:
@@ -59,9 +58,11 @@ def test_folders_of_pictures_become_states(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.labelled("at-right").observations[:12], images[labels])
     assert found.counts()["heldout"]["at-right"] == {"states": 6, "positives": 3}
     grey = save_pictures(tmp_path / "grey", change=lambda image: image[..., 0])
-    assert read_pictures(grey, Taking(), Counter()).labelled.observations[""].shape == (24, SIDE, SIDE, 1)
+    run("import", grey, "--out", data, "-q", "--force")
+    assert open_dataset(data).observation_shape == (SIDE, SIDE, 1)
     (grey / "positive" / "01.png").write_bytes(saved(images[1]))
-    mixed = read_pictures(grey, Taking(), Counter()).labelled.observations[""]
+    run("import", grey, "--out", data, "-q", "--force")
+    mixed = open_dataset(data).labelled("grey").observations
     np.testing.assert_array_equal(mixed[0], images[1])
     np.testing.assert_array_equal(mixed[1], images[3][..., :1].repeat(3, 2))
 
@@ -82,10 +83,12 @@ def test_what_is_not_read_is_counted_and_folders_are_groups(tmp_path: Path) -> N
     assert "not read: 3 .heic\n" in said
     found = open_dataset(tmp_path / "data.h5")
     left: Counter[str] = Counter()
-    parts = read_pictures(folder, Taking(), left)
-    assert left == Counter({".heic": 3}) and len(parts.labelled.names) == 24 and parts.labelled.groups is not None
-    rows = [state.tobytes() for state in parts.labelled.observations[""]]
-    day = dict(zip(rows, parts.labelled.groups.tolist(), strict=True))
+    episodes = [each for each in read_pictures(folder, "goal", left) if each.role == "labelled"]
+    assert left == Counter({".heic": 3}) and len(episodes) == 24
+    day = {}
+    for each in episodes:
+        path = folder / each.name
+        day[picture_of(path.read_bytes(), path).tobytes()] = each.group
     held = {day[state.tobytes()] for state in found.heldout("goal").observations}
     learned = {day[state.tobytes()] for state in found.labelled("goal").observations}
     assert len(held) == 1 and held | learned == {f"day{number}" for number in range(4)} and not held & learned
@@ -114,9 +117,8 @@ def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
     run("import", sources[0], "--out", tmp_path / "x.h5", "--resize", "30", "-q")
     assert open_dataset(tmp_path / "x.h5").observation_shape == (30, 30, 3)
     np.savez(tmp_path / "rows.npz", **{name: x.reshape(len(x), -1)[:, :9] for name, x in arrays().items()})
-    refuses(
-        "only pictures can be resized", "import", tmp_path / "rows.npz", "--out", tmp_path / "y.h5", "--resize", "24"
-    )
+    rows = ["import", tmp_path / "rows.npz", "--out", tmp_path / "y.h5", "--resize", "24"]
+    refuses("only pictures can be resized", *rows)
 
 
 def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
@@ -140,18 +142,8 @@ def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path) -> None:
     few = {name: states for name, states in arrays().items() if "heldout" not in name}
     large = {name: states.repeat(5, 1).repeat(4, 2) if states.ndim == 4 else states for name, states in few.items()}
     np.savez(tmp_path / "it's large.npz", **large)
-    given = [
-        "import",
-        tmp_path / "it's large.npz",
-        "--out",
-        tmp_path / "data.h5",
-        "--seed",
-        "4",
-        "--domain",
-        "montezuma",
-    ]
-    said = run(*given)
-    [line] = [line for line in said.out.splitlines() if "--resize" in line]
+    given = ["import", tmp_path / "it's large.npz", "--out", tmp_path / "data.h5", "--domain", "montezuma"]
+    [line] = [line for line in run(*given).out.splitlines() if "--resize" in line]
     assert "pictures of 240 x 192 x 3 need much memory and time; add --resize 160 --force" in line
     assert "--resize" not in run(*given, *line.partition("add ")[2].split()).out
     after = open_dataset(tmp_path / "data.h5")

@@ -44,8 +44,8 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     assert artefact.manifest.files.keys() == {"audit.json", "index.html", *pictures}
     [part] = json.loads((audit / "audit.json").read_text())["sub_goals"]
     assert (part["sub_goal"], part["known"], part["unlabelled"], len(part["members"])) == (GOAL, 56, 20, 2)
-    rows = read_table(audit / "next" / GOAL / TO_FILL_IN, ("row", "digest"))
-    places = [int(row["row"]) for row in rows]
+    rows = read_table(audit / "next" / GOAL / TO_FILL_IN, {"row": int, "digest": str})
+    places = [row["row"] for row in rows]
     assert sorted(places) == list(range(20)) and places == part["next"]
     assert all(digest(data.unlabelled()[place]).hex() == row["digest"] for place, row in zip(places, rows, strict=True))
     page = (audit / "index.html").read_text()
