@@ -35,27 +35,27 @@ def read_arrays(path: Path, group: str = "") -> Arrays:
     each key: ``observations/front``. ``group`` names another array, (N,): labelled states with equal values there
     belong together, and unlabelled ones by the array ``unlabelled_GROUP``.
     """
-    found: dict[str, Array] = {}
+    loaded: dict[str, Array] = {}
     with reading(path, DO):
         for file in sorted(path.rglob("*.npy")):
-            found[file.relative_to(path).with_suffix("").as_posix()] = np.load(file)
+            loaded[file.relative_to(path).with_suffix("").as_posix()] = np.load(file)
         if path.is_file():
             with path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
-                found.update(stored)
+                loaded.update(stored)
     arrays: Arrays = {}
-    for name, values in found.items():
+    for name, values in loaded.items():
         base, _, key = name.partition("/")
         plain = base if base in KEYED else name
         if plain not in (*KNOWN, group, f"unlabelled_{group}"):
-            known = ", ".join(KNOWN)
-            do = near(name, KNOWN) or f"Known are {known}; leave it out, or is it for --group?"
+            names = ", ".join(KNOWN)
+            do = near(name, KNOWN) or f"Known are {names}; leave it out, or is it for --group?"
             raise UserError(f"unknown array {name!r}", path, do)
         arrays.setdefault(base, {})[key] = values
     arrays.setdefault("sub_goals", {"": np.array(["sub-goal"])})
     arrays.setdefault("features", {"": np.array([])})
     for name in (*NEEDED, group or "labels"):
         if name not in arrays:
-            present = ", ".join(found)
+            present = ", ".join(loaded)
             raise UserError(f"no array {name!r}", path, f"There are {present}.")
     return arrays
 
@@ -72,8 +72,8 @@ def episodes_of(
         by_key = arrays.get(name, {})
         with reading(path, DO):
             count = max(map(len, by_key.values()), default=0)
-            given = 0 if role != UNLABELLED else count
-            blank = np.zeros((given, goals))
+            expected = 0 if role != UNLABELLED else count
+            blank = np.zeros((expected, goals))
             labels = arrays.get(f"{prefix}labels", {"": blank})[""]
             columns = labels if labels.ndim > 1 else labels[:, None]
             if columns.shape != (count, goals) or not np.isin(columns, (0, 1)).all():

@@ -103,14 +103,14 @@ def contradictions(
 
     ``names``, ``labels`` (N, G) and ``looks``, equal where states are, are of all states, the last two rows of some.
     """
-    known = np.concatenate([labelled, heldout])
+    judged = np.concatenate([labelled, heldout])
     lines = []
     for goal, column in zip(goals, labels.T, strict=True):
-        positive = column[known]
-        both = np.intersect1d(looks[known[positive]], looks[known[~positive]])
+        positive = column[judged]
+        both = np.intersect1d(looks[judged[positive]], looks[judged[~positive]])
         if not len(both):
             continue
-        alike = known[looks[known] == both[0]]
+        alike = judged[looks[judged] == both[0]]
         example = " and ".join(names[row] for row in alike)
         clear = labelled[~np.isin(looks[labelled], both)]
         where = f"without those that have both labels, such as {example}"

@@ -108,7 +108,7 @@ def import_data(
         }
         config = {name: value for name, value in arguments.items() if value}
         write_dataset(file, collected, domain=domain, config=config, seed=seed)
-        counts = ", ".join(f"{count} {what}" for what, count in sorted(left.items()))
+        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(left.items()))
         return [f"not read: {counts}", *remarks] if left else remarks
 
 

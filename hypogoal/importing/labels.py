@@ -82,14 +82,14 @@ def _by_table(path: Path) -> Rule:
 
     def marks(episode: Episode) -> Labels | None:
         positive = np.zeros(episode.length, np.bool_)
-        own = [row for row in rows if row["episode"] == episode.name]
-        for row in own:
+        spans = [row for row in rows if row["episode"] == episode.name]
+        for row in spans:
             first, end = row["from"], row["to"]
             if not 0 <= first <= end <= episode.length:
                 fault = f"a label is of frames {first} up to {end} of {episode.length}"
                 raise UserError(fault, row["line"], "Give 0 <= from <= to <= the episode's frames.")
             positive[first:end] = True
-        return positive if own else None
+        return positive if spans else None
 
     return Rule(marks, {row["episode"]: row["line"] for row in rows})
 
