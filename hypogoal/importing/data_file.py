@@ -86,7 +86,8 @@ def import_data(
             goals = [*sub_goals] or arrays["sub_goals"][""].tolist()
             features = arrays["features"][""].tolist()
             episodes = episodes_of(arrays, goals, group, source)
-        require_names(goals)
+        if goals:
+            require_names(goals)
         by_goal = {goal: rule_of(rules.get(goal, goal)) for goal in goals}  # columns are named after their sub-goals
         frames = frames_of(
             source,

@@ -80,7 +80,7 @@ def frames_of(
             taken, channels = {}, {}
             for key, state in seen.items():
                 side = sides.get(key, sides.get("", 0))
-                taken[key], channels[key] = take(state, f"{name}: {key or 'it'}", side, stack)
+                taken[key], channels[key] = take(state, f"{name}: {key or 'observations'}", side, stack)
             yield Frame(name, episode, role, labels, taken, channels)
     for rule in rules.values():
         for name in rule.listed.keys() - met:
