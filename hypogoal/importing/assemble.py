@@ -49,8 +49,9 @@ def assemble(
         short = key.replace("/", ".") if len(first.seen) > 1 else ""
         parts[short] = together(states, names, key or "the observations")
         doubt = reading_of(state.shape, state.dtype).doubt
-        if first.channels[key]:
-            channels[short] = first.channels[key]
+        stack = first.channels[key]
+        if stack:
+            channels[short] = stack
         if doubt:
             remarks.append(doubt)
     with reading(source, "Give keys that can be file names."):
@@ -84,9 +85,11 @@ def assemble(
     collected = Collected(
         observations.shape[1:],
         tuple(goals),
-        *sets,
-        tuple(features),
-        channels,
+        labelled=sets[0],
+        unlabelled=sets[1],
+        heldout=sets[2],
+        features=tuple(features),
+        channels=channels,
     )
     return collected, remarks
 

@@ -72,7 +72,7 @@ def _by_end(count: int, episode: Episode) -> Labels:
     succeeded = True
     for name in reversed(SUCCESS):
         if name in episode.columns:
-            succeeded = np.any(episode.columns[name] > 0)
+            succeeded = bool((episode.columns[name] > 0).any())
     return succeeded & (rows >= episode.length - count)
 
 
@@ -140,20 +140,17 @@ def with_labels(
     learned = joined([old, replace(unlabelled.where(rows), labels=marks)])
     others = np.delete(np.arange(len(unlabelled.labels)), rows)
     rest = unlabelled.where(others)
-    sets = [
-        replace(learned, labels=learned.labels[:, None]),
-        rest,
-        replace(heldout, labels=heldout.labels[:, None]),
-    ]
     features: Sequence[str] = ()
     if dataset.observation_dtype == NUMBERS:
         features = dataset.features()
     collected = Collected(
         dataset.observation_shape,
         dataset.sub_goals,
-        *sets,
-        tuple(features),
-        dataset.channels,
+        labelled=replace(learned, labels=learned.labels[:, None]),
+        unlabelled=rest,
+        heldout=replace(heldout, labels=heldout.labels[:, None]),
+        features=tuple(features),
+        channels=dataset.channels,
     )
     return collected, len(labels)
 

@@ -79,7 +79,7 @@ def read_robomimic(
     """The demonstrations ``data/*/obs/KEY``; those that ``mask/valid`` lists are held out."""
     with reading_hdf5(source, "the recording", DEMOS) as file:
         demos = file["data"]
-        valid = []
+        valid: list[bytes] = []
         if "mask/valid" in file:
             valid = file["mask/valid"][()].tolist()
         by_number = sorted(demos, key=len)  # HDF5 lists names in order: demo_10 before demo_2
