@@ -38,22 +38,24 @@ def read_arrays(path: Path, group: str = "") -> Arrays:
     loaded: dict[str, Array] = {}
     with reading(path, DO):
         for file in sorted(path.rglob("*.npy")):
-            loaded[file.relative_to(path).with_suffix("").as_posix()] = np.load(file)
+            name = file.relative_to(path).with_suffix("")
+            loaded[name.as_posix()] = np.load(file)
         if path.is_file():
             with path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
                 loaded.update(stored)
     arrays: Arrays = {}
-    for name, values in loaded.items():
-        base, _, key = name.partition("/")
-        plain = base if base in KEYED else name
+    for full, values in loaded.items():
+        base, _, key = full.partition("/")
+        plain = base if base in KEYED else full
         if plain not in (*KNOWN, group, f"unlabelled_{group}"):
             names = ", ".join(KNOWN)
-            do = near(name, KNOWN) or f"Known are {names}; leave it out, or is it for --group?"
-            raise UserError(f"unknown array {name!r}", path, do)
+            do = near(full, KNOWN) or f"Known are {names}; leave it out, or is it for --group?"
+            raise UserError(f"unknown array {full!r}", path, do)
         arrays.setdefault(base, {})[key] = values
     arrays.setdefault("sub_goals", {"": np.array(["sub-goal"])})
     arrays.setdefault("features", {"": np.array([])})
-    for name in (*NEEDED, group or "labels"):
+    needed = [*NEEDED, group or "labels"]
+    for name in needed:
         if name not in arrays:
             present = ", ".join(loaded)
             raise UserError(f"no array {name!r}", path, f"There are {present}.")
@@ -76,7 +78,8 @@ def episodes_of(
             blank = np.zeros((expected, goals))
             labels = arrays.get(f"{prefix}labels", {"": blank})[""]
             columns = labels if labels.ndim > 1 else labels[:, None]
-            if columns.shape != (count, goals) or not np.isin(columns, (0, 1)).all():
+            are_marks = np.isin(columns, (0, 1)).all()
+            if columns.shape != (count, goals) or not are_marks:
                 fault = f"labels of {count} {role} states and {goals} sub-goals are not 0 or 1 for each"
                 raise UserError(fault, f"{labels.dtype} {labels.shape}", LABELS)
             groups = np.full(count, "")

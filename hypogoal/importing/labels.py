@@ -108,7 +108,8 @@ def is_marked(mark: Any, row: int, seen: Any) -> bool:
 def read_table(path: Path, columns: Mapping[str, type]) -> list[dict[str, Any]]:
     """The rows of a CSV file that has these columns, and the ``line`` of each; a byte order mark is left out."""
     rows = []
-    do = f"Give a CSV file, with commas, whose first line names {', '.join(columns)}."
+    names = ", ".join(columns)
+    do = f"Give a CSV file, with commas, whose first line names {names}."
     with reading(path, do), path.open(encoding="utf-8-sig", newline="") as text:
         lines = csv.DictReader(text, restval="")
         for number, cells in enumerate(lines, 2):
@@ -130,8 +131,9 @@ def with_labels(
     that names a state twice or has no label, and data of several sub-goals are a ``UserError``.
     """
     if dataset.sub_goals != (sub_goal,):
-        do = f"It has {', '.join(dataset.sub_goals)}."
-        raise UserError("a table labels data of one sub-goal, its own", f"{sub_goal}={table}", do)
+        goals = ", ".join(dataset.sub_goals)
+        fault = "a table labels data of one sub-goal, its own"
+        raise UserError(fault, f"{sub_goal}={table}", f"It has {goals}.")
     unlabelled = dataset.unlabelled_states()
     labels = _labels_in(table, unlabelled.observations)
     rows = np.array([*labels])
