@@ -38,8 +38,8 @@ def read_arrays(path: Path, group: str = "") -> Arrays:
     loaded: dict[str, Array] = {}
     with reading(path, DO):
         for file in sorted(path.rglob("*.npy")):
-            name = file.relative_to(path).with_suffix("")
-            loaded[name.as_posix()] = np.load(file)
+            inner = file.relative_to(path).with_suffix("")
+            loaded[inner.as_posix()] = np.load(file)
         if path.is_file():
             with path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
                 loaded.update(stored)

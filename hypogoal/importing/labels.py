@@ -100,8 +100,9 @@ def is_marked(mark: Any, row: int, seen: Any) -> bool:
         return bool(mark[row])
     value = mark(seen)
     if np.shape(value) or value not in (0, 1):
+        fault = "the label function gave neither True nor False"
         do = "It gets an observation, by key if there are several."
-        raise UserError("the label function gave neither True nor False", repr(value), do)
+        raise UserError(fault, repr(value), do)
     return bool(value)
 
 
@@ -174,5 +175,6 @@ def _labels_in(table: Path, observations: Observations) -> dict[int, bool]:
             raise UserError(fault, row["line"], do)
         labels[place] = TRUTHS[row["label"]]
     if not labels:
-        raise UserError("the table has no label yet", table, "Fill in 1 or 0.")
+        do = "Fill in 1 or 0."
+        raise UserError("the table has no label yet", table, do)
     return labels
