@@ -64,7 +64,7 @@ def assemble(
     remarks += contradictions(names, labels, looks, goals, labelled, heldout)
     learned = np.concatenate([labelled, unlabelled])
     if not len(heldout):
-        groups = np.array([frame.episode.group for frame in frames])
+        groups = np.array([frame.group for frame in frames])
         is_held = _held_out(labels[labelled], groups[labelled], looks[labelled], share, seed)
         heldout, labelled = labelled[is_held], labelled[~is_held]
         learned = labelled
@@ -134,7 +134,7 @@ def split(frames: Sequence[Frame], seed: int, source: Path) -> list[Integers]:
         if frame.role:
             sets[frame.role].append(row)
         else:
-            free.setdefault(frame.episode.name, []).append(row)
+            free.setdefault(frame.episode, []).append(row)
     if free:
         are_empty = [not rows for rows in sets.values()]
         shares = np.cumsum(SPLIT * are_empty)

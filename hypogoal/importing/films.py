@@ -35,7 +35,7 @@ def count_frames(path: Path) -> int:
         return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
 
 
-def frames_of(
+def frames_in(
     path: Path,
     rows: Integers,
     rate: float = 0.0,

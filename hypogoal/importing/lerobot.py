@@ -16,7 +16,7 @@ import numpy as np
 from hypogoal.data import Integers
 from hypogoal.importing.episodes import Array, Episode
 from hypogoal.importing.files import needed, reading
-from hypogoal.importing.films import EXTRA, frames_of
+from hypogoal.importing.films import EXTRA, frames_in
 from hypogoal.importing.pictures import picture_of
 
 INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
@@ -53,7 +53,7 @@ def read_lerobot(
                 if kind == "video":
                     film = place("video_path", f"videos/{key}", key)
                     begin = row.get(f"videos/{key}/from_timestamp", 0.0)
-                    seen[key] = partial(frames_of, film, rate=info["fps"], begin=begin)
+                    seen[key] = partial(frames_in, film, rate=info["fps"], begin=begin)
                 elif kind == "image":
                     seen[key] = partial(_cells, file, frames[key])
                 else:

@@ -13,7 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.data import reading as reading_hdf5
 from hypogoal.importing.episodes import HELDOUT, Array, Episode
 from hypogoal.importing.files import files_of, needed, reading
-from hypogoal.importing.films import SUFFIXES, count_frames, frames_of
+from hypogoal.importing.films import SUFFIXES, count_frames, frames_in
 from hypogoal.importing.lerobot import INFO, read_lerobot
 
 MINARI = Path("data") / "metadata.json"  # in a dataset's folder
@@ -101,7 +101,7 @@ def read_films(
     """The films in a folder, an episode each, called by their path in it."""
     for file in files_of(source, SUFFIXES, left):
         name = file.relative_to(source).with_suffix("")
-        seen = {"video": partial(frames_of, file)}
+        seen = {"video": partial(frames_in, file)}
         yield Episode(name.as_posix(), count_frames(file), seen, {})
     left.pop(TABLE, None)
 

@@ -24,14 +24,16 @@ class Frame(NamedTuple):
 
     Attributes:
         name: what messages call it.
-        episode: the one that it is of.
+        episode: of which it is, by name.
+        group: see :class:`Episode`.
         labels: whether each sub-goal holds; False where it is unlabelled.
         seen: a picture or numbers by key.
         channels: frames and colours by key, see :class:`hypogoal.data.Collected`.
     """
 
     name: str
-    episode: Episode
+    episode: str
+    group: str
     role: str
     labels: list[bool]
     seen: dict[str, Array]
@@ -81,7 +83,7 @@ def frames_of(
             for key, state in seen.items():
                 side = sides.get(key, sides.get("", 0))
                 taken[key], channels[key] = take(state, f"{name}: {key or 'observations'}", side, stack)
-            yield Frame(name, episode, role, labels, taken, channels)
+            yield Frame(name, episode.name, episode.group, role, labels, taken, channels)
     for rule in rules.values():
         for name in rule.listed.keys() - met:
             examples = f"There are {', '.join(met[:3])} ..."

@@ -20,7 +20,6 @@ from command_line import refuses, run
 from hypogoal.data import Dataset, open_dataset
 from hypogoal.importing import films
 from hypogoal.importing.assemble import split
-from hypogoal.importing.episodes import Episode
 from hypogoal.importing.states import Frame, kept
 from hypogoal.observations import digest
 from tests.importing import robot_data
@@ -127,9 +126,9 @@ def test_episodes_are_split_whole_and_what_is_held_out_stays_so() -> None:
     ):
         frames = []
         for number, role in enumerate(roles):
-            frames += [Frame("", Episode(str(number), 3, {}, {}), role, [], {}, {})] * 3
+            frames += [Frame("", str(number), "", role, [], {}, {})] * 3
         sets = split(frames, 0, Path("here"))
-        episodes = [sorted({int(frames[row].episode.name) for row in rows}) for rows in sets]
+        episodes = [sorted({int(frames[row].episode) for row in rows}) for rows in sets]
         assert tuple(map(len, episodes)) == sizes and sum(map(len, sets)) == 3 * len(roles)
         assert sorted(chain(*episodes)) == list(range(len(roles)))
         fixed = [number for number, role in enumerate(roles) if role == "heldout"]
@@ -214,7 +213,7 @@ def write_turned(path: Path, orientation: int) -> None:
 def test_a_film_is_turned_as_players_turn_it(tmp_path: Path, orientation: int) -> None:
     write_turned(tmp_path / "x.mp4", orientation)
     assert films.count_frames(tmp_path / "x.mp4") == 2
-    [seen] = films.frames_of(tmp_path / "x.mp4", np.array([1]))
+    [seen] = films.frames_in(tmp_path / "x.mp4", np.array([1]))
     assert seen.shape == UPRIGHT.shape
     assert np.abs(seen[4::16, 4::16].mean(-1) - UPRIGHT[4::16, 4::16].mean(-1)).max() < 40  # colours are compressed
 
