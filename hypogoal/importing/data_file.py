@@ -6,10 +6,11 @@ from pathlib import Path
 
 from hypogoal.core.artefacts import DATA, create, kind_of
 from hypogoal.core.errors import UserError
-from hypogoal.data import open_dataset, require_names, write_dataset
+from hypogoal.data import open_dataset, reading, require_names, write_dataset
 from hypogoal.domains.base import IMPORTED
 from hypogoal.importing.arrays import episodes_of, read_arrays
 from hypogoal.importing.assemble import assemble
+from hypogoal.importing.files import AGAIN
 from hypogoal.importing.labels import rule_of, with_labels
 from hypogoal.importing.pictures import POSITIVE, read_pictures
 from hypogoal.importing.recordings import reader_of
@@ -58,7 +59,7 @@ def import_data(
     inputs = [source] if source.is_file() else []
     with create(out, kind=DATA, config={"domain": domain}, seed=seed, inputs=inputs, force=force) as draft:
         file = draft.files / out.name
-        if inputs and kind_of(source) == DATA:
+        if inputs and _is_data_file(source):
             if sub_goals or group or keys or sides or stack or every > 1 or domain != IMPORTED:
                 do = "Give --label NAME=TABLE.csv and --out alone."
                 raise UserError("a data file is taken as it is", source, do)
@@ -111,6 +112,14 @@ def import_data(
         write_dataset(file, collected, domain=domain, config=config, seed=seed)
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(left.items()))
         return [f"not read: {counts}", *remarks] if left else remarks
+
+
+def _is_data_file(source: Path) -> bool:
+    """Whether a file is one of hypogoal's; recordings are HDF5, too."""
+    if kind_of(source) != DATA:
+        return False
+    with reading(source, "the file", AGAIN) as file:
+        return "sub_goals" in file.attrs
 
 
 def _label(source: Path, file: Path, rules: Mapping[str, str], seed: int) -> list[str]:
