@@ -109,18 +109,24 @@ def contradictions(
     judged = np.concatenate([labelled, heldout])
     lines = []
     for goal, column in zip(goals, labels.T, strict=True):
-        positive = column[judged]
-        both = np.intersect1d(looks[judged[positive]], looks[judged[~positive]])
+        both = _ambiguous(looks, column, judged)
         if not len(both):
             continue
         alike = judged[looks[judged] == both[0]]
         example = " and ".join(names[row] for row in alike)
-        clear = labelled[~np.isin(looks[labelled], both)]
+        learned = _ambiguous(looks, column, labelled)
+        clear = labelled[~np.isin(looks[labelled], learned)]
         where = f"without those that have both labels, such as {example}"
         require_classes(column[clear, None], [goal], where, "Remove the copies whose label is wrong.")
         fault = f"{len(both)} times equal states have both labels of {goal}"
         lines.append(f"{fault}: no member can be right about {example}")
     return lines
+
+
+def _ambiguous(looks: Array, labels: Labels, rows: Integers) -> Array:
+    """The looks of states, some rows of all, that carry both labels."""
+    positive = labels[rows]
+    return np.intersect1d(looks[rows[positive]], looks[rows[~positive]])
 
 
 def split(frames: Sequence[Frame], seed: int, source: Path) -> list[Integers]:

@@ -89,7 +89,7 @@ def frames_of(
             examples = f"There are {', '.join(met[:3])} ..."
             fault = f"a label is of an unknown episode, {name!r}"
             raise UserError(fault, rule.listed[name], examples)
-    pictures = [key for key, state in taken.items() if state.dtype == PICTURE]
+    pictures = [key for key, state in taken.items() if state.ndim == 3 and state.dtype == PICTURE]
     for key in sides:
         if not pictures or key not in ("", *pictures):
             raise UserError("only pictures can be resized", key or source, "Leave out --resize.")

@@ -134,7 +134,7 @@ def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
     found = open_dataset(tmp_path / "goal.h5")
     whole = states[[2, 5]].transpose(0, 2, 3, 1, 4).reshape(2, 16, 4, 12, 4, 12).mean((2, 4))
     assert np.abs(found.unlabelled() - whole).max() <= 1
-    assert found.channels == {"": (4, 3)}
+    assert found.channels == {"": [4, 3]}
 
 
 def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path) -> None:
