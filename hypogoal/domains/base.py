@@ -8,10 +8,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from hypogoal.core import own_code
-from hypogoal.core.checkpoints import ANEW, Resumable
+from hypogoal.core.arrays import Bools, Bytes, Ints
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
@@ -44,17 +46,17 @@ class Step(NamedTuple):
             succeeds when it terminates with a sum of rewards above 0.
     """
 
-    next_ids: NDArray[np.int64]
+    next_ids: Ints
     rewards: NDArray[np.float32]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    succeeded: NDArray[np.bool_] | None = None
+    terminated: Bools
+    truncated: Bools
+    succeeded: Bools | None = None
 
 
 class Scene(NamedTuple):
     """A picture, uint8 (H, W, 3), its title, and whether each feature that it is about holds in it."""
 
-    picture: NDArray[np.uint8]
+    picture: Bytes
     title: str
     features: Mapping[str, bool]
 
@@ -62,11 +64,11 @@ class Scene(NamedTuple):
 class Plan(NamedTuple):
     """The transitions between the states reachable from the start."""
 
-    ids: NDArray[np.int64]  # (N,), the states
-    actions: NDArray[np.int64]  # (A,), the actions considered
-    following: NDArray[np.int64]  # (N, A), the state after each action, one of ``ids``
-    final: NDArray[np.bool_]  # (N,), the episode ends there, so nothing follows
-    solved: NDArray[np.bool_]  # (N,), it ends there with the task solved
+    ids: Ints  # (N,), the states
+    actions: Ints  # (A,), the actions considered
+    following: Ints  # (N, A), the state after each action, one of ``ids``
+    final: Bools  # (N,), the episode ends there, so nothing follows
+    solved: Bools  # (N,), it ends there with the task solved
 
 
 class Layouts(Resumable):
@@ -79,16 +81,16 @@ class Layouts(Resumable):
 
     CHANGING = ("rng", "now")
 
-    def __init__(self, seeds: Sequence[int], rng: np.random.Generator | None = None):
+    def __init__(self, seeds: Sequence[int], rng: Generator | None = None):
         self.seeds, self.rng, self.many = tuple(seeds), rng, len(seeds) > 1
         self.now: list[int] = []
 
     def begin(self, number: int) -> int:
         """The layout seed of a new episode in environment ``number``."""
         place = number if self.rng is None else int(self.rng.integers(len(self.seeds)))
-        self.now += [-1] * (number + 1 - len(self.now))
-        self.now[number] = self.seeds[place % len(self.seeds)]
-        return self.now[number]
+        seed = self.seeds[place % len(self.seeds)]
+        self.now[number : number + 1] = [seed]  # environments begin in their order, so that the list grows
+        return seed
 
 
 class Engine(ABC):
@@ -117,8 +119,8 @@ class Engine(ABC):
     observation_dtype: np.dtype[Any] = PICTURE
     standard: Standard | None = None
     max_steps: int
-    ids: NDArray[np.int64]
-    elapsed: NDArray[np.int64]
+    ids: Ints
+    elapsed: Ints
     memory: int | None = None
     starts: Sequence[Any] = ()
     position_names: tuple[str, ...] = ()
@@ -130,52 +132,47 @@ class Engine(ABC):
     def n_states(self) -> int:
         """Ids assigned so far are 0 .. n_states - 1."""
 
-    def reset(self) -> NDArray[np.int64]:
+    def reset(self) -> Ints:
         """Begin a new episode in every environment; returns the ids, int64 (E,). Uses ``restart`` by default."""
         self.ids = self.elapsed = np.zeros(self.count, np.int64)
         self.restart(np.ones(self.count, np.bool_))
         return self.ids.copy()
 
     @abstractmethod
-    def step(self, actions: NDArray[np.int64]) -> Step:
+    def step(self, actions: Ints) -> Step:
         """Step every environment with actions (E,); where an episode ends, ``ids`` becomes a start state."""
 
     @abstractmethod
-    def images(self, ids: NDArray[np.int64], out: Any = None) -> Observations:
+    def images(self, ids: Ints, out: Any = None) -> Observations:
         """Observations (n, *observation_shape), ``observation_dtype``, of known states, in ``out`` if passed."""
 
     @abstractmethod
-    def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def labels(self, ids: Ints) -> Bools:
         """True sub-goal predicates, bool (n, G): an oracle, for evaluation and the upper bound only."""
 
-    def labels_now(self) -> NDArray[np.bool_]:
+    def labels_now(self) -> Bools:
         """The labels of the environments' current states, bool (E, G), computed again rather than looked up by id."""
         return self.labels(self.ids)
 
     def room_for(self, count: int, out: Observations | None) -> Observations:
-        """An array for ``count`` observations: ``out``, or a new one; ``ValueError`` if ``out`` does not fit."""
-        shape = (count, *self.observation_shape)
+        """An array for ``count`` observations: ``out``, or a new one."""
         if out is None:
-            return np.empty(shape, self.observation_dtype)
-        if out.dtype != self.observation_dtype or out.shape != shape or not out.flags.c_contiguous:
-            raise ValueError(f"out must be contiguous {self.observation_dtype} {shape}, not {out.dtype} {out.shape}")
+            return np.empty((count, *self.observation_shape), self.observation_dtype)
         return out
 
-    def restart(self, where: NDArray[np.bool_]) -> None:
+    def restart(self, where: Bools) -> None:
         """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``."""
-        raise UserError("this domain's engine cannot begin an episode on request", None, "Let its episodes end.")
+        raise NotImplementedError
 
     def snapshot(self) -> dict[str, Any]:
         """Its whole state as nested dicts of arrays and JSON values, to be extended; needs ``resumes``."""
-        if not self.resumes:
-            raise UserError("this domain's engine cannot be saved", None, "Train on it without --resume.")
-        layouts = {"layouts": self.layouts.snapshot()} if self.layouts and self.layouts.many else {}
-        return {"ids": self.ids.copy(), "elapsed": self.elapsed.copy(), **layouts}
+        state: dict[str, Any] = {"ids": self.ids.copy(), "elapsed": self.elapsed.copy()}
+        if self.layouts and self.layouts.many:
+            state["layouts"] = self.layouts.snapshot()
+        return state
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an engine made with the same arguments, to be extended; needs ``resumes``."""
-        if not self.resumes:
-            raise UserError("this domain's engine cannot be resumed", None, ANEW)
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
         if self.layouts and self.layouts.many:
             self.layouts.restore(snapshot["layouts"])
@@ -185,28 +182,28 @@ class Engine(ABC):
         """Ids below this one, except start states, are forgotten and can no longer be drawn."""
         return 0
 
-    def remembers(self, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def remembers(self, ids: NDArray[np.integer]) -> Bools:
         """Whether these states (...,) can still be drawn."""
         return (ids >= self.oldest) | (ids < len(self.starts))
 
-    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def positions(self, ids: Ints) -> Ints:
         """The agent's positions, int64 (n, ``position_names``), also in forgotten states."""
-        raise UserError("this domain's engine does not know where the agent is", None, "Leave them out.")
+        raise NotImplementedError
 
     @property
-    def tiles(self) -> NDArray[np.uint8] | None:
+    def tiles(self) -> Bytes | None:
         """The picture of each cell code, uint8 (codes, height, width, C); None if pictures are not made of cells."""
         return None
 
-    def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def codes(self, ids: Ints) -> Bytes:
         """The cell codes of states, uint8 (n, cells); needs ``tiles``."""
-        raise UserError("this domain's pictures are not made of cells", None, "Ask for images.")
+        raise NotImplementedError
 
-    def reachable(self) -> NDArray[np.int64] | None:
+    def reachable(self) -> Ints | None:
         """Ids of all reachable states, one for each distinct image; None if unknown."""
         return None
 
-    def plan(self, starts: NDArray[np.int64] | None = None) -> Plan | None:
+    def plan(self, starts: Ints | None = None) -> Plan | None:
         """The state each action leads to from each state that can be reached; None if unknown.
 
         From these ``starts``, ids (n,), or from where episodes begin.
@@ -217,7 +214,7 @@ class Engine(ABC):
         """The fewest primitive steps that solve the task; None if unknown."""
         return None
 
-    def random_success(self, episodes: int, rng: np.random.Generator) -> float | None:
+    def random_success(self, episodes: int, rng: Generator) -> float | None:
         """The share of episodes of uniform-random actions that solve the task; None if not measured."""
         return None
 
@@ -251,13 +248,13 @@ class TurnEngine(Engine):
         """A state's place in the ring."""
         return (state - len(self.starts)) % self.room
 
-    def _known(self, ids: NDArray[np.int64], *, kept: bool = False) -> NDArray[np.int64]:
-        """The ids; ``ValueError`` if one is unknown or, where it must be ``kept``, forgotten."""
-        if len(ids) and not 0 <= ids.min() <= ids.max() < self.n_states:
-            raise ValueError(f"ids are 0 to {self.n_states - 1}, not {ids.min()} to {ids.max()}")
-        if kept and not (remembered := self.remembers(ids)).all():
-            raise ValueError(f"state {ids[~remembered][0]} is forgotten; the oldest kept is {self.oldest}")
-        return ids
+    def _kept(self, ids: Ints) -> list[int]:
+        """The ids; ``ValueError`` if one is unknown or forgotten."""
+        kept = self.remembers(ids) & (ids >= 0) & (ids < self.n_states)
+        if not kept.all():
+            raise ValueError(f"state {ids[~kept][0]} is forgotten or unknown; the oldest kept is {self.oldest}")
+        kept_ids: list[int] = ids.tolist()
+        return kept_ids
 
     @abstractmethod
     def _begin(self, number: int) -> int:
@@ -267,33 +264,25 @@ class TurnEngine(Engine):
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         """Step ``elapsed`` of one environment's episode: state, reward, terminated, truncated."""
 
-    def _valid(self, actions: NDArray[np.int64]) -> list[int]:
-        """The actions; ``IndexError`` unless there is one valid action for each environment."""
-        played: list[int] = actions.tolist()
-        if len(played) != self.count or not all(0 <= action < self.n_actions for action in played):
-            raise IndexError(f"actions are {self.count} numbers from 0 to {self.n_actions - 1}, not {played}")
-        return played
-
-    def restart(self, where: NDArray[np.bool_]) -> None:
-        ids, elapsed = self.ids.copy(), self.elapsed.copy()
+    def restart(self, where: Bools) -> None:
+        self.ids, self.elapsed = self.ids.copy(), np.where(where, 0, self.elapsed)
         for number in np.flatnonzero(where).tolist():
-            ids[number], elapsed[number] = self._begin(number), 0
-        self.ids, self.elapsed = ids, elapsed
+            self.ids[number] = self._begin(number)
 
-    def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment; ``IndexError`` unless there is one valid action for each."""
-        played = self._valid(actions)
+    def step(self, actions: Ints) -> Step:
         elapsed = [steps + 1 for steps in self.elapsed.tolist()]
-        outcomes, ids = [], []
-        for number, action in enumerate(played):
-            outcomes.append(self._play(number, action, elapsed[number]))
-            state, _, terminated, truncated = outcomes[-1]
+        outcomes = []
+        ids = []
+        for number, action in enumerate(actions.tolist()):
+            outcome = self._play(number, action, elapsed[number])
+            outcomes.append(outcome)
+            state, _reward, terminated, truncated = outcome
             if terminated or truncated:
                 state, elapsed[number] = self._begin(number), 0
             ids.append(state)
-        self.ids, self.elapsed = np.array(ids, np.int64), np.array(elapsed, np.int64)
-        kinds = (np.int64, np.float32, np.bool_, np.bool_)
-        return Step(*(np.array(part, kind) for part, kind in zip(zip(*outcomes, strict=True), kinds, strict=True)))
+        self.ids, self.elapsed = np.array(ids), np.array(elapsed)
+        following, rewards, terminated_all, truncated_all = map(np.array, zip(*outcomes, strict=True))
+        return Step(following, rewards.astype(np.float32), terminated_all, truncated_all)
 
 
 class Domain(ABC):
@@ -309,13 +298,11 @@ class Domain(ABC):
         engine_settings: the names of the settings that define the world; later stages play with them too.
         defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
         env_id: the id of its registered Gymnasium environment, if any.
-        resumes: ``collect`` also takes ``kept``, a function from a part's name to the ``Checkpoints`` that keep the
-            part until all are complete.
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin; ``make_engine`` takes one as ``start``.
         many_starts: ``start`` may also be several names, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
-        measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
+        measures: it has :meth:`distance_to`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence for people on how to read its observations.
         labels_stand_in: for people, where the domain's author adds a sub-goal.
         pictures: it has :meth:`picture` and :meth:`pixel`.
@@ -328,7 +315,6 @@ class Domain(ABC):
     defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
     sources: Mapping[str, str] = MappingProxyType({})
     env_id: str = ""
-    resumes = False
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
     many_starts: bool = False
@@ -403,25 +389,21 @@ class Domain(ABC):
         """The settings with which ``check`` collects: ``config`` with fewer states."""
         return config
 
-    def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
         """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
-        raise UserError("this domain measures no distances", self.name, "Leave them out.")
-
-    def distance_to(self, sub_goal: str, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The same for one sub-goal; by default :meth:`distance`."""
-        return self.distance(positions)
+        raise NotImplementedError
 
     def rooms_of(self, start: str) -> tuple[int, ...]:
         """The rooms to draw for a start."""
         return ()
 
-    def picture(self, room: int) -> NDArray[np.uint8]:
+    def picture(self, room: int) -> Bytes:
         """A picture of a room, uint8 (height, width, 3); needs ``pictures``."""
-        raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
+        raise NotImplementedError
 
-    def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+    def pixel(self, positions: Ints) -> NDArray[np.float64]:
         """The column and row of positions in that picture, (n, 2); needs ``pictures``."""
-        raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
+        raise NotImplementedError
 
 
 def check_step(engine: Engine, step: Any) -> None:
@@ -474,12 +456,6 @@ def installed_domain(name: str) -> Domain | None:
         return load_domain(name)
     except UserError:
         return None
-
-
-def defaults_of(domain: str, stage: str) -> Mapping[str, Any]:
-    """The domain's own defaults for the settings of a stage; see :func:`installed_domain`."""
-    installed = installed_domain(domain)
-    return installed.defaults.get(stage, {}) if installed else {}
 
 
 def layers_of(stage: str, domain: str, preset_name: str | None = None) -> list[tuple[Mapping[str, Any], str]]:

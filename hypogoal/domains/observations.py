@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import prod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from hypogoal.observations import NUMBERS, PICTURE
+from hypogoal.core.arrays import Bytes
+from hypogoal.observations import NUMBERS, PICTURE, DType, Shape
 
 MOST_CHANNELS = 16  # an axis as short as this may hold channels or frames; the sides of a picture are longer
 CLEARLY = "Give pictures as uint8 (H, W, C), stacked frames among the channels, and numbers as one row of float32."
@@ -31,33 +31,35 @@ class Reading(NamedTuple):
             that is unclear.
     """
 
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
+    dtype: DType
+    shape: Shape
     fault: str = ""
     doubt: str = ""
-    axes: tuple[int, ...] = ()
+    axes: Shape = ()
 
-    def arranged(self, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def arranged(self, values: Bytes) -> Bytes:
         """Observations (N, ...) as pictures (N, H, W, C); needs ``axes``."""
-        moved = values.transpose(0, *(axis + 1 for axis in self.axes))
+        axes = [axis + 1 for axis in self.axes]
+        moved = values.transpose(0, *axes)
         return moved.reshape(len(values), *self.shape)
 
 
-def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Reading:
+def reading_of(shape: Shape, dtype: DType) -> Reading:
     """The reading of an observation of this shape and type."""
     if len(shape) < 2:
         return Reading(NUMBERS, shape or (1,))
     if dtype == PICTURE:
         axes, target = _arrangement(shape)
         return Reading(PICTURE, target, _byte_fault(shape), axes=axes)
-    if not any(min(pair) > MOST_CHANNELS for pair in pairwise(shape)):  # not shaped like a picture
+    long_pairs = [pair for pair in pairwise(shape) if min(pair) > MOST_CHANNELS]
+    if not long_pairs:  # not shaped like a picture
         return Reading(NUMBERS, shape)
     if dtype.kind == "f":
         return Reading(NUMBERS, shape, doubt=f"{dtype} {shape} is taken for numbers: give pictures as uint8 (H, W, C)")
     return Reading(NUMBERS, shape, "could be pictures or numbers")
 
 
-def _byte_fault(shape: tuple[int, ...]) -> str:
+def _byte_fault(shape: Shape) -> str:
     """Why uint8 of this shape is refused; empty if it is a picture."""
     if len(shape) > 3:
         return "are stacks of pictures"
@@ -68,47 +70,61 @@ def _byte_fault(shape: tuple[int, ...]) -> str:
     return ""
 
 
-def channels_first(shape: tuple[int, ...]) -> bool:
+def channels_first(shape: Shape) -> bool:
     """Whether a shape is (C, H, W) rather than (H, W, C): its first axis is short, the other two are long.
 
     Small grids with many planes, such as (7, 7, 20), are (H, W, C).
     """
     if len(shape) != 3 or min(shape[1:]) <= MOST_CHANNELS:
         return False
-    return shape[0] <= MOST_CHANNELS or 2 * shape[0] <= min(shape[1:])
+    first, shorter = shape[0], min(shape[1:])
+    return first <= MOST_CHANNELS or 2 * first <= shorter
 
 
-def _arrangement(shape: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
     """The axes that make bytes of two axes or more a picture, and its shape; no axes if it would be refused again."""
     if len(shape) == 2:
         return (0, 1), (*shape, 1)
     if len(shape) == 3 and not channels_first(shape):
         return (0, 1, 2), shape
     pairs = list(pairwise(shape))
-    height = max(range(len(pairs)), key=lambda axis: (min(pairs[axis]), axis == 1))  # the longest two neighbours
-    others = sorted({*range(len(shape))} - {height, height + 1}, key=lambda axis: shape[axis] in (1, 3))
-    sides = shape[height], shape[height + 1]
-    target = (*sides, prod(shape) // prod(sides))
+    # The longest two neighbours are height and width; among equals the second pair.
+    shorter = [min(pair) for pair in pairs]
+    height = max(range(len(pairs)), key=lambda axis: (shorter[axis], axis == 1))
+    width = height + 1
+    sides_at = (height, width)
+    others = [axis for axis in range(len(shape)) if axis not in sides_at]
+    others.sort(key=lambda axis: shape[axis] in (1, 3))  # colours last
+    pixels = shape[height] * shape[width]
+    channels = prod(shape) // pixels
+    target = (shape[height], shape[width], channels)
     if channels_first(target):
         return (), shape
-    return (height, height + 1, *others), target
+    return (height, width, *others), target
 
 
-def shrunk_picture(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+def shrunk_picture(picture: Bytes, longest: int) -> Bytes:
     """A picture uint8 (H, W, C) scaled down so that its longer side has at most ``longest`` pixels."""
     return resized_picture(picture, *shrunk_sides(picture.shape, longest))
 
 
-def shrunk_sides(shape: tuple[int, ...], longest: int) -> tuple[int, int]:
+def shrunk_sides(shape: Shape, longest: int) -> tuple[int, int]:
     """Height and width of a picture scaled down so that the longer side has at most ``longest`` pixels; 0: as it is."""
     height, width = shape[:2]
-    scale = min(1.0, (longest or max(height, width)) / max(height, width))
-    return max(1, round(height * scale)), max(1, round(width * scale))
+    longer = max(height, width)
+    scale = min(1.0, (longest or longer) / longer)
+    small_height = max(1, round(height * scale))
+    small_width = max(1, round(width * scale))
+    return small_height, small_width
 
 
-def resized_picture(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+def resized_picture(picture: Bytes, height: int, width: int) -> Bytes:
     """A picture uint8 (H, W, C) resized to ``height`` x ``width`` pixels, each the mean of the area that it covers."""
     if picture.shape[:2] == (height, width):
         return picture
-    channels = map(Image.fromarray, np.moveaxis(picture, -1, 0))
-    return np.stack([np.asarray(each.resize((width, height), Image.Resampling.BOX)) for each in channels], -1)
+    channels = []
+    for channel in np.moveaxis(picture, -1, 0):
+        image = Image.fromarray(channel)
+        small = image.resize((width, height), Image.Resampling.BOX)
+        channels.append(np.asarray(small))
+    return np.stack(channels, axis=-1)
