@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
-from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig
+from hypogoal.domains.montezuma.collect import MontezumaConfig
+from hypogoal.domains.montezuma.domain import DOMAIN
 from hypogoal.domains.montezuma.ladders import GROUPS
 from hypogoal.evaluation.distance import NEAR, option_numbers
 from hypogoal.options.tables import Executions

@@ -17,7 +17,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     """Collect labelled, unlabelled and held-out states.
 
     ``domain`` is a name, or in Python a ``Domain``, which later stages find by its own name, in this process only.
-    ``out`` is an HDF5 file. ``resume`` continues an unfinished one, of domains that can.
+    ``out`` is an HDF5 file. ``resume`` keeps a complete one and begins an unfinished one anew.
     """
     from hypogoal.data import open_dataset, require_names, write_dataset
     from hypogoal.domains.base import BUILT_IN, load_domain
@@ -31,9 +31,8 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     with call.draft(DATA, settings | {"domain": name}) as draft:
         if played.doubt:
             say(f"hypogoal: {played.doubt}", err=True)
-        kept = {"kept": draft.checkpoints} if played.resumes else {}
         with Progress(f"collect {name}", total=1, quiet=call.quiet) as progress:
-            collected = played.collect(config, call.seed, progress, **kept)
+            collected = played.collect(config, call.seed, progress)
         write_dataset(
             draft.files / call.out.name,
             collected,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bytes, Ints
 from hypogoal.core.errors import UserError
 
 GAME = "montezuma_revenge"
@@ -55,7 +56,7 @@ SPRITE_LEFT, SPRITE_TOP = -1, 308
 THREE_PLACES = (20, 75, 130)  # so far apart that the agent and its traces never overlap
 
 
-def stack_frames(frames: Sequence[NDArray[np.uint8]], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+def stack_frames(frames: Sequence[Bytes], out: Bytes | None = None) -> Bytes:
     """Four frames (84, 84), the oldest first, as uint8 (84, 84, 4): ``np.stack(frames, axis=-1)``, ten times faster."""
     import cv2
 
@@ -63,7 +64,7 @@ def stack_frames(frames: Sequence[NDArray[np.uint8]], out: NDArray[np.uint8] | N
     return merged
 
 
-Frames = tuple[NDArray[np.uint8], ...]  # of the last four agent steps, uint8 (84, 84) each, oldest first
+Frames = tuple[Bytes, ...]  # of the last four agent steps, uint8 (84, 84) each, oldest first
 
 
 class Position(NamedTuple):
@@ -80,10 +81,10 @@ class Snapshot:
 
     state: Any  # an ``ALEState``
     seen: Frames  # of its observation
-    screen: NDArray[np.uint8]  # (210, 160), the last of them before resizing
+    screen: Bytes  # (210, 160), the last of them before resizing
 
     @property
-    def stack(self) -> NDArray[np.uint8]:
+    def stack(self) -> Bytes:
         """The observation, uint8 (84, 84, 4), a new array."""
         return stack_frames(self.seen)
 
@@ -119,16 +120,14 @@ class Emulator:
 
     Attributes:
         seen, screen: as in ``Snapshot``; never modified: each step makes new ones.
-        screens: False, no frame is drawn and ``seen`` stays as it is: twice as fast when only RAM matters.
     """
 
     def __init__(self, seed: int = 0):
         self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed; refuses if cv2 is missing
         import cv2
 
+        self._cv2 = cv2
         self.actions = list(self.ale.getLegalActionSet())
-        self.screens = True
-        self._resize, self._area, self._brighter = cv2.resize, cv2.INTER_AREA, cv2.max
         self._drawn = np.zeros(SCREEN, np.uint8), np.zeros(SCREEN, np.uint8)
         self._ram = np.zeros(128, np.uint8)
         self._first_room: Any = None
@@ -136,11 +135,11 @@ class Emulator:
         self.reset()
 
     @property
-    def stack(self) -> NDArray[np.uint8]:
+    def stack(self) -> Bytes:
         """The observation, uint8 (84, 84, 4): a copy of the last four agent steps' frames, oldest first."""
         return stack_frames(self.seen)
 
-    def reset(self) -> NDArray[np.uint8]:
+    def reset(self) -> Bytes:
         """Begin a new game; the stack repeats its first frame four times."""
         self.ale.reset_game()
         self.screen = self.ale.getScreenGrayscale()
@@ -155,27 +154,26 @@ class Emulator:
             reward += ale.act(act)
             if ale.game_over():
                 break  # without drawing this frame, as Gymnasium's wrapper does
-            if frame >= FRAME_SKIP - 2 and self.screens:
+            if frame >= FRAME_SKIP - 2:
                 ale.getScreenGrayscale(self._drawn[drawn])
                 drawn += 1
-        if self.screens:
-            if drawn:
-                # NumPy's maximum, if it uses AVX-512, slows down the emulator's next frames by a seventh.
-                self.screen = self._brighter(self._drawn[0], self._drawn[1] if drawn == 2 else self.screen)
-            self.seen = (*self.seen[1:], self._shrink(self.screen))
+        if drawn:
+            before = self._drawn[1] if drawn == 2 else self.screen
+            # NumPy's maximum, if it uses AVX-512, slows down the emulator's next frames by a seventh.
+            self.screen = self._cv2.max(self._drawn[0], before)
+        self.seen = (*self.seen[1:], self._shrink(self.screen))
         return reward
 
-    def _shrink(self, screen: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        small: Any = self._resize(screen, (SIDE, SIDE), interpolation=self._area)
+    def _shrink(self, screen: Bytes) -> Bytes:
+        small: Any = self._cv2.resize(screen, (SIDE, SIDE), interpolation=self._cv2.INTER_AREA)
         return small
 
     def frames(self, action: int, count: int) -> None:
         """Play ``count`` single frames of ``action`` undrawn: no agent step, the stack stays as it is."""
-        act = self.actions[action]
         for _ in range(count):
-            self.ale.act(act)
+            self.ale.act(self.actions[action])
 
-    def ram(self) -> NDArray[np.uint8]:
+    def ram(self) -> Bytes:
         """The console's memory, uint8 (128,), overwritten by the next call."""
         self.ale.getRAM(self._ram)
         return self._ram
@@ -190,14 +188,13 @@ class Emulator:
 
     def position(self) -> Position:
         """The agent's position."""
-        ram = self.ram()
-        return Position(int(ram[RAM["room"]]), int(ram[RAM["x"]]), int(ram[RAM["y"]]))
+        return Position(self.read("room"), self.read("x"), self.read("y"))
 
     def alive(self) -> bool:
         """Whether the agent is not dying."""
         return self.read("dying") == 0 and not self.ale.game_over()
 
-    def screen_rgb(self) -> NDArray[np.uint8]:
+    def screen_rgb(self) -> Bytes:
         """The console's picture, uint8 (210, 160, 3)."""
         return self.ale.getScreenRGB()
 
@@ -245,9 +242,11 @@ class Emulator:
         self.ale.restoreState(self._first_room)
 
     def _enter(self, room: int) -> Any:
+        """The emulator's state right after the agent entered a room."""
         if not 0 <= room < ROOMS:
             raise UserError("no such room", room, f"Rooms are 0 to {ROOMS - 1}.")
-        for neighbour, x, action in ((room - 1, RIGHT_EDGE, RIGHT), (room + 1, LEFT_EDGE, LEFT)):
+        entries = (room - 1, RIGHT_EDGE, RIGHT), (room + 1, LEFT_EDGE, LEFT)
+        for neighbour, x, action in entries:
             if not 0 <= neighbour < ROOMS:
                 continue
             self._to_first_room()
@@ -264,22 +263,25 @@ class Emulator:
         raise RuntimeError(f"room {room} could not be entered: has the ROM changed?")
 
 
-def pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
+def pixel(positions: Ints) -> NDArray[np.float64]:
     """The agent's middle in the console's picture: column, row (n, 2), for positions (n, 3) of room, x, y."""
-    columns = positions[:, 1] + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2
-    rows = SPRITE_TOP - positions[:, 2] + (SPRITE_HEIGHT - 1) / 2
+    _, x, y = positions.T
+    columns = x + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2
+    rows = SPRITE_TOP - y + (SPRITE_HEIGHT - 1) / 2
     return np.stack([columns, rows], axis=1)
 
 
-def observed_pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
+def observed_pixel(positions: Ints) -> NDArray[np.float64]:
     """The agent's middle in an 84x84 observation, the resized picture: row, column (n, 2).
 
     A test compares it with the emulator.
     """
-    return (pixel(positions)[:, ::-1] + 0.5) * (np.array(OBSERVATION_SHAPE[:2]) / SCREEN) - 0.5
+    scale = np.array([SIDE, SIDE]) / SCREEN
+    rows_and_columns = pixel(positions)[:, ::-1]
+    return (rows_and_columns + 0.5) * scale - 0.5
 
 
-def picture(emulator: Emulator, room: int) -> NDArray[np.uint8]:
+def picture(emulator: Emulator, room: int) -> Bytes:
     """A room as the console shows it, with enemies but without the agent: uint8 (210, 160, 3).
 
     Of three pictures with the agent at three places, two agree on every pixel.

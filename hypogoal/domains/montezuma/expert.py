@@ -1,0 +1,255 @@
+"""Spec B5: scripted play in a room of Montezuma's Revenge, from around the places of its sub-goals and elsewhere."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, cycle
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.random import Generator
+
+from hypogoal.core.arrays import Bytes, Ints
+from hypogoal.domains.montezuma import emulator as game
+from hypogoal.domains.montezuma.emulator import RAM, Emulator, Position
+from hypogoal.domains.montezuma.ladders import BASES, LADDERS, REACH, SHAFT_ENTRY, SHAFT_EXIT, TOPS
+from hypogoal.domains.montezuma.sub_goals import SubGoal
+
+ROLLOUT_STEPS = 40
+SETTLE = 4  # agent steps that fill the stack with frames of the start
+PHASES = (2, 200)  # frames for which the room's enemies move before the first step
+ROLLOUTS_PER_PHASE = 4
+STARTS = {  # shares, among the kinds that a room has
+    "spot": 0.5,
+    "ladder": 0.15,
+    "side": 0.1,
+    "anywhere": 0.25,
+}
+
+LONGEST_REPEAT = 8  # agent steps of one action
+JITTER = 0.1  # share of the steps with another action in between
+HEADINGS = (game.DOWN, game.UP, game.LEFT, game.RIGHT)
+HEADING = 0.7  # share of the actions that are a heading; the others are any action
+CLOSE = 1  # distance from a spot, in RAM units, at which an agent that heads for it stops
+STEPS_ASIDE = 3  # most steps from a spot or side before a rollout begins
+HELD = 0.5  # share of the starts at a spot where the agent stays there, against the conveyor belt in room 1
+STRIDE = 4  # RAM units that the agent walks or climbs in an agent step
+
+# Where the agent can be placed.
+BLACK_SHARE = 0.95  # of the agent's box if it stands in the open; the rows of its feet are all black
+FEET = 4  # rows
+SNAP = 3  # in some rooms the floor is drawn so much below the row of entry
+LAVA_ROOMS = (10, 18, 20, 22)
+LAVA_BELOW = 220  # y; the agent stands on lava only if placed there
+
+
+class Shown(NamedTuple):
+    """One state of a rollout: the observation, uint8 (84, 84, 4), the RAM, uint8 (128,), and the last two actions."""
+
+    stack: Bytes
+    ram: Bytes
+    action: int
+    previous_action: int
+
+    @property
+    def dying(self) -> bool:
+        """Whether the agent is dying."""
+        return bool(self.ram[RAM["dying"]] > 0)
+
+
+class Expert:
+    """Plays in a room; ``rng`` draws all that it does.
+
+    A rollout begins at a spot of a sub-goal, in the midst of a ladder, at a side or anywhere; several of a kind take
+    turns. Its actions are repeated, most of them headings; some lead to a spot. It ends when the agent leaves the room
+    or would revive after a death.
+    """
+
+    def __init__(
+        self,
+        emulator: Emulator,
+        room: int,
+        rng: Generator,
+        sub_goals: Sequence[SubGoal],
+    ):
+        self.emulator = emulator
+        self.room = room
+        self.rng = rng
+        self.places = standing_places(emulator, room)
+        self.spots = self._in_room(goal.spots for goal in sub_goals)
+        sides = self._in_room(goal.sides for goal in sub_goals)
+        self.in_turn = {
+            "spot": self._in_turn(self.spots),
+            "side": self._in_turn(sides),
+            "ladder": self._in_turn(climbs_in(room)),
+            "anywhere": None,
+        }
+        self.kinds = [kind for kind in STARTS if self.in_turn[kind] or kind == "anywhere"]
+        weights = np.array([STARTS[kind] for kind in self.kinds])
+        self.chances = weights / weights.sum()
+
+    def _in_room(self, places: Iterable[Iterable[Position]]) -> list[Position]:
+        return [place for place in chain.from_iterable(places) if place.room == self.room]
+
+    def _in_turn(self, items: Sequence[Any]) -> Any:
+        """Cycles through the items in a random order; None if there are none."""
+        if not items:
+            return None
+        order = self.rng.permutation(len(items)).tolist()
+        return cycle([items[index] for index in order])
+
+    def play(self) -> Iterator[Shown]:
+        """Endlessly, the states of rollouts."""
+        while True:
+            scene = self._scene()
+            for _ in range(ROLLOUTS_PER_PHASE):
+                self.emulator.restore(scene)
+                first = self._begin()
+                if first is not None:
+                    yield from self._rollout(first)
+
+    def _scene(self) -> game.Snapshot:
+        """The room with its enemies at a random phase; the agent is placed later."""
+        while True:
+            phase = int(self.rng.integers(*PHASES, endpoint=True))
+            entrance = (self.room, game.RIGHT_EDGE, game.EDGE_Y)
+            scene = self.emulator.place(*entrance, phase=phase, settle=0)
+            if scene is not None:
+                return scene
+
+    def _begin(self) -> Shown | None:
+        """Bring the agent to a start and fill the stack; None unless it is alive in the room then."""
+        emulator = self.emulator
+        stays = self._place()
+        action = previous = game.NOOP
+        for _ in range(SETTLE):
+            previous = action
+            if stays:
+                action, _ = towards(emulator.position(), self.spots)
+            emulator.step(action)
+        outside = emulator.position().room != self.room
+        if outside or not emulator.alive():
+            return None
+        return Shown(emulator.stack, emulator.ram().copy(), action, previous)
+
+    def _place(self) -> bool:
+        """Place the agent where a rollout begins; whether it is to stay at the spot while the stack fills."""
+        rng, emulator = self.rng, self.emulator
+        kind = self.kinds[rng.choice(len(self.kinds), p=self.chances)]
+        action, steps = game.NOOP, 0  # which it plays for so many agent steps, undrawn
+        stays = False
+        if kind == "anywhere":
+            row = rng.integers(len(self.places))
+            x, y = self.places[row].tolist()
+        elif kind == "ladder":
+            (_, x, y), action, longest = next(self.in_turn[kind])
+            steps = int(rng.integers(1, longest + 1))
+        else:
+            _, x, y = next(self.in_turn[kind])
+            x += int(rng.integers(-REACH, REACH + 1))
+            share = HELD if kind == "spot" else 0.0
+            stays = rng.random() < share
+            if not stays:
+                action = (game.LEFT, game.RIGHT)[rng.integers(2)]
+                steps = int(rng.integers(STEPS_ASIDE + 1))
+        emulator.write("x", x)
+        emulator.write("y", y)
+        emulator.frames(action, game.FRAME_SKIP * steps)
+        return stays
+
+    def _rollout(self, shown: Shown) -> Iterator[Shown]:
+        """A state and those after it."""
+        yield shown
+        for action in self._actions():
+            self.emulator.step(action)
+            ram = self.emulator.ram().copy()
+            following = Shown(self.emulator.stack, ram, action, shown.action)
+            revived = shown.dying and not following.dying
+            outside = ram[RAM["room"]] != self.room
+            if revived or outside or self.emulator.ale.game_over():
+                return
+            shown = following
+            yield shown
+
+    def _actions(self) -> Iterator[int]:
+        """The actions of a rollout, some of them towards the spots."""
+        action, left = game.NOOP, 0
+        homing = self.rng.random() if self.spots else 0.0
+        for _ in range(ROLLOUT_STEPS):
+            if left == 0:
+                action, left = self._next_action(homing)
+            left -= 1
+            jitters = self.rng.random() < JITTER
+            yield int(self.rng.integers(game.N_ACTIONS)) if jitters else action
+
+    def _next_action(self, homing: float) -> tuple[int, int]:
+        """An action, towards a spot with the probability ``homing``, and its number of agent steps."""
+        if self.rng.random() < homing:
+            return towards(self.emulator.position(), self.spots)
+        if self.rng.random() < HEADING:
+            action = HEADINGS[self.rng.integers(len(HEADINGS))]
+        else:
+            action = int(self.rng.integers(game.N_ACTIONS))
+        return action, int(self.rng.integers(1, LONGEST_REPEAT + 1))
+
+
+def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
+    """An action that moves the agent to the nearest spot or holds it there, and its number of agent steps."""
+
+    def distance(spot: Position) -> int:
+        return abs(position.x - spot.x) + abs(position.y - spot.y)
+
+    spot = min(spots, key=distance)
+    aside = spot.x - position.x
+    if abs(aside) > CLOSE:
+        steps = max(1, round(abs(aside) / STRIDE))
+        return (game.RIGHT if aside > 0 else game.LEFT), steps
+    if position.y > spot.y:
+        return game.DOWN, 1
+    if position.y < spot.y and spot in TOPS and spot not in BASES:
+        return game.UP, 1
+    return game.NOOP, 1
+
+
+def climbs_in(room: int) -> list[tuple[Position, int, int]]:
+    """Each climb that begins in a room: its start, its action, and the most agent steps without leaving the room."""
+    climbs = []
+    for ladder in LADDERS:
+        highest = SHAFT_ENTRY if ladder.joins_rooms else ladder.top.y
+        lowest = SHAFT_EXIT if ladder.joins_rooms else ladder.base.y
+        up = (highest - ladder.base.y) // STRIDE - 1
+        down = (ladder.top.y - lowest) // STRIDE - 1
+        if ladder.base.room == room:
+            climbs.append((ladder.base, game.UP, up))
+        if ladder.top.room == room:
+            climbs.append((ladder.top, game.DOWN, down))
+    return climbs
+
+
+def standing_places(emulator: Emulator, room: int) -> Ints:
+    """Places x, y (n, 2) of a room where an agent placed there stands on something, in the open.
+
+    Many places lie inside walls, where the game does not stop the agent from climbing about. So the agent's box must be
+    black, with something under its feet. Room 15 has no black places; for it, the row of entry is taken.
+    """
+    black = (game.picture(emulator, room) == 0).all(2)
+    x = np.arange(game.LEFT_EDGE, game.RIGHT_EDGE + 1)
+    y = np.arange(SHAFT_EXIT, SHAFT_ENTRY + 1)
+    # The agent's box at each place, and below it the row under the feet.
+    boxes = sliding_window_view(black, (game.SPRITE_HEIGHT + 1, game.SPRITE_WIDTH))
+    boxes = boxes[np.ix_(game.SPRITE_TOP - y, x + game.SPRITE_LEFT)]
+    body = boxes[:, :, :-1]
+    feet = body[:, :, -FEET:]
+    floor = boxes[:, :, -1]
+    stands = body.mean((2, 3)) >= BLACK_SHARE
+    stands &= feet.all((2, 3))
+    stands &= floor.mean(2) <= 0.5
+    if room in LAVA_ROOMS:
+        stands[y < LAVA_BELOW] = False
+    rows, columns = np.nonzero(stands)
+    if not len(rows):
+        entry = np.full_like(x, game.EDGE_Y)
+        return np.stack([x, entry], axis=1)
+    below_entry = np.abs(y - game.EDGE_Y) <= SNAP
+    level = np.where(below_entry, game.EDGE_Y, y)
+    places = np.stack([x[columns], level[rows]], axis=1)
+    return np.unique(places, axis=0)
