@@ -49,7 +49,8 @@ class DoorKeyConfig(Config):
 
 def _heldout_seeds(config: DoorKeyConfig) -> list[int]:
     """The first layout seeds from ``heldout_first`` on whose grids are new."""
-    grids = {env.layout_of(layout_seed).grid for layout_seed in (config.labelled_seed, *config.unlabelled_seeds)}
+    training = (config.labelled_seed, *config.unlabelled_seeds)
+    grids = {env.layout_of(layout_seed).grid for layout_seed in training}
     chosen: list[int] = []
     for layout_seed in itertools.count(config.heldout_first):
         if len(chosen) == config.heldout_layouts:

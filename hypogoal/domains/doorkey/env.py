@@ -13,7 +13,8 @@ from minigrid.core.grid import Grid
 from minigrid.core.mission import MissionSpace
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from minigrid.minigrid_env import MiniGridEnv
-from numpy.typing import NDArray
+
+from hypogoal.core.arrays import Bools, Bytes
 
 SIZE = 8  # cells a side
 TILE = 8  # pixels a cell
@@ -29,12 +30,12 @@ MISSION = "use the red key to open the door and then get to the goal"
 
 
 def sub_goals_reached(
-    held: NDArray[np.bool_],
-    door_open: NDArray[np.bool_],
-    facing_door: NDArray[np.bool_],
-    on_goal: NDArray[np.bool_],
+    held: Bools,
+    door_open: Bools,
+    facing_door: Bools,
+    on_goal: Bools,
     door_label: str = "open",
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Spec B2: the five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
 
     ``held`` (..., 3) covers the blue, the green and the red key; the others are (...,). ``open-red-door`` holds when
@@ -164,7 +165,7 @@ class DoorKeyGrid(MiniGridEnv):
     def _reward(self) -> float:
         return 1.0
 
-    def labels(self) -> NDArray[np.bool_]:
+    def labels(self) -> Bools:
         """Spec B2: the true predicates of the current state, bool (5,), in the order of ``SUB_GOALS``."""
         held = np.array([colour in self.held for colour in KEY_COLOURS])
         facing = self.grid.get(*self.front_pos) is self.door
@@ -206,7 +207,7 @@ class DoorKeyEnv(DoorKeyGrid):
         super().__init__(*args, **kwargs)
         self.observation_space = spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
 
-    def gen_obs(self) -> NDArray[np.uint8]:
+    def gen_obs(self) -> Bytes:
         """What MiniGrid's ``RGBImgObsWrapper(tile_size=8)`` draws when the view cone is not tinted."""
         x, y = self.agent_pos
         return self.grid.render(TILE, (x, y), self.agent_dir)
