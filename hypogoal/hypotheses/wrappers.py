@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.domains.gymnasium.engine import Reader, reader_of
+from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]

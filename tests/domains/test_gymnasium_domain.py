@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import corridor_env
@@ -11,15 +10,11 @@ import numpy as np
 import pytest
 from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
 
-from hypogoal.check import check_domain
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
-from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium.engine import GymnasiumEngine
-from hypogoal.domains.observations import channels_first
-from hypogoal.stages.collect import collect
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 
@@ -30,13 +25,6 @@ def collected(domain: GymnasiumDomain = DOMAIN, config: GymnasiumConfig = SMALL,
 
 def engine_of(count: int = 3, **arguments: int) -> GymnasiumEngine:
     return DOMAIN.make_engine(0, count, 30, **arguments)
-
-
-def test_it_is_a_domain() -> None:
-    """Spec B6."""
-    assert isinstance(DOMAIN, Domain)
-    assert DOMAIN.sub_goals == ("left-end", "right-end")
-    assert DOMAIN.observation_shape == (48, 48, 3)
 
 
 def test_collection_has_each_picture_once_with_its_labels() -> None:
@@ -74,80 +62,6 @@ def test_labels_come_from_functions_or_from_one(sub_goals: Any, labels: Any) -> 
         UserError, match=r"(nothing says where sub-goals hold: a, b|and labels= too: left).* Give \{name"
     ):
         GymnasiumDomain(CorridorEnv, sub_goals, labels=labels)
-
-
-def test_collection_is_the_same_for_the_same_seed() -> None:
-    """Spec G1."""
-    one, same, other = (collected(seed=seed) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one.labelled.origins["step"], same.labelled.origins["step"])
-    np.testing.assert_array_equal(one.heldout.observations, same.heldout.observations)
-    assert one.labelled.origins["step"].tolist() != other.labelled.origins["step"].tolist()
-
-
-def test_few_states_are_shared_out_among_combinations_of_sub_goals() -> None:
-    """Spec B3: of three states one is at each end, though most of what is met is in between."""
-    states = collected(config=GymnasiumConfig(heldout_seeds=(4,), steps=300, states=3)).labelled
-    assert sorted(map(tuple, states.labels.tolist())) == [(False, False), (False, True), (True, False)]
-
-
-class Counting(gymnasium.Env[np.ndarray, int]):
-    """Each picture is another: the number of the step."""
-
-    observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
-    action_space = gymnasium.spaces.Discrete(2)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.count = 10_000 * (seed or 0)
-        return self._picture(), {}
-
-    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.count += 1
-        return self._picture(), 0.0, False, False, {}
-
-    def _picture(self) -> np.ndarray:
-        picture = np.zeros((8, 8, 3), np.uint8)
-        picture[0, 0] = self.count >> 16, self.count >> 8 & 255, self.count & 255
-        return picture
-
-
-@pytest.mark.parametrize(("states", "steps"), [(500, 1000), (400, 3000)])
-def test_the_sample_is_of_all_that_was_played(states: int, steps: int) -> None:
-    """Spec B7: each sixth of the play gives a sixth of the states, where there are fewer or more than are kept."""
-    config = GymnasiumConfig(heldout_seeds=(4,), steps=steps, states=states, max_episode_steps=steps)
-    found = collected(ODD, config).labelled
-    assert len(found.labels) == states and found.labels.sum() == states // 2
-    sixths = np.histogram(found.origins["step"], bins=6, range=(0, steps))[0]
-    # Drawn without replacement: at most binomial's spread, of which this is more than four times.
-    assert np.abs(sixths - states / 6).max() < 4 * np.sqrt(states * 5 / 36), sixths
-
-
-ODD = GymnasiumDomain(Counting, {"odd": lambda env: env.unwrapped.count % 2 == 1})
-
-
-def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec B6: with the sub-goal, as 'import' tells it; nothing where there are enough of both."""
-    collect(ODD, tmp_path / "odd.h5", heldout_seeds=(4,), steps=100, max_episode_steps=100, quiet=True)
-    assert capsys.readouterr().err == ""
-    collect(DOMAIN, tmp_path / "corridor.h5", quiet=True, **SMALL.model_dump())
-    told = "hypogoal: {} has 1 positives among 6 labelled states: classes are unbalanced"
-    assert capsys.readouterr().err.splitlines() == [told.format("left-end"), told.format("right-end")]
-    one = SMALL.model_dump() | {
-        "heldout_seeds": (4,),
-        "steps": 60,
-        "max_episode_steps": 2,
-    }
-    seldom = GymnasiumDomain(CorridorEnv, {"first": lambda env: env.unwrapped.cell < 3})
-    collect(seldom, tmp_path / "seldom.h5", quiet=True, **(one | {"labelled_seeds": (0,)}))
-    assert "first has 3 positives among 5 labelled states" in capsys.readouterr().err
-
-
-def test_a_policy_collects() -> None:
-    """Spec B7: without exploration a policy that goes right never sees the left end, and that is said."""
-    right = GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=lambda env, observation, rng: 1)
-    with pytest.raises(UserError, match=r"left-end has no positives among .* labelled states"):
-        collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=80, explore=0.0))
-    assert collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=800, explore=0.6)).labelled.labels[:, 0].any()
 
 
 class Stairs(gymnasium.Env[np.ndarray, int]):
@@ -205,47 +119,6 @@ def test_policies_share_the_steps() -> None:
         GymnasiumDomain(Stairs, STEPS_UP, policy={"half-way": climb, "moon": stay})
 
 
-def test_how_long_options_need_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec B6: where play took longer from one sub-goal to the next than options have by default."""
-    collect(GymnasiumDomain(Stairs, STEPS_UP, policy=climb), tmp_path / "data.h5", **vars(FEW))
-    told = " ".join(capsys.readouterr().err.split())
-    assert "play took up to 6 steps from one sub-goal to the next" in told
-    assert "train-options --option-timeout 12 gives options time" in told
-
-
-def test_check_takes_few_states() -> None:
-    """Spec B6: 2,000 pictures of each layout would be kept; of big ones that is more than a machine may have."""
-
-    class Tall(CorridorEnv):
-        def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-            self.count = 0
-            return super().reset(**kwargs)
-
-        def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
-            image, reward, _over, cut, info = super().step(action)
-            return image, reward, False, cut, info  # it goes on, and no two pictures are alike
-
-        def image(self) -> np.ndarray:
-            self.count += 1
-            picture = super().image()
-            picture[0, :3, 0] = self.count >> 16, self.count >> 8 & 255, self.count & 255
-            return picture
-
-    domain = GymnasiumDomain(Tall, corridor_env.SUB_GOALS)
-    config = GymnasiumConfig(states=2_000, steps=2_000, heldout_seeds=(4,), max_episode_steps=2_000)
-    kept: list[int] = []
-    collect_all = domain.collect
-
-    def counted(config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
-        found = collect_all(config, seed, progress)
-        kept.append(len(found.labelled.labels))
-        return found
-
-    domain.collect = counted  # type: ignore[method-assign]
-    list(check_domain(domain, config))
-    assert kept == [200, 200]
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -278,14 +151,6 @@ def test_the_engine_is_the_environment() -> None:
         if terminated or step.truncated[0]:
             observation, _ = env.reset(seed=0)
     assert engine.n_states == LENGTH  # each picture once
-
-
-def test_the_engine_cuts_episodes() -> None:
-    """Spec B1: a time limit truncates, and is no end of the task."""
-    engine = DOMAIN.make_engine(0, 2, 3)
-    ends = [engine.step(np.zeros(2, np.int64)).truncated.tolist() for _ in range(4)]
-    assert ends == [[False] * 2, [False] * 2, [True] * 2, [False] * 2]
-    assert engine.elapsed.tolist() == [1, 1]
 
 
 def test_a_domain_says_what_is_a_success() -> None:
@@ -352,39 +217,6 @@ def test_the_engine_forgets_but_not_what_a_replay_holds() -> None:
     for _ in range(50):
         action = rng.integers(2, size=1)
         assert restored.step(action).next_ids == engine.step(action).next_ids
-
-
-def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6: whichever way hypogoal was started."""
-    import sys
-
-    from hypogoal.core import own_code
-    from hypogoal.domains.base import load_domain
-
-    (tmp_path / "domain_lying_here.py").write_text("from corridor_env import DOMAIN\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
-    own_code.allow(["domain_lying_here:DOMAIN"])
-    assert load_domain("domain_lying_here:DOMAIN") is DOMAIN
-
-
-@pytest.mark.parametrize(
-    ("shape", "first"),
-    [
-        ((3, 48, 48), True),
-        ((12, 48, 48), True),
-        ((16, 84, 84), True),
-        ((48, 48, 12), False),
-        ((16, 64, 16), False),
-        ((20, 84, 84), True),
-        ((24, 32, 30), False),  # ten frames in colour of a small picture
-        ((7, 7, 20), False),  # MiniGrid's one-hot view
-        ((3, 48), False),
-    ],
-)
-def test_channels_first_are_known_by_their_shape(shape: tuple[int, ...], first: bool) -> None:
-    """Spec B6: of any number of channels, stacks of colour frames too, and never an image that is only low."""
-    assert channels_first(shape) == first
 
 
 def test_pictures_are_resized() -> None:

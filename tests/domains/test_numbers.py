@@ -6,7 +6,6 @@ from typing import Any
 
 import corridor_env
 import gymnasium
-import h5py
 import numpy as np
 import pytest
 from corridor_env import SENSED, SUB_GOALS, CorridorEnv
@@ -16,7 +15,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import open_dataset, write_dataset
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
-from hypogoal.domains.gymnasium.engine import reader_of
+from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised
 
 NAMES = (*(f"layout[{number}]" for number in range(8)), "noise", "place[0]", "place[1]")
@@ -100,22 +99,6 @@ def test_collected_numbers_are_kept_with_their_names(tmp_path: Any) -> None:
         open_dataset(path).unlabelled()
 
 
-def test_a_file_says_what_its_observations_are(tmp_path: Any) -> None:
-    """Spec A8: pictures or numbers; what is neither is refused, and so is silence."""
-    path = tmp_path / "corridor.h5"
-    found = corridor_env.DOMAIN.collect(SMALL, 0, Progress("collect", 1, quiet=True))
-    write_dataset(path, found, domain="own", config={}, seed=0)
-    np.testing.assert_array_equal(open_dataset(path).unlabelled(), found.unlabelled.observations)
-    with h5py.File(path, "r+") as file:
-        file.attrs["observation_dtype"] = np.bytes_("int64")
-    with pytest.raises(UserError, match="observations of type int64"):
-        open_dataset(path)
-    with h5py.File(path, "r+") as file:
-        del file.attrs["observation_dtype"]
-    with pytest.raises(UserError, match="'observation_dtype'"):
-        open_dataset(path)
-
-
 def test_features_may_be_named() -> None:
     """Spec B6: one name for each number."""
     named = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=[f"f{number}" for number in range(11)])
@@ -124,36 +107,6 @@ def test_features_may_be_named() -> None:
         _ = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=["a", "b"]).observation_shape
     with pytest.raises(UserError, match="1 for 0"):
         _ = GymnasiumDomain(CorridorEnv, SUB_GOALS, features=["a"]).observation_shape
-
-
-class Drifting(CorridorEnv):
-    """No state comes twice, but for those that episodes begin in."""
-
-    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)  # type: ignore[assignment]
-    steps, shown = 0, 0
-
-    def reset(self, **arguments: Any) -> Any:
-        self.shown = 0
-        return super().reset(**arguments)
-
-    def step(self, action: int) -> Any:
-        self.steps = self.shown = self.steps + 1
-        return super().step(action)
-
-    def image(self) -> Any:
-        return np.array([self.cell, self.shown], np.float32)
-
-
-def test_an_engine_of_states_that_never_repeat_stays_small() -> None:
-    """Spec D2: what was met within the last ``memory`` steps can be drawn, and no more than twice as many are kept."""
-    engine = GymnasiumDomain(Drifting, SUB_GOALS, memory=50).make_engine(0, 2, 30)
-    rng, met = np.random.default_rng(0), []
-    for _ in range(400):
-        step = engine.step(rng.integers(2, size=2))
-        met += list(zip(step.next_ids.tolist(), engine.images(step.next_ids), strict=True))
-        for identity, values in met[-50:]:
-            np.testing.assert_array_equal(engine.images(np.array([identity]))[0], values)
-    assert engine.n_states > 700 and len(engine._ring) == len(engine._ids) == 100
 
 
 def test_numbers_are_standardised_and_cut() -> None:

@@ -20,7 +20,7 @@ from test_numbers import Says
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains.gymnasium.engine import reader_of
+from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.importing.taken import take
 from hypogoal.observations import PICTURE
 

@@ -7,13 +7,9 @@ import pytest
 from command_line import refuses, run, settings
 
 import hypogoal
-from hypogoal.cli import main
-from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain
-from hypogoal.options.tables import Episodes
-from hypogoal.stages.train_baseline import train_baseline
 
 TESTS = Path(__file__).parents[1]
 
@@ -41,17 +37,6 @@ def test_what_is_no_domain_is_refused() -> None:
         load_domain("own_domain:NOTHING")
 
 
-@pytest.mark.parametrize("agent", ["ppo", "dqn"])
-def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
-    """Spec E7, B6: on images that no 8 x 8 cells fill, of a layout whose shortest path nobody knows."""
-    train = ["train-baseline", "own_domain:ODD", "--agent", agent, "--out", str(tmp_path / agent), "-q"]
-    few = settings("steps=128", "max_episode_steps=20")
-    run(*train, *few)
-    facts = json.loads((tmp_path / agent / "layout.json").read_text(encoding="utf-8"))
-    assert (facts["shortest_path"], facts["random_success"], facts["random_episodes"]) == (None, None, 0)
-    assert json.loads((tmp_path / agent / "manifest.json").read_text())["config"]["domain"] == "own_domain:ODD"
-
-
 @pytest.mark.parametrize(
     ("domain", "message"),
     [
@@ -68,20 +53,6 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str,
     err = refuses(message, "collect", f"corridor_env:{domain}", "--out", tmp_path / "data.h5", "-q")
     assert domain != "RAISING" or "corridor_env.py, line " in err
     assert not list(tmp_path.glob("data.h5"))
-
-
-def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec B6, F5: in the table of episodes, the evaluation; by reward it would be another."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    few = {"steps": 2_048, "max_episode_steps": 20}
-    train_baseline("corridor_env:SWIFT", tmp_path / "ppo", quiet=True, **few)
-    episodes = Episodes.read(tmp_path / "ppo" / "episodes.csv")
-    succeeded, cut = episodes.succeeded, ~episodes.terminated
-    assert (succeeded == (episodes.length <= 5))[~cut].all() and succeeded[cut].any()
-    assert (~succeeded & (episodes.reward > 0)).any()
-    run("evaluate", tmp_path)
-    agent = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())["agents"][0]
-    assert agent["success"]["mean"] == pytest.approx(succeeded[-100:].mean())
 
 
 def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,17 +81,3 @@ def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeyp
         assert worlds == (set() if command[0] == "train-ensemble" else {True}), command
     env = hypogoal.load_options(folder / "meta").make_env()
     assert env.unwrapped.mirrored
-
-
-def test_baselines_play_in_the_world_of_the_data(tmp_path: Path) -> None:
-    """Spec E7: a wrong key ends episodes where it did in the data; not on states of another domain."""
-    data = tmp_path / "data.h5"
-    few = settings("wrong_key=ends", "heldout_layouts=1")
-    run("collect", "doorkey", "--out", data, *few, "-q")
-    steps = ["--set", "steps=64", "--set", "environments=2", "--layout-seed", "1", "-q"]
-    run("train-baseline", "doorkey", "--data", data, "--out", tmp_path / "ppo", *steps)
-    world = {"door_label": "open", "wrong_key": "ends"}
-    assert open_artefact(tmp_path / "ppo").config["domain_config"] == world
-    # On layout 1 a wrong key is in the way.
-    assert json.loads((tmp_path / "ppo" / "layout.json").read_text())["shortest_path"] is None
-    assert main(["train-baseline", "montezuma", "--data", str(data), "--out", str(tmp_path / "other"), *steps]) == 2

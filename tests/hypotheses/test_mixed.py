@@ -18,7 +18,7 @@ import hypogoal
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains.gymnasium.engine import reader_of
+from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, network_for
 from hypogoal.hypotheses.training import Training, train

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
-import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import rng_for
-from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
+from hypogoal.data import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium import engine as engines
-from hypogoal.observations import Observations, digest
-
-Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
-"""How to play when collecting states: (environment, observation, random numbers) -> action."""
-SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
+from hypogoal.domains.gymnasium.engine import GymnasiumEngine, Labels, make_checked
+from hypogoal.domains.gymnasium.play import Policy, collect
+from hypogoal.domains.gymnasium.reader import Reader, reader_of, resized
+from hypogoal.observations import DType, Shape
 
 
 class GymnasiumConfig(Config):
@@ -96,36 +92,36 @@ class GymnasiumDomain(Domain):
         self.make, self.memory, self.name = make, memory, name
         self.success, self._named, self.resize = success, tuple(features), resize
         self.config_class = config_class
-        generic, settings = GymnasiumConfig.model_fields, config_class.model_fields
-        self._own_settings = {name: field.default for name, field in settings.items() if name not in generic}
-        self.engine_settings = tuple(self._own_settings)
-        self.labels = engines.Labels(sub_goals, labels)
+        shared = GymnasiumConfig.model_fields
+        self.engine_settings = tuple(name for name in config_class.model_fields if name not in shared)
+        self.labels = Labels(sub_goals, labels)
         self.sub_goals = self.labels.names
-        by_goal = policy if isinstance(policy, Mapping) else {}
-        self.policies = tuple(by_goal.values()) or (None if isinstance(policy, Mapping) else policy,)
-        if not set(by_goal) <= set(self.sub_goals):
-            raise UserError(
-                "policies are given by sub-goal", ", ".join(by_goal), f"These are {', '.join(self.sub_goals)}."
-            )
         self.defaults = dict(defaults or {})
+        by_goal = policy if isinstance(policy, Mapping) else {}
+        self.policies: tuple[Policy | None, ...] = tuple(by_goal.values())
+        if not by_goal:
+            self.policies = (None if isinstance(policy, Mapping) else policy,)
+        if not by_goal.keys() <= {*self.sub_goals}:
+            do = f"These are {', '.join(self.sub_goals)}."
+            raise UserError("policies are given by sub-goal", ", ".join(by_goal), do)
 
     @cached_property
-    def reader(self) -> engines.Reader:
+    def reader(self) -> Reader:
         """Reads its observations."""
-        env = engines.make_checked(self.make_env)
-        reader = engines.reader_of(env)
+        env = make_checked(self.make_env)
+        reader = reader_of(env)
         env.close()
         if self._named and len(self._named) != len(reader.features):
             counts = f"{len(self._named)} for {len(reader.features)}"
             raise UserError("the number of feature names is wrong", counts, "Give one for each.")
-        return reader._replace(features=self._named or reader.features)
+        return replace(reader, features=self._named or reader.features)
 
     @property
-    def observation_shape(self) -> tuple[int, ...]:
+    def observation_shape(self) -> Shape:
         return self.reader.shape
 
     @property
-    def observation_dtype(self) -> np.dtype[Any]:
+    def observation_dtype(self) -> DType:
         return self.reader.dtype
 
     @property
@@ -138,13 +134,16 @@ class GymnasiumDomain(Domain):
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: the domain's own settings, defaults for those left out."""
-        env = self.make(**{**self._own_settings, **arguments})
-        return engines.resized(env, self.resize) if self.resize else env
+        fields = self.config_class.model_fields
+        defaults = {name: fields[name].default for name in self.engine_settings}
+        env = self.make(**{**defaults, **arguments})
+        return resized(env, self.resize) if self.resize else env
 
-    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> engines.GymnasiumEngine:
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
         """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory`` and the domain's own settings."""
-        memory, layouts = arguments.pop("memory", self.memory), arguments.pop("layouts", layout_seed)
-        return engines.GymnasiumEngine(
+        memory = arguments.pop("memory", self.memory)
+        layouts = arguments.pop("layouts", layout_seed)
+        return GymnasiumEngine(
             partial(self.make_env, **arguments),
             self.labels,
             layouts,
@@ -158,141 +157,4 @@ class GymnasiumDomain(Domain):
         return config.model_copy(update={"states": min(config.states, 200)})
 
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
-        """Labelled, unlabelled and held-out states reached in play on each layout, each picture once.
-
-        Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
-        and ``step``, counted from 0. Raises ``Unmet`` if the labelled states have one class only, or if there are no
-        unlabelled or no held-out states.
-        """
-        seeds_of_sets = [getattr(config, name) for name in SEEDS]
-        env = engines.make_checked(partial(self.make_env, **self.world(config.model_dump())))
-        progress.total = config.steps * sum(map(len, seeds_of_sets))
-        training: set[bytes] = set()  # digests of labelled and unlabelled states
-        sets: list[States] = []
-        for seeds in seeds_of_sets:
-            avoid = training if len(sets) == 2 else set()
-            states: list[_State] = []
-            for layout_seed in seeds:
-                rng = rng_for(seed, "play", layout_seed)
-                starts = engines.Starts(self.reader)
-                play = _LayoutPlay(self, env, config, layout_seed, rng, progress, starts, set(avoid))
-                states += play.collect()
-            sets.append(_states(states, self.reader, len(self.sub_goals)))
-            training.update(map(digest, sets[-1].observations))
-        env.close()
-        labelled, unlabelled, heldout = sets
-        where = f"steps={config.steps}"
-        for part, name in ((unlabelled, "unlabelled"), (heldout, "held-out")):
-            if not len(part.observations):
-                do = "Give other seeds, or more steps: states that look like training states do not count."
-                raise Unmet(f"there are no {name} states", where, do)
-        require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
-        return Collected(self.reader.shape, self.sub_goals, labelled, unlabelled, heldout, self.reader.features)
-
-
-class _State(NamedTuple):
-    """A state and its origin: layout seed, episode, step."""
-
-    observation: Observations
-    labels: NDArray[np.bool_]
-    origin: tuple[int, int, int]
-
-
-@dataclass
-class _LayoutPlay:
-    """Plays one layout and keeps its distinct states by combination of sub-goals, except those in ``seen``."""
-
-    domain: GymnasiumDomain
-    env: Any
-    config: GymnasiumConfig
-    layout_seed: int
-    rng: np.random.Generator
-    progress: Any
-    starts: engines.Starts
-    seen: set[bytes]  # digests
-    groups: dict[bytes, _Sample] = field(default_factory=dict)
-    episode: int = -1
-    elapsed: int = 0
-
-    def collect(self) -> list[_State]:
-        """An even sample of all combinations of sub-goals; the policies share the steps."""
-        policies = self.domain.policies
-        for number, policy in enumerate(policies):
-            first, end = (self.config.steps * turn // len(policies) for turn in (number, number + 1))
-            self.explore(policy, end - first)
-        return _even_sample(list(self.groups.values()), self.config.states, self.rng)
-
-    def explore(self, policy: Policy | None, steps: int) -> None:
-        """Play ``steps`` by a policy, or at random."""
-        count = int(self.env.action_space.n)
-        over = True
-        for _ in range(steps):
-            if over:
-                observation = self.begin()
-            if policy is None or self.rng.random() < self.config.explore:
-                action = int(self.rng.integers(count))
-            else:
-                action = int(policy(self.env, observation, self.rng))
-            observation, over = self.step(action)
-
-    def begin(self) -> Any:
-        """Begin an episode; returns its first observation."""
-        observation = self.starts.begin(self.env, self.layout_seed)
-        self.episode, self.elapsed = self.episode + 1, 0
-        self._keep(observation)
-        return observation
-
-    def step(self, action: int) -> tuple[Any, bool]:
-        """Play one step: the observation, and whether the episode is over."""
-        result = self.env.step(action)
-        if self.episode == self.elapsed == 0:
-            engines.check_step(result)
-        observation, _reward, terminated, truncated, _info = result
-        self.elapsed += 1
-        self._keep(observation)  # an episode's last state too: a sub-goal may hold in it
-        self.progress.advance()
-        return observation, bool(terminated or truncated) or self.elapsed >= self.config.max_episode_steps
-
-    def _keep(self, observation: Any) -> None:
-        picture = self.domain.reader.read(observation)
-        look = digest(picture)
-        if look not in self.seen:
-            self.seen.add(look)
-            labels = self.domain.labels.of(self.env)
-            sample = self.groups.setdefault(labels.tobytes(), _Sample(self.config.states))
-            sample.offer(_State(picture, labels, (self.layout_seed, self.episode, self.elapsed)), self.rng)
-
-
-class _Sample:
-    """A uniform sample of up to ``size`` of the states offered."""
-
-    def __init__(self, size: int):
-        self.size, self.offered = size, 0
-        self.kept: list[_State] = []
-
-    def offer(self, state: _State, rng: np.random.Generator) -> None:
-        """Offer a state, each once."""
-        self.offered += 1
-        if len(self.kept) < self.size:
-            self.kept.append(state)
-        elif (place := int(rng.integers(self.offered))) < self.size:
-            self.kept[place] = state
-
-
-def _even_sample(groups: list[_Sample], size: int, rng: np.random.Generator) -> list[_State]:
-    """Up to ``size`` states of all groups, as evenly as possible, in the order in which they were reached."""
-    left = size
-    states: list[_State] = []
-    for number, group in enumerate(sorted(groups, key=lambda group: len(group.kept))):
-        take = min(len(group.kept), left // (len(groups) - number))
-        # Not the first places: those favour the first states reached, or, in a full sample, exclude the next ones.
-        states += [group.kept[place] for place in rng.permutation(len(group.kept))[:take]]
-        left -= take
-    return sorted(states, key=lambda state: state.origin)
-
-
-def _states(states: list[_State], reader: engines.Reader, sub_goals: int) -> States:
-    observations = np.array([state.observation for state in states], reader.dtype).reshape(-1, *reader.shape)
-    labels = np.array([state.labels for state in states], np.bool_).reshape(-1, sub_goals)
-    origins = np.array([state.origin for state in states], np.int64).reshape(-1, 3)
-    return States(observations, labels, dict(zip(("layout_seed", "episode", "step"), origins.T, strict=True)))
+        return collect(self, config, seed, progress)

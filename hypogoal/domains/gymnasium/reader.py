@@ -1,0 +1,173 @@
+"""How observations of a Gymnasium space become arrays: a picture, numbers, or several of both by key.
+
+What is a picture and what numbers, ``hypogoal.domains.observations`` says; several by key are packed into one array of
+a structured type, see ``hypogoal.observations``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from hypogoal.core.arrays import Bytes
+from hypogoal.core.errors import UserError
+from hypogoal.domains.observations import CLEARLY, Reading, reading_of, resized_picture
+from hypogoal.observations import NUMBERS, PICTURE, DType, Shape, mixed_type
+
+UNREADABLE = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
+MIXED = "observations mix pictures with other values"
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads observations of a space as arrays of one shape and type.
+
+    Attributes:
+        features: the names of numbers, those of a ``Dict`` by its keys.
+        doubt: a warning that numbers may be meant as a picture; empty if there is none.
+        key: of a ``Dict`` that holds nothing but a picture, the picture's.
+        parts: by key, the readers of a ``Dict`` of pictures and numbers.
+    """
+
+    space: spaces.Space[Any]
+    shape: Shape
+    dtype: DType
+    features: tuple[str, ...] = ()
+    doubt: str = ""
+    key: str = ""
+    parts: Mapping[str, Reader] = field(default_factory=dict)
+
+    def read(self, observation: Any) -> Any:
+        """A copy (*shape) of an observation; ``UserError`` if it does not fit its space."""
+        if self.parts:
+            mixed = np.empty((), self.dtype)
+            for key, part in self.parts.items():
+                mixed[key] = part.read(observation[key])
+            return mixed
+        if self.key:
+            observation = observation[self.key]
+        elif not isinstance(self.space, spaces.Box):
+            observation = spaces.flatten(self.space, observation)
+        values = np.array(observation, order="C")
+        received = f"{values.dtype} {values.shape}"
+        if self.dtype == NUMBERS and values.dtype.kind in "iufb":
+            values = values.astype(NUMBERS)
+        shapes = (self.shape, self.space.shape)
+        if values.dtype != self.dtype or values.shape not in shapes:
+            do = f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}."
+            raise UserError("the environment gave an observation that does not fit its space", received, do)
+        return values.reshape(self.shape)
+
+
+def reader_of(env: gymnasium.Env) -> Reader:
+    """A reader of an environment's observations; a ``UserError`` if they are neither pictures nor numbers.
+
+    A ``Dict`` of pictures and others, each under a key of its own, is read by key. Other spaces that Gymnasium's
+    ``flatten`` accepts become float32 (D,) in its order.
+    """
+    return _reader(env.observation_space)
+
+
+def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
+    """A reader of a space, or of what a ``Dict`` has under ``key``."""
+    if isinstance(space, spaces.Dict) and any(map(_is_picture, space.values())):
+        return _by_key(space)
+    if isinstance(space, spaces.Box):
+        reading = _reading(space)
+        if reading.fault:
+            received = f"{space.dtype} {space.shape}"
+            where = f"{key}, {received}" if key else received
+            raise UserError(f"observations {reading.fault}", where, CLEARLY)
+        if reading.dtype == PICTURE:
+            return Reader(space, reading.shape, PICTURE)
+    return _numbers(space)
+
+
+def _reading(space: spaces.Box) -> Reading:
+    return reading_of(space.shape, space.dtype)
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    """Whether this is a picture, or refused because it may be."""
+    if not isinstance(space, spaces.Box):
+        return False
+    reading = _reading(space)
+    return reading.dtype == PICTURE or bool(reading.fault)
+
+
+def _by_key(space: spaces.Dict) -> Reader:
+    """A reader of a ``Dict`` with pictures; of one alone it is that picture."""
+    parts = {key: _reader(part, str(key)) for key, part in space.items()}
+    if len(parts) == 1:
+        [(key, part)] = parts.items()
+        return replace(part, key=key)
+    fields = {key: (part.dtype, part.shape) for key, part in parts.items()}
+    try:
+        dtype = mixed_type(fields)
+    except (ValueError, KeyError, TypeError):
+        do = "Give a Dict of pictures and numbers, with keys that can be file names."
+        raise UserError("the entries of the observations cannot be read by their keys", space, do) from None
+    doubt = max(part.doubt for part in parts.values())
+    return Reader(space, (), dtype, doubt=doubt, parts=parts)
+
+
+def _numbers(space: spaces.Space[Any]) -> Reader:
+    """A reader of a space without pictures, which Gymnasium flattens."""
+    features: list[str] = []
+    doubts = [""]
+    for name, part in _leaves(space):
+        if _is_picture(part):
+            names = [leaf for leaf, _ in _leaves(space)]
+            do = "Give a Dict with each picture under a key of its own, beside those of numbers."
+            raise UserError(MIXED, ", ".join(names), do)
+        if isinstance(part, spaces.Box):
+            doubts.append(_reading(part).doubt)
+        features += _names(name, part)
+    shape: Shape = (len(features),)
+    if isinstance(space, spaces.Box) and space.shape:
+        shape = space.shape
+    return Reader(space, shape, NUMBERS, tuple(features), max(doubts))
+
+
+def _leaves(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """By name, the spaces in a ``Dict`` or ``Tuple`` in the order of flattening; any other space itself."""
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        yield name, space
+        return
+    inner = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
+    for key, part in inner:
+        inner_name = f"{name}.{key}" if name else str(key)
+        yield from _leaves(part, inner_name)
+
+
+def _names(name: str, space: spaces.Space[Any]) -> list[str]:
+    """The names of a space's numbers."""
+    try:
+        size = spaces.flatdim(space)
+    except (NotImplementedError, ValueError):
+        do = "Wrap it so that it gives those, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
+        raise UserError(UNREADABLE, space, do) from None
+    if not name:
+        return [f"x{place}" for place in range(size)]
+    if size == 1:
+        return [name]
+    return [f"{name}[{place}]" for place in range(size)]
+
+
+def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
+    """The environment with pictures of side x side pixels, means over areas; ``UserError`` without pictures."""
+    reader = reader_of(env)
+    if reader.dtype != PICTURE:
+        raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
+
+    def small(observation: Any) -> Bytes:
+        return resized_picture(reader.read(observation), side, side)
+
+    channels = reader.shape[-1]
+    space = spaces.Box(0, 255, (side, side, channels), np.uint8)
+    return gymnasium.wrappers.TransformObservation(env, small, space)
