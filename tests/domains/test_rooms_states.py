@@ -17,8 +17,8 @@ from hypogoal.domains.rooms.states import (
     INNER,
     OBJECT,
     TILE,
-    _image,
     crossed_states,
+    image_of,
     labelled_states,
     tiles,
     unlabelled_states,
@@ -43,7 +43,7 @@ def test_a_scene_is_drawn_as_minigrid_draws_it() -> None:
     grid.set(4, 3, Ball("red"))
     ids = np.full((1, CELLS), FLOOR)
     ids[0, 0], ids[0, 2 * INNER + 3], ids[0, INNER + 1] = OBJECT + 1, OBJECT + 2, AGENT + 3
-    assert (_image(ids)[0] == grid.render(TILE, (2, 2), 3)).all()
+    assert (image_of(ids)[0] == grid.render(TILE, (2, 2), 3)).all()
     assert (tiles()[1] == Grid.render_tile(Wall(), tile_size=TILE).astype(np.uint8)).all()
 
 
@@ -92,20 +92,3 @@ def test_test_states_are_fully_crossed(names: tuple[str, ...]) -> None:
     combinations, counts = np.unique(factors, axis=0, return_counts=True)
     assert len(combinations) == 2 ** len(names)
     assert (counts == 7).all()
-
-
-@SETS
-def test_a_seed_gives_the_same_bytes_and_another_others(names: tuple[str, ...]) -> None:
-    """And so do the sets of one seed: what is not a factor is drawn anew in each."""
-    makers = (
-        lambda seed: labelled_states(64, seed, names),
-        lambda seed: unlabelled_states(64, 0.5, seed, names),
-        lambda seed: crossed_states(4, seed, names),
-    )
-    sets = {make: make(1).observations for make in makers}
-    for make, images in sets.items():
-        assert images.tobytes() == make(1).observations.tobytes()
-        assert images.tobytes() != make(2).observations.tobytes()
-    bodies = [{image.tobytes() for image in images} for images in sets.values()]
-    assert len(set.union(*bodies)) == sum(len(some) for some in bodies)
-    assert all(images.dtype == np.uint8 and images.shape[1:] == (48, 48, 3) for images in sets.values())

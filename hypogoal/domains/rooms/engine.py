@@ -1,0 +1,113 @@
+"""The rooms that an agent chooses among, and the settings that say which feature is rewarded (Spec H1)."""
+
+import numpy as np
+from numpy.random import Generator
+
+from hypogoal.core.arrays import Bools, Bytes, Ints
+from hypogoal.core.config import Config, setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Engine, Plan, Step
+from hypogoal.domains.rooms.states import FACTORS, drawn
+
+DECKS = 64  # sets of rooms of a layout; episodes cycle through them
+
+
+class RoomsConfig(Config):
+    """Settings of ``hypogoal collect rooms``."""
+
+    factors: tuple[str, ...] = setting(
+        ("shape", "place"),
+        "planted features: equal in labelled states",
+        choices=FACTORS,
+    )
+    truth: str = setting("shape", "the feature that rooms are rewarded for", choices=FACTORS)
+    rooms: int = setting(5, "rooms to choose among; one is right", low=2, high=32)
+    mix: float = setting(1.0, "share of unlabelled states with crossed features", low=0.0, high=1.0)
+    labelled: int = setting(256, "labelled states", low=4, high=100_000)
+    unlabelled: int = setting(2048, "unlabelled states", low=1, high=100_000)
+
+    @property
+    def column(self) -> int:
+        """The true feature's place among the planted ones; ``UserError`` if it has none of its own."""
+        twice = len({*self.factors}) < len(self.factors)
+        if twice or self.truth not in self.factors:
+            rule = "each feature is planted once, the true one among them"
+            where = f"factors={','.join(self.factors)}, truth={self.truth}"
+            raise UserError(rule, where, f"Choose from {', '.join(FACTORS)}.")
+        return self.factors.index(self.truth)
+
+
+class RoomsEngine(Engine):
+    """Environments of one layout: ``DECKS`` sets of rooms in turn. An action is the room to enter.
+
+    Only the right room has the true feature; every other feature is drawn evenly. Entering a room ends the episode,
+    with a reward of 1 if it is the right one. Before the rooms the agent sees a scene in which no feature holds. States
+    are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck. ``layout_seed`` draws the rooms. An episode has
+    one step, so it is never truncated.
+    """
+
+    resumes = True
+    n_states = 0
+
+    def __init__(
+        self,
+        layout_seed: int,
+        count: int,
+        max_steps: int,
+        config: RoomsConfig,
+    ):
+        rooms, factors = config.rooms, len(config.factors)
+        self.count, self.max_steps = count, max_steps
+        self.n_actions = rooms
+        self.n_states = DECKS * (1 + rooms)
+        rng = rng_for(layout_seed, "which-feature", "rooms")
+        right_room = rng.integers(rooms, size=(DECKS, 1))
+        right = np.arange(rooms) == right_room
+        holds = rng.random((DECKS, rooms, factors)) < 0.5
+        holds[..., config.column] = right
+        before = np.zeros((DECKS, factors), np.bool_)
+        in_rooms = holds.reshape(-1, factors)
+        every = np.concatenate([before, in_rooms])
+        self._pictures = drawn(every, config.factors, rng).observations
+        self._right = np.zeros(self.n_states, np.bool_)
+        self._right[DECKS:] = right.ravel()
+        self.observation_shape = self._pictures.shape[1:]
+        self.reset()
+
+    def reset(self) -> Ints:
+        self.ids = np.arange(self.count) % DECKS
+        self.elapsed = np.zeros(self.count, np.int64)
+        return self.ids.copy()
+
+    def step(self, actions: Ints) -> Step:
+        following = DECKS + self.ids * self.n_actions + actions
+        self.ids = (self.ids + self.count) % DECKS
+        over = np.ones(self.count, np.bool_)
+        rewards = self._right[following].astype(np.float32)
+        return Step(following, rewards, over, ~over)
+
+    def images(self, ids: Ints, out: Bytes | None = None) -> Bytes:
+        out = self.room_for(len(ids), out)
+        return np.take(self._pictures, ids, axis=0, out=out)
+
+    def labels(self, ids: Ints) -> Bools:
+        return self._right[ids][:, None]
+
+    def reachable(self) -> Ints:
+        return np.arange(self.n_states)
+
+    def plan(self, starts: Ints | None = None) -> Plan:
+        ids = self.reachable()
+        actions = np.arange(self.n_actions)
+        final = ids >= DECKS
+        column = ids[:, None]
+        following = np.repeat(column, len(actions), axis=1)
+        following[:DECKS] = ids[final].reshape(DECKS, -1)
+        return Plan(ids, actions, following, final, self._right)
+
+    def shortest_path(self) -> int:
+        return 1
+
+    def random_success(self, episodes: int, rng: Generator) -> float:
+        return 1 / self.n_actions
