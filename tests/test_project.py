@@ -162,14 +162,6 @@ def test_the_readme_is_short_and_its_targets_exist() -> None:
     assert {"demo", "test"} <= {*re.findall(r"(?:^|`)\s*make ([a-z]+)", text, re.M)} <= targets
 
 
-@pytest.fixture
-def clone(tmp_path: Path) -> Path:
-    """What make needs of a fresh clone."""
-    for name in ("Makefile", "pyproject.toml", "constraints.txt", ".gitignore"):
-        shutil.copy(ROOT / name, tmp_path)
-    return tmp_path
-
-
 def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run make in ``folder`` as from a shell, also when these tests themselves run under make."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "MFLAGS"))}
@@ -177,8 +169,11 @@ def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
-def test_set_up_is_done_once_and_again_when_the_versions_change(clone: Path) -> None:
+def test_set_up_is_done_once_and_again_when_the_versions_change(tmp_path: Path) -> None:
     """``make demo`` and ``make test`` set up by themselves; an unfit Python is one line, and nothing is left of it."""
+    clone = tmp_path
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, clone)
     done = make(clone, "setup", "PYTHON=false")
     assert done.returncode != 0 and "needs Python 3.11" in done.stderr and not (clone / ".venv").exists()
     create_it, install = "-m venv .venv", "pip install"
@@ -195,17 +190,6 @@ def test_set_up_is_done_once_and_again_when_the_versions_change(clone: Path) -> 
     os.utime(clone / "constraints.txt", (later, later))
     changed = make(clone, "-n", "test").stdout
     assert install in changed and create_it not in changed
-
-
-@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
-def test_results_are_not_committed_by_mistake(clone: Path) -> None:
-    """data/ and runs/ are ignored but for their README; sources are not."""
-    subprocess.run(["git", "init", "-q", "."], cwd=clone, check=True)
-    wanted = {"data/README.md", "runs/README.md", "hypogoal/data.py", "hypogoal/core/artefacts.py"}
-    unwanted = {"data/doorkey.h5", "runs/demo/manifest.json", ".venv/bin/python", "tests/__pycache__/a.pyc"}
-    paths = "\n".join(wanted | unwanted)
-    done = subprocess.run(["git", "check-ignore", "--stdin"], cwd=clone, input=paths, capture_output=True, text=True)
-    assert {*done.stdout.split()} == unwanted
 
 
 def test_formats_are_readable_without_hypogoal(

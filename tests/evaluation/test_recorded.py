@@ -17,6 +17,7 @@ from hypogoal.evaluation.recorded import (
     to_label,
     turning_patch,
 )
+from hypogoal.evaluation.recorded_page import lines_of
 from hypogoal.observations import packed
 
 
@@ -97,3 +98,15 @@ def test_sketches_are_alike_where_states_are() -> None:
     distance = np.linalg.norm(sketches[:, None] - sketches[None], axis=2)
     np.fill_diagonal(distance, np.inf)
     np.testing.assert_array_equal(kinds[distance.argmin(1)], kinds)
+
+
+def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:
+    """Of one classifier, which cannot disagree, the line says how many unlabelled states it predicts positive."""
+    rows = [
+        {"member": member, "negatives": 4, "false_positives": 0, "highest_negative": 0.1, "positive_unlabelled": share}
+        for member, share in enumerate((1.0, 0.25, 0.0))
+    ]
+    part = {"sub_goal": "door", "unlabelled": 8, "disagreement": 1.0, "members": rows}
+    assert "100.0% of 8 unlabelled states (the same prediction for all of them: member 0, 2)" in lines_of([part])[0]
+    alone = lines_of([part | {"members": rows[1:2]}])[0]
+    assert "the classifier predicts 25.0% of 8 unlabelled states positive" in alone and "disagree" not in alone

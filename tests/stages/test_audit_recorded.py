@@ -15,7 +15,6 @@ from command_line import refuses, run, settings
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.recorded import picture_of
-from hypogoal.evaluation.recorded_page import lines_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
 from tests import mixed
@@ -123,15 +122,3 @@ def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path) -> No
         ([audited / "audit"], "but ensemble is needed"),
     ]:
         refuses(fault, "audit", *words, "--out", out)
-
-
-def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:
-    """Of one classifier, which cannot disagree, the line says how many unlabelled states it predicts positive."""
-    rows = [
-        {"member": member, "negatives": 4, "false_positives": 0, "highest_negative": 0.1, "positive_unlabelled": share}
-        for member, share in enumerate((1.0, 0.25, 0.0))
-    ]
-    part = {"sub_goal": "door", "unlabelled": 8, "disagreement": 1.0, "members": rows}
-    assert "100.0% of 8 unlabelled states (the same prediction for all of them: member 0, 2)" in lines_of([part])[0]
-    alone = lines_of([part | {"members": rows[1:2]}])[0]
-    assert "the classifier predicts 25.0% of 8 unlabelled states positive" in alone and "disagree" not in alone
