@@ -35,21 +35,16 @@ def train_meta(
     Options start fresh, or continue as those of an ``options`` artefact. ``tensorboard``, a folder, gets the numbers of
     the log.
     """
-    from hypogoal.core.processes import prepare
-    from hypogoal.domains.base import load_domain
     from hypogoal.meta import training
     from hypogoal.options.tables import Episodes
     from hypogoal.stages import agents
 
-    device = prepare(call.device)
-    source = open_artefact(ensemble, "ensemble")
     practice = open_artefact(options, "options") if options else None
-    config = agents.settings_of(call, source, practice, FIXED)
-    domain = load_domain(source.config["domain"])
-    setup = training.Setup(domain, source.config, source.path, config, call.seed, device)
+    setup = agents.setup_of(call, ensemble, practice, FIXED)
+    steps = setup.config.steps
     settings = agents.description(setup, **_steps_spent(practice))
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training("meta", settings, inputs, config.steps, tensorboard) as work:
+    with call.training("meta", settings, inputs, steps, tensorboard) as work:
         loop = training.assemble(setup)
         if practice:
             training.continue_with(loop, practice)
@@ -58,7 +53,7 @@ def train_meta(
             if all(practice.config[key] == settings[key] for key in WORLD):
                 practised = Episodes.read(practice.path / Episodes.FILE)
                 loop.recorder.episodes.extend(practised.rows())
-        agents.learn(work, setup, loop, config.steps)
+        agents.learn(work, setup, loop, steps)
     episodes = loop.recorder.episodes
     numbers = episodes.counts() | episodes.recent()
     return Done(outcome_of(numbers), ("evaluate", call.out.parent))

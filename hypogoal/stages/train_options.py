@@ -26,18 +26,13 @@ def train_options(
 
     ``options``, an artefact, are trained further. ``tensorboard``, a folder, gets the numbers of the log.
     """
-    from hypogoal.core.processes import prepare
-    from hypogoal.domains.base import load_domain
     from hypogoal.evaluation.nearness import distances_of
     from hypogoal.meta import training
     from hypogoal.stages import agents
 
-    device = prepare(call.device)
-    source = open_artefact(ensemble, "ensemble")
     practice = open_artefact(options, "options") if options else None
-    config = agents.settings_of(call, source, practice, FIXED)
-    domain = load_domain(source.config["domain"])
-    setup = training.Setup(domain, source.config, source.path, config, call.seed, device)
+    setup = agents.setup_of(call, ensemble, practice, FIXED)
+    config = setup.config
     steps = config.steps
     if config.restart_options:
         steps *= setup.options
@@ -48,24 +43,19 @@ def train_options(
         if practice:
             training.continue_with(loop, practice)
         solved = agents.learn(work, setup, loop, steps, config.until)
-        if domain.measures and loop.engine.position_names:
-            away = distances_of(domain, source.config["sub_goals"], setup.members)
-            loop.recorder.write_executions(work.draft.files, away)
+        recorder = loop.recorder
+        if setup.domain.measures and loop.engine.position_names:
+            away = distances_of(setup.domain, setup.source["sub_goals"], setup.members)
+            recorder.write_executions(work.draft.files, away)
         if config.until:
-            settings["ended_at"] = loop.recorder.steps  # for the manifest, which comes last
+            settings["ended_at"] = recorder.steps  # for the manifest, which comes last
             settings["until_reached"] = solved
-    recorder = loop.recorder
-    numbers: dict[str, Any] = {**recorder.episodes.counts(), **recorder.recent(restarted=config.restart_options)}
+    counts: dict[str, Any] = dict(recorder.episodes.counts())
+    numbers = counts | recorder.recent(restarted=config.restart_options)
     if config.until:
         numbers[f"until={config.until:g}"] = "reached" if solved else "not reached"
-    return Done(outcome_of(numbers), _next(call, ensemble, config))
-
-
-def _next(call: Call, ensemble: Path, config: Any) -> tuple[object, ...]:
-    """Choose among the options; where each began an episode, no episodes are left to choose in."""
     run = call.out.parent
-    if config.restart_options:
-        return "evaluate", run
-    preset = ["--preset", call.preset] if call.preset else []
-    inputs = [ensemble, "--options", call.out]
-    return "train-meta", *inputs, *preset, "--out", run / "meta"
+    if config.restart_options:  # no episodes are left to choose in
+        return Done(outcome_of(numbers), ("evaluate", run))
+    then = ("train-meta", ensemble, "--options", call.out, "--out", run / "meta")
+    return Done(outcome_of(numbers), then)

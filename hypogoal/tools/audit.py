@@ -41,17 +41,18 @@ def audit(
     from hypogoal.core.processes import prepare
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
-    from hypogoal.evaluation.audit import lines_of, random_play, report_of, target_of, terminations_of
+    from hypogoal.evaluation import audit as played
     from hypogoal.evaluation.numbers import plain
     from hypogoal.learners.world import columns_of
     from hypogoal.meta.training import Setup, assemble
     from hypogoal.stages import agents
 
     device = prepare(call.device)
-    config, world = call.settings(domain), load_domain(domain)
+    config = call.settings(domain)
+    world = load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
     member = member or 0
-    target = target_of(classifier, sub_goal, member, domain, device)
+    target = played.target_of(classifier, sub_goal, member, domain, device)
     edges = _edges(config, target.threshold)
     ensemble_config = {
         "sub_goals": [sub_goal],
@@ -62,13 +63,15 @@ def audit(
     setup = Setup(world, ensemble_config, Path(), config, call.seed, device)
     settings = agents.description(setup, classifier=classifier, member=member)
     with call.training("audit", settings, target.inputs, config.steps) as work:
-        loop = assemble(setup, terminations_of(target, np.array(edges)))
+        loop = assemble(setup, played.terminations_of(target, np.array(edges)))
         agents.learn(work, setup, loop, config.steps)
-        report = report_of(loop, edges, world.sub_goals, work.draft.files)
-        report["random_play"] = random_play(loop, column, rng_for(call.seed, "random-play"))
+        files = work.draft.files
+        rng = rng_for(call.seed, "random-play")
+        report = played.report_of(loop, edges, world.sub_goals, files)
+        report["random_play"] = played.random_play(loop, column, rng)
         text = json.dumps(plain(report), indent=1)
-        (work.draft.files / "audit.json").write_text(text + "\n", encoding="utf-8")
-    return Done([*lines_of(report)])
+        (files / "audit.json").write_text(text + "\n", encoding="utf-8")
+    return Done([*played.lines_of(report)])
 
 
 def _edges(config: Any, threshold: float) -> list[float]:
