@@ -42,7 +42,6 @@ LISTED = {  # every stage in its order, in a line; it is loaded when it is calle
     "report": "Draw the report of an evaluated run: one HTML file.",
     "audit": "How often, and where, do policies fool a success classifier?",
 }
-STAGES: dict[str, "Stage"] = {}  # by command, those that were loaded
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
 Preset = Annotated[str | None, Option("--preset", help="demo, paper, or your .toml file.")]
@@ -144,19 +143,15 @@ def load_stage(name: str) -> "Stage":
     if name not in LISTED:
         raise UserError("this is no stage", name, f"Choose one of {', '.join(LISTED)}.")
     folder = "tools" if name == "audit" else "stages"
-    import_module(f"hypogoal.{folder}.{name.replace('-', '_')}")
-    return STAGES[name]
+    word = name.replace("-", "_")
+    function: Any = getattr(import_module(f"hypogoal.{folder}.{word}"), word)
+    made: Stage = function.stage
+    return made
 
 
 def stage(example: str, **more: Any) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
-    """Make a function a stage; ``example`` and ``more`` are of :class:`Stage`."""
-
-    def register(function: Callable[..., Done]) -> Callable[..., "Made"]:
-        made = Stage(function, example, **more)
-        STAGES[made.name] = made
-        return made.python()
-
-    return register
+    """Make a function a stage, its attribute ``stage``; ``example`` and ``more`` are of :class:`Stage`."""
+    return lambda function: Stage(function, example, **more).python()
 
 
 @dataclass
@@ -209,6 +204,7 @@ class Stage:
         settings = Parameter("settings", Parameter.VAR_KEYWORD)
         parameters = [self.source, out, *self.inputs, *self.options, settings]
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.stage = self  # type: ignore[attr-defined]
         return called
 
     def parsed(self, words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -244,10 +240,9 @@ class Stage:
         source = self.source.replace(kind=Parameter.KEYWORD_ONLY)
         parameters = [source, *self.inputs, self.out, *self.options, *self._settings()]
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        summary, *_ = str(self.function.__doc__).splitlines()
         example = f"Example:\n\n[bold]hypogoal {self.example}[/bold]"
         alone = typer.Typer(add_completion=False)
-        alone.command(self.name, help=summary, epilog=example)(called)
+        alone.command(self.name, help=LISTED[self.name], epilog=example)(called)
         return typer.main.get_command(alone)
 
     def run(
