@@ -94,9 +94,9 @@ def is_resumable(out: Path) -> bool:
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """All files by their place, hidden ones too; manifests without ``took`` and this folder's own place.
+    """All files by their place, hidden ones too; manifests without ``took`` and the place of the folder.
 
-    Logs of cells are left out: they say when they ran.
+    Logs of cells are left out: they say when they ran. What the unbroken run has made is copied, its place with it.
     """
     found: dict[str, object] = {}
     for path in sorted(folder.rglob("*")):
@@ -104,7 +104,8 @@ def contents(folder: Path) -> dict[str, object]:
         if path.is_file() and not name.startswith("sweep/logs"):
             found[name] = path.read_bytes()
             if path.name == "manifest.json":
-                found[name] = {**json.loads(path.read_text().replace(str(folder), "")), "took": 0}
+                text = path.read_text().replace(str(folder), "").replace(str(folder.with_name("whole")), "")
+                found[name] = {**json.loads(text), "took": 0}
     return found
 
 
