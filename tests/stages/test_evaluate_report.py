@@ -97,7 +97,7 @@ def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypat
         assert line in run("show", path).out.splitlines()
     assert json.loads(run("show", tmp_path / "evaluation", "--json").out)["numbers"] == metrics
     (tmp_path / "evaluation" / "metrics.json").write_text("{}", encoding="utf-8")
-    refuses("the evaluation's numbers are damaged", "show", tmp_path)
+    refuses("metrics.json is changed since it was written", "show", tmp_path)
 
 
 class Structure(HTMLParser):
