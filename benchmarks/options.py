@@ -4,9 +4,9 @@
 
 The plain update is the paper's network and Double-DQN as one would write them down, anew: the images of every step of
 32 executions up to the sampled step, float32 NCHW, three passes (the online network before and after the step, the
-target after it), Adam as it comes. Ours is ``RecurrentLearner``: distinct images once, and of these distinct patches;
-with ``recurrence=none`` the sampled steps alone. The light update is that of all members at once, with its own batch of
-128. All are fed executions of random play.
+target after it), Adam as it comes. Ours is ``PaperLearner``: features of distinct images once; with
+``recurrence=1`` the sampled steps alone. The light update is that of all members at once, with its own batch of 128.
+All are fed executions of random play.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
 from hypogoal.meta.config import TrainOptionsConfig  # noqa: E402
 from hypogoal.options.choosers import RandomChooser  # noqa: E402
+from hypogoal.options.conv_gru import Lived, PaperLearner, left_aligned  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.loop import OptionLoop  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
-from hypogoal.options.recurrent import RecurrentLearner, Rows  # noqa: E402
 from hypogoal.options.termination import Terminations  # noqa: E402
 
 LAYOUT = 100
@@ -80,23 +80,22 @@ class PlainLearner:
 
     def update(self) -> None:
         """One update with 32 transitions."""
-        data = self.replay.data
         indices, weights = self.replay.sample(32, self.rng)
-        place = data.place[indices].astype(np.int64)
-        steps = np.minimum(np.arange(int(place.max()) + 1), place[:, None])  # padded with the last step
-        prefix = indices[:, None] - place[:, None] + steps
-        here, after = data.state[prefix].astype(np.int64), data.next_state[prefix].astype(np.int64)
-        row, last = torch.arange(32), torch.from_numpy(place)
+        steps = self.replay.data.at(indices)
+        last = torch.from_numpy(steps.length.astype(np.int64) - 1)
+        paths = left_aligned(steps.path.astype(np.int64), steps.length + 1)  # padded with the last state
+        here, after = paths[:, :-1], paths[:, 1:]
+        row = torch.arange(32)
         self.online.train()
         values = self.online(self._images(here))[row, last]
         following = self._images(after)
         with torch.no_grad():
             best = self.online(following)[row, last].argmax(1)
             ahead = self.target(following)[row, last].gather(1, best[:, None])[:, 0]
-        reward = torch.from_numpy(self.reached.of(data.next_state[indices].astype(np.int64))[:, 0]).float()
-        end = torch.from_numpy((data.reached | data.terminated)[indices])
-        goal = reward + 0.95 * ahead * ~end
-        taken = values.gather(1, torch.from_numpy(data.action[indices].astype(np.int64))[:, None])[:, 0]
+        reached = torch.from_numpy(self.reached.of(steps.path[:, -1].astype(np.int64))[:, 0])
+        end = reached | torch.from_numpy(steps.terminated)
+        goal = reached.float() + 0.95 * ahead * ~end
+        taken = values.gather(1, torch.from_numpy(steps.action.astype(np.int64))[:, None])[:, 0]
         errors = nn.functional.huber_loss(taken, goal, reduction="none")
         loss = (errors * torch.from_numpy(weights)).mean()
         self.adam.zero_grad()
@@ -119,7 +118,7 @@ def played(config: TrainOptionsConfig, options: int, steps: int) -> OptionLoop:
     """A loop after ``steps`` of random play, nothing learned."""
     engine = DoorKeyEngine(LAYOUT, config.environments)
     verdicts = terminations(engine, options)
-    learner = (RecurrentLearner if config.network == "paper" else LightLearner)(engine, verdicts, config, 0)
+    learner = (PaperLearner if config.network == "paper" else LightLearner)(engine, verdicts, config, 0)
     chooser = RandomChooser(rng_for(0, "choice"))
     loop = OptionLoop(engine, verdicts, learner, chooser, Recorder(options, engine), config, gamma=1.0)
     while loop.recorder.steps < steps:
@@ -132,11 +131,11 @@ def learning(loop: OptionLoop, updates: int) -> float:
     learner = loop.learner
     times = []
     for _ in range(updates + 1):
-        if isinstance(learner, RecurrentLearner):
+        if isinstance(learner, PaperLearner):
             learner.members[0].due = learner.config.update_interval
         else:
             assert isinstance(learner, LightLearner)
-            learner._due = learner.config.update_interval
+            learner.due = learner.config.update_interval
         times.append(timing.cpu_seconds(learner.learn))
     return statistics.median(times[1:])
 
@@ -144,9 +143,9 @@ def learning(loop: OptionLoop, updates: int) -> float:
 def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The literal and the light update against the plain one; the light one by number of members."""
     paper = played(config_of("warm_up=100", preset="paper"), 1, 2_000)
-    alone = played(config_of("warm_up=100", "recurrence=none", preset="paper"), 1, 2_000)
+    alone = played(config_of("warm_up=100", "recurrence=1", preset="paper"), 1, 2_000)
     learner = paper.learner
-    assert isinstance(learner, RecurrentLearner) and isinstance(paper.engine, DoorKeyEngine)
+    assert isinstance(learner, PaperLearner) and isinstance(paper.engine, DoorKeyEngine)
     plain = PlainLearner(paper.engine, copy.deepcopy(learner.members[0].replay), paper.terminations)
     light = {members: played(config_of("warm_up=100"), members, 4_000) for members in MEMBERS}
 
@@ -158,7 +157,7 @@ def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[s
         {
             "paper's network, plain": plainly,
             "paper's network, ours": lambda: learning(paper, count),
-            "the same, recurrence=none": lambda: learning(alone, count),
+            "the same, recurrence=1": lambda: learning(alone, count),
             "light, 15 members at once": lambda: learning(light[15], 20 * count),
         },
         repeats,
@@ -177,12 +176,13 @@ def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[s
 def replay_figures(repeats: int) -> dict[str, float]:
     """Memory of 15 full replays of 1e5 transitions, and a sample of 32 with its new priorities."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    replays = [PrioritisedReplay(100_000, Rows, alpha=0.6, beta=0.4) for _ in range(15)]
+    replays = [PrioritisedReplay(Lived.empty(100_000, 10)) for _ in range(15)]
     rng = np.random.default_rng(0)
     for replay in replays:
         for _ in range(100):
-            replay.add(Rows.cast(*rng.integers(0, 2, (len(Rows.names()), 1_000))))
-    held = sum(part.nbytes for replay in replays for part in (*replay.tree.levels, *vars(replay.data).values()))
+            steps = rng.integers(0, 2, (1_000, 11))
+            replay.add(Lived.cast(steps, *steps[:, :3].T))
+    held = sum(part.nbytes for replay in replays for part in (replay.priorities, *vars(replay.data).values()))
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
 
     def sampled() -> None:

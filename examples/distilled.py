@@ -32,16 +32,14 @@ import torch
 from torch import Tensor, nn
 
 import hypogoal
-from hypogoal.core.drawing import DrawsFrom
-from hypogoal.core.seeding import torch_generator
-from hypogoal.learners.double_dqn import descend
+from hypogoal.learners.double_dqn import DoubleDQN, descend
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
-from hypogoal.options.choosers import Ids
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.learner import Learner as AnyLearner
 from hypogoal.options.learner import Transitions
 from hypogoal.options.light import GRADIENT_NORM, LightLearner
-from hypogoal.options.networks import LightQNetwork, apply_to_states
+from hypogoal.options.networks import apply_to_states
+from hypogoal.options.parts import Ids
 from hypogoal.options.planned import FAR, distances, places_of, plan_of
 
 CELL = 8  # pixels
@@ -119,21 +117,17 @@ class Learner(LightLearner):
         UserError: nobody knows what follows in this engine, or options do not end at a single positive prediction.
     """
 
-    CHANGING = (*AnyLearner.CHANGING, "online", "optimiser", "best", "kind", "steps", "updates", "_due")
+    CHANGING = (*AnyLearner.CHANGING, "networks", "best", "kind", "steps", "due")
 
     def build(self, config: Any, seed: int) -> None:
         assert isinstance(config, TrainOptionsConfig | TrainMetaConfig)
         self.last = config.steps
         self.actions = plan_of(self.engine, self.terminations, config, self.engine.ids[:1]).actions
         self.exploration = Exploration(config, self.engine.count, len(self.actions), self.rng)
-        shape, actions = self.engine.observation_shape, self.engine.n_actions
-        with DrawsFrom(torch_generator(seed, "option-weights")):
-            network = LightQNetwork(shape, self.options, actions, self.engine.standard, config.embedding)
-        self.online = self.target = network.to(self.device)  # best actions are known: no target moves
-        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
-        self.best = np.zeros((0, self.options), np.min_scalar_type(2**actions - 1))
+        self.networks = DoubleDQN(self.network(config, seed), config, GRADIENT_NORM)  # the target's is not used
+        self.best = np.zeros((0, self.options), np.min_scalar_type(2**self.engine.n_actions - 1))
         self.kind = np.zeros(0, np.uint8)
-        self.steps = self.updates = self._due = 0
+        self.steps = self.due = 0
         self.loaded = False
 
     @staticmethod
@@ -160,12 +154,12 @@ class Learner(LightLearner):
             return
         self.kind[moved.ids] = VISITED
         self.steps += len(moved.ids)
-        self._due += len(moved.ids)
+        self.due += len(moved.ids)
 
     def learn(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
-        while self._due >= self.config.update_interval:
-            self._due -= self.config.update_interval
+        while self.due >= self.config.update_interval:
+            self.due -= self.config.update_interval
             numbers = self._update()
         return numbers
 
@@ -203,15 +197,16 @@ class Learner(LightLearner):
         best = (self.best[states][:, :, None] >> np.arange(self.engine.n_actions) & 1).astype(np.bool_)
         leads = best.any(axis=2)
         best[~leads] = True  # where no way leads to a sub-goal nothing is wrong
-        scores = apply_to_states(self.online, self.engine, states).log_softmax(2)
+        networks = self.networks
+        scores = apply_to_states(networks.online, self.engine, states).log_softmax(2)
         of_best = scores.masked_fill(self.tensor(~best), -torch.inf).logsumexp(2)
         loss = of_best.neg().sum() / max(1, int(leads.sum()))
         fallen = min(1.0, self.steps / self.last)
-        for group in self.optimiser.param_groups:
+        for group in networks.optimiser.param_groups:
             group["lr"] = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
-        where = f"in the batch of update {self.updates}, step {self.steps}"
-        descend(loss, self.online, self.optimiser, "the options", where, GRADIENT_NORM)
-        self.updates += 1
+        where = f"in the batch of update {networks.updates}, step {self.steps}"
+        descend(loss, networks.online, networks.optimiser, "the options", where, GRADIENT_NORM)
+        networks.updates += 1
         planned = int((self.kind >= PLANNED).sum())
         return {"option_loss": float(loss.detach()), "planned_states": float(planned)}
 

@@ -95,7 +95,7 @@ def method_of(config: Mapping[str, Any], place: str) -> str:
     if config.get("termination") == "oracle":
         return "oracle"
     if config.get("network") == "paper":
-        return "literal" if config.get("recurrence") != "none" else "literal-none"
+        return "literal-none" if config.get("recurrence") in (1, "none") else "literal"
     return next(name for name in METHODS if f"-{name}-" in f"-{place}-")
 
 

@@ -19,10 +19,10 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
-from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
 
 CONFIG = OptionConfig.of(environments=4, warm_up=20, update_interval=4, option_batch=16)
@@ -58,8 +58,8 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
     """Spec G3: the option, the batch and the step are named; the weights stay as they were."""
     loop = loop_of(Corridor(4))
     play(loop, 20)
-    heads = loop.learner.online.heads
-    of_gradient = r"a gradient of the options is (nan|inf) in the batch of update \d+, step"
+    heads = loop.learner.networks.online.heads
+    of_gradient = r"a gradient of options \[0, 1\] is (nan|inf) in the batch of update \d+, step"
     of_loss = r"the loss of options \[1\] is nan in the batch of update \d+"
     stops(loop.learner._update, heads.weight, heads.bias.detach().view(2, -1)[1], of_gradient, of_loss)
 
@@ -70,7 +70,7 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None
     engine = Corridor(1)
     verdicts = oracle_terminations(engine, (0, 1))
     config = OptionConfig.of(network="paper", experience="own", environments=1, warm_up=4, option_batch=4)
-    learner = RecurrentLearner(engine, verdicts, config, 0)
+    learner = PaperLearner(engine, verdicts, config, 0)
     loop = OptionLoop(
         engine, verdicts, learner, RandomChooser(np.random.default_rng(0)), Recorder(2, engine), config, gamma=0.9
     )
@@ -78,8 +78,8 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None
         loop.step()
     member = learner.members[1]
     first, *_, last = member.online.parameters()
-    of_gradient = r"a gradient of option 1 is (nan|inf) in the batch of its update \d+, its"
-    of_loss = r"the loss of option 1 is nan in the batch of its update \d+, its step"
+    of_gradient = r"a gradient of options \[1\] is (nan|inf) in the batch of update \d+, step"
+    of_loss = r"the loss of options \[1\] is nan in the batch of update \d+, step"
     stops(lambda: learner._update(1, member), first, last.detach(), of_gradient, of_loss)
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation.curves import scores
-from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
+from hypogoal.options.choosers import Chooser, Offered, Outcome
 from hypogoal.options.loop import NONE, OptionLoop
+from hypogoal.options.parts import Ids
 from hypogoal.options.recording import Recorder
 
 ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout: 512 episodes,

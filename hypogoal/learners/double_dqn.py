@@ -1,15 +1,21 @@
-"""Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies, exploration schedules, and steps."""
+"""Double Q-learning (Van Hasselt, Guez and Silver 2016): targets, one update, the target network, exploration."""
 
+import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import huber_loss
 from torch.nn.utils import clip_grad_norm_
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import NumericalError
+from hypogoal.core.tensors import load_into
 
 SOFT = 0.01  # how far a target network follows at an update where it is not copied now and then
 
@@ -45,21 +51,79 @@ def double_q_targets(
     return targets.clamp(0.0, 1.0) if bounded else targets
 
 
-@torch.no_grad()
-def target_rate(updates: int, interval: int) -> float:
-    """How far the target network follows after so many updates: all the way every ``interval``; 0: a little at each."""
-    if interval == 0:
-        return SOFT
-    return 1.0 if updates % interval == 0 else 0.0
+@dataclass(frozen=True)
+class Batch:
+    """Transitions of O policies to learn from, n of each."""
+
+    actions: Tensor  # int64 (n,)
+    rewards: Tensor  # float (n, O)
+    terminal: Tensor  # bool (n, O), nothing follows
+    discounts: float | Tensor  # of what follows, float or (n, 1)
+    weights: Tensor  # float (n,)
+    learns: Tensor  # bool (n, O), which policies learn from which transitions
 
 
-def follow(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
-    """Move a target network's tensors towards the online network's by ``tau``; integers, and all at 1, are copied."""
-    for ours, theirs in zip(target, online, strict=True):
-        if tau < 1 and ours.is_floating_point():
-            ours.lerp_(theirs, tau)
-        else:
-            ours.copy_(theirs)
+class DoubleDQN(Resumable):
+    """An online network of values (n, O, A), its optimiser, and the target network that follows it.
+
+    ``config`` is a ``LearnerConfig``; gradients are cut to the norm ``largest``.
+    """
+
+    CHANGING = ("online", "target", "optimiser", "updates")
+
+    def __init__(self, online: nn.Module, config: Any, largest: float = math.inf):
+        self.online, self.config, self.largest = online, config, largest
+        self.target = copy.deepcopy(online).requires_grad_(False).eval()
+        self.optimiser = torch.optim.Adam(online.parameters(), lr=config.option_learning_rate, fused=True)
+        self.updates = 0
+
+    def update(
+        self,
+        values: Tensor,
+        next_online: Tensor,
+        next_target: Tensor,
+        batch: Batch,
+        options: Sequence[int],
+        step: int,
+    ) -> tuple[float, NDArray[np.float32]]:
+        """Spec D2: a step down the Huber loss of a batch; then the target network follows.
+
+        ``values`` are the online network's in the states, with gradients; ``next_online`` and ``next_target`` both
+        networks' in the next states; all float (n, O, A). ``options`` (O,) and ``step`` are for errors. Returns the
+        loss, and each transition's largest absolute error (n,).
+        """
+        gamma, bounded = batch.discounts, self.config.bounded_values
+        targets = double_q_targets(batch.rewards, batch.terminal, next_online, next_target, gamma, bounded=bounded)
+        taken = values.gather(2, batch.actions[:, None, None].expand(-1, len(options), 1)).squeeze(2)
+        errors = (taken - targets) * batch.learns
+        losses = huber_loss(errors, torch.zeros_like(errors), reduction="none")
+        loss = (losses.sum(1) * batch.weights).mean()
+        if not loss.isfinite():
+            wrong = (~losses.isfinite()).any(0).nonzero().flatten()
+            options = [options[column] for column in wrong.tolist()]
+        where = f"in the batch of update {self.updates}, step {step}"
+        descend(loss, self.online, self.optimiser, f"options {list(options)}", where, self.largest)
+        self.updates += 1
+        self._follow()
+        return float(loss.detach()), errors.detach().abs().amax(1).cpu().numpy()
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """Copy the online network every ``target_interval`` updates; where that is 0, move a little towards it."""
+        interval = self.config.target_interval
+        if interval and self.updates % interval:
+            return
+        ours, theirs = self.target.state_dict(), self.online.state_dict()
+        for name, value in ours.items():
+            if interval or not value.is_floating_point():
+                value.copy_(theirs[name])
+            else:
+                value.lerp_(theirs[name], SOFT)
+
+    def load(self, weights: Mapping[str, Tensor], where: str) -> None:
+        """Go on with these weights; a ``UserError`` that says ``where`` if they do not fit."""
+        load_into(self.online, weights, where)
+        self.target.load_state_dict(weights)
 
 
 def descend(

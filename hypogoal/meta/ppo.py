@@ -21,8 +21,9 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, meta_network
 from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.observations import PICTURE
-from hypogoal.options.choosers import FILE, Chooser, Ids, Offered, Outcome
+from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
 from hypogoal.options.networks import apply_to_states
+from hypogoal.options.parts import Ids
 
 GRADIENT_NORM = 0.5
 CLIP = 0.2  # of the ratio of probabilities: Schulman et al. 2017

@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.options.parts import Part, load_part
+from hypogoal.options.parts import Flags, Ids, Part, load_part
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,26 +24,25 @@ CHOOSERS = {
     "ppo": "hypogoal.meta.ppo:MetaPolicy",
 }
 
+Offered: TypeAlias = Flags  # (n, O), the options that may be chosen
 FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
-Ids = NDArray[np.int64]  # (n,), of environments, states or options
-Offered = NDArray[np.bool_]  # (n, O), the options that may be chosen
 
 
 @dataclass(frozen=True)
 class Outcome:
     """Finished option executions, arrays of length n."""
 
-    environments: NDArray[np.int64]  # in which they ran
-    options: NDArray[np.int64]  # that they were of
-    began: NDArray[np.int64]  # the states in which these were chosen
-    reached: NDArray[np.bool_]  # the options' own classifiers ended them
-    inside: NDArray[np.bool_]  # these were positive already where they began
+    environments: Ids  # in which they ran
+    options: Ids  # that they were of
+    began: Ids  # the states in which these were chosen
+    reached: Flags  # the options' own classifiers ended them
+    inside: Flags  # these were positive already where they began
     returns: NDArray[np.float64]  # the environment's rewards inside the option, discounted from its start
-    durations: NDArray[np.int64]  # tau, the options' steps
+    durations: Ids  # tau, the options' steps
     discounts: NDArray[np.float64]  # gamma ** tau, for the state reached
-    next_ids: NDArray[np.int64]  # the states reached
-    terminated: NDArray[np.bool_]  # the task is over, nothing follows
-    truncated: NDArray[np.bool_]  # the episode was cut, at its limit or because the next option begins at a start
+    next_ids: Ids  # the states reached
+    terminated: Flags  # the task is over, nothing follows
+    truncated: Flags  # the episode was cut, at its limit or because the next option begins at a start
 
 
 class Chooser(Part, ABC):

@@ -94,12 +94,13 @@ class LightConfig(LearnerConfig):
 class PaperConfig(LearnerConfig):
     """What only network=paper has."""
 
-    recurrence: str = setting(
-        "execution",
-        "what the conv-GRU remembers: its execution, from the option's first step on; or none, each step a sequence "
-        "of its own",
-        source="execution: paper; none: the authors' code",
-        choices=("execution", "none"),
+    recurrence: int = setting(
+        1,
+        "states of its execution that the conv-GRU sees, the last of them the present one; the option's timeout: all",
+        unit="steps",
+        source="1: the authors' code",
+        low=1,
+        high=1_000,
     )
 
 

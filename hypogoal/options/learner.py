@@ -17,16 +17,15 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.observations import Observations
-from hypogoal.options.choosers import Ids
 from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
-from hypogoal.options.parts import Part, load_part
+from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part
 from hypogoal.options.termination import ORACLE, Terminations
 
-COUNTERS = ("option_steps", "steps_since_positive")
+FILE = "options.safetensors"  # of an artefact
 LEARNERS = {
     "light": "hypogoal.options.light:LightLearner",
-    "paper": "hypogoal.options.recurrent:RecurrentLearner",
+    "paper": "hypogoal.options.conv_gru:PaperLearner",
     "planned": "hypogoal.options.planned:PlannedLearner",
 }
 
@@ -52,7 +51,7 @@ class SavedOptions:
 
         A ``UserError`` where the weights are not those of so many options.
         """
-        actions = len(self.weights[layer]) // heads if layer in self.weights else 0
+        actions = len(self.weights.get(layer, ())) // heads
         if not actions:
             raise UserError("the weights do not fit the manifest", f"{self.count} options", AGAIN)
         return actions
@@ -62,22 +61,21 @@ class SavedOptions:
 class Transitions:
     """One step of every environment, arrays (E,): what intra-option policies learn from."""
 
-    ids: NDArray[np.int64]
-    actions: NDArray[np.int64]
-    next_ids: NDArray[np.int64]
-    rewards: NDArray[np.float32]
-    options: NDArray[np.int64]  # that were running
-    terminated: NDArray[np.bool_]  # the task is over
-    timed_out: NDArray[np.bool_]  # the option's time was up without reaching its sub-goal
-    reached: NDArray[np.bool_]  # it reached its sub-goal
-    ended: NDArray[np.bool_]  # the option stopped here for whatever reason
+    ids: Ids
+    actions: Ids
+    next_ids: Ids
+    rewards: Floats
+    options: Ids  # that were running
+    terminated: Flags  # the task is over
+    reached: Flags  # the option reached its sub-goal
+    timed_out: Flags  # its time was up without that
+    ended: Flags  # it stopped here for whatever reason
 
 
 class Learner(Part, ABC):
     """The intra-option policies of all O options.
 
     Attributes:
-        NEEDS: settings that must have this value.
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
         steps_since_positive: int64 (O,), those since the first one of these, also in a run that this one continues.
@@ -86,8 +84,8 @@ class Learner(Part, ABC):
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    NEEDS: ClassVar[Mapping[str, Any]] = {}
-    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *COUNTERS)
+    KEPT: ClassVar[tuple[str, ...]] = ("option_steps", "steps_since_positive")  # in artefacts, beside the weights
+    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *KEPT)
 
     def __init__(
         self,
@@ -114,20 +112,11 @@ class Learner(Part, ABC):
             )
 
     @classmethod
-    def refuse(cls, config: Any, engine: Engine) -> None:
-        """Raise a ``UserError`` where it cannot learn with these settings in this engine."""
-        for name, value in cls.NEEDS.items():
-            if getattr(config, name) != value:
-                fault = f"network={config.network} needs {name}={value}"
-                raise UserError(fault, f"{name}={getattr(config, name)}", f"Give --set {name}={value}.")
-
-    @classmethod
     def policies(cls, saved: SavedOptions) -> Policies:
         """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
         fault = "these options need their domain's engine, which is not in the artefact"
-        raise UserError(
-            fault, f"network={saved.config['network']}", "Load options of the light or the paper's network."
-        )
+        do = "Load options of the light or the paper's network."
+        raise UserError(fault, f"network={saved.config['network']}", do)
 
     @abstractmethod
     def build(self, config: Any, seed: int) -> None:
@@ -170,7 +159,7 @@ class Learner(Part, ABC):
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen
 
-    def count(self, options: NDArray[np.int64]) -> None:
+    def count(self, options: Ids) -> None:
         """Steps of these options (n,) were learned from, after those that reached their sub-goals are counted."""
         np.add.at(self.option_steps, options, 1)
         reached = (self.positives > 0) | (self.steps_since_positive > 0)
@@ -182,7 +171,7 @@ class Learner(Part, ABC):
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""
-        counters = {name: torch.from_numpy(getattr(self, name).copy()) for name in COUNTERS}
+        counters = {name: torch.from_numpy(getattr(self, name).copy()) for name in self.KEPT}
         return self.weights() | counters
 
     def load(self, state: Mapping[str, Tensor]) -> None:
@@ -190,7 +179,7 @@ class Learner(Part, ABC):
         ``UserError``.
         """
         self.load_weights(state)
-        for name in COUNTERS:
+        for name in self.KEPT:
             saved = state.get(name)
             if saved is None or saved.shape != (self.options,) or saved.dtype != torch.int64 or (saved < 0).any():
                 raise UserError(f"the weights do not fit the manifest (at {name})", f"{self.options} options", AGAIN)
@@ -209,6 +198,5 @@ def make_policies(
     if config["termination"] == ORACLE:
         fault = "these options end at the true sub-goals, which only the domain's engine can see"
         raise UserError(fault, "termination=oracle", "Load options that were trained with learned members.")
-
     shape = tuple(ensemble_config["observation_shape"])
     return load_learner(config["network"]).policies(SavedOptions(config, weights, shape))

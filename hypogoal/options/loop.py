@@ -99,7 +99,7 @@ class OptionLoop(Resumable):
         timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
         ended = reached | timed_out | over
         moved = Transitions(
-            ids, actions, step.next_ids, step.rewards, option, step.terminated, timed_out, reached, ended
+            ids, actions, step.next_ids, step.rewards, option, step.terminated, reached, timed_out, ended
         )
         if learning:
             self.learner.observe(moved)

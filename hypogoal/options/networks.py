@@ -1,6 +1,6 @@
 """Q-networks of the intra-option policies (Spec D2): a small one on cells, or on pictures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
-from hypogoal.observations import PICTURE, Standard, standard_of, standardised
+from hypogoal.observations import PICTURE, Standard, standardised
 
 CELL = 8  # pixels
 WIDTH = 128  # of dense layers
@@ -112,11 +112,6 @@ class OwnEmbedding(FullView):
         return self.encoder(as_input(seen))
 
 
-def standard_in(weights: Mapping[str, Tensor], shape: tuple[int, ...]) -> Standard | None:
-    """One that a light network's weights are to replace; None where they are of one that sees pictures."""
-    return standard_of(shape) if "cells.mean" in weights else None
-
-
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
 
 
@@ -189,31 +184,8 @@ def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDAr
     """As :func:`apply_to_states`, several networks' outputs on the same states."""
     device = next(networks[0].parameters()).device
     tiles = engine.tiles
-    light = (network for network in networks if isinstance(network, LightNetwork))
-    by_codes = [network for network in light if isinstance(network.cells, CellEmbedding)]
-    if tiles is not None and len(by_codes) == len(networks):
+    if tiles is not None and isinstance(getattr(networks[0], "cells", None), CellEmbedding):
         codes = tensor(engine.codes(ids).astype(np.int64), device)
-        return [network.from_codes(codes, tiles) for network in by_codes]
+        return [network.from_codes(codes, tiles) for network in networks]  # type: ignore[operator]
     images = tensor(engine.images(ids), device)
     return [network(images) for network in networks]
-
-
-class Pixels:
-    """At most ``most`` pictures of states as float32, on the CPU always in the same memory.
-
-    To convert them once for several networks, into memory in use already, saves a third of an update's time.
-    """
-
-    def __init__(self, engine: Engine, most: int, device: torch.device):
-        self.engine, self.device = engine, device
-        self._images = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
-        self._pixels = torch.zeros(self._images.shape) if device.type == "cpu" else None
-
-    def of(self, ids: NDArray[np.int64]) -> Tensor:
-        """float32 (n, H, W, C), 0 to 255, valid until the next call."""
-        count = len(ids)
-        self.engine.images(ids, self._images[:count])
-        images = torch.from_numpy(self._images[:count])
-        if self._pixels is None:
-            return images.to(self.device).float()
-        return self._pixels[:count].copy_(images)

@@ -1,10 +1,13 @@
-"""Parts of an agent that a setting names: choosers, learners, termination rules."""
+"""Parts of an agent that a setting names: choosers, learners, termination rules; and the arrays that they share."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
@@ -12,6 +15,10 @@ from hypogoal.core.own_code import load
 
 if TYPE_CHECKING:
     from hypogoal.domains.base import Engine
+
+Ids: TypeAlias = NDArray[np.int64]  # (n,), of environments, states or options
+Flags: TypeAlias = NDArray[np.bool_]
+Floats: TypeAlias = NDArray[np.float32]
 
 
 class Part(Resumable):

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
-from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.learner import COUNTERS, Learner, Transitions
+from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.parts import Ids
 from hypogoal.options.termination import Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
@@ -34,7 +34,7 @@ class PlannedLearner(Learner):
         UserError: nobody knows what follows in this engine.
     """
 
-    CHANGING: ClassVar[tuple[str, ...]] = ("rng", "positives", *COUNTERS)  # it does not explore
+    CHANGING: ClassVar[tuple[str, ...]] = ("rng", "positives", *Learner.KEPT)  # it does not explore
 
     def build(self, config: OptionConfig, seed: int) -> None:
         plan = plan_of(self.engine, self.terminations, config)

@@ -27,8 +27,9 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import qualities
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.episodes import agent_of
-from hypogoal.options.choosers import Ids, RandomChooser
+from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.loop import OptionLoop
+from hypogoal.options.parts import Ids
 from hypogoal.options.planned import FAR, PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations

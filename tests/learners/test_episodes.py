@@ -27,7 +27,7 @@ def test_success_is_by_reward_or_as_the_domain_says() -> None:
     assert [row[4] for row in played(None)] == [1, 0, 0, 0, 0, 0]
     own = played(np.array([False, True, True]))
     assert [row[4] for row in own] == [0, 1, 1, 1, 0, 0]
-    assert own.success() == 0.5 and played(None).success() == 1 / 6
+    assert own.recent()["success"] == 0.5 and played(None).recent()["success"] == 1 / 6
     assert own[:2] == [(6, 2, 2.0, 1, 0), (6, 2, 0.0, 1, 1)]
 
 

@@ -50,8 +50,8 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "DoorKey, many layouts, random": (partial(many, DOMAIN.make_engine), "light", {}, "random"),
     "Gymnasium, many layouts, random": (partial(many, corridor_env.SWIFT.make_engine), "light", {}, "random"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
-    "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
-    "paper without memory, random": (Corridor, "paper", {**OWN, "replay": 100, "recurrence": "none"}, "random"),
+    "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100, "recurrence": 3}, "random"),
+    "paper without memory, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
 }
 
 

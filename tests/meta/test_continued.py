@@ -20,10 +20,10 @@ from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.networks import LightMetaNetwork
 from hypogoal.meta.training import frames_kept
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import Transitions
 from hypogoal.options.networks import LightQNetwork
-from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
 
 GOALS = 5
@@ -33,7 +33,7 @@ QUICK: dict[str, Any] = {"environments": 2, "warm_up": 20, "update_interval": 4,
 def learner_of(kind: type, **changes: Any) -> Any:
     engine = DoorKeyEngine(100, 2, max_steps=50)
     verdicts = oracle_terminations(engine, range(GOALS))
-    network = "paper" if kind is RecurrentLearner else "light"
+    network = "paper" if kind is PaperLearner else "light"
     return kind(engine, verdicts, OptionConfig.of(**{"network": network, **QUICK, **changes}), seed=0)
 
 
@@ -93,10 +93,10 @@ def test_an_embedding_by_name_goes_through_both_stages(ensemble: Path, tmp_path:
 
 
 @pytest.mark.usefixtures("small_gru")
-@pytest.mark.parametrize("kind", [LightLearner, RecurrentLearner])
+@pytest.mark.parametrize("kind", [LightLearner, PaperLearner])
 def test_exploration_goes_on_falling_where_options_go_on(kind: type) -> None:
     """Spec D8: a member that found its sub-goal in the run before has found it; one that never did has not."""
-    own = {"experience": "own", "mask_reached": False} if kind is RecurrentLearner else {}
+    own = {"experience": "own", "mask_reached": False} if kind is PaperLearner else {}
     learner = learner_of(kind, epsilon_from="first-positive", epsilon_steps=1000, **own)
     state = {**learner.state(), "option_steps": torch.full((GOALS,), 500)}
     state["steps_since_positive"] = torch.tensor([300, 0, 0, 0, 0])
@@ -112,7 +112,7 @@ def test_exploration_goes_on_falling_where_options_go_on(kind: type) -> None:
 @pytest.mark.usefixtures("small_gru")
 def test_a_continued_paper_learner_fills_its_replay_first() -> None:
     """Spec D2: updates begin when the replay has ``warm_up`` transitions, not when earlier runs had so many steps."""
-    learner = learner_of(RecurrentLearner, experience="own", mask_reached=False)
+    learner = learner_of(PaperLearner, experience="own", mask_reached=False)
     learner.load({**learner.state(), "option_steps": torch.full((GOALS,), 5000)})
     walk(learner, 9)
     assert learner.members[0].updates == 0
@@ -139,7 +139,7 @@ def test_odd_settings_of_options_learn_too(changes: dict[str, Any]) -> None:
 def test_replays_keep_any_action() -> None:
     """Spec D2, B6: an own domain may have more than 128 of them."""
     learner = learner_of(LightLearner)
-    own = learner_of(RecurrentLearner, experience="own", mask_reached=False)
+    own = learner_of(PaperLearner, experience="own", mask_reached=False)
     for data in (learner.replay.data, own.members[0].replay.data):
         data.action[0] = 300
         assert data.action[0] == 300

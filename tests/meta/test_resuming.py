@@ -96,7 +96,7 @@ class Poisoned(Checkpoints):
         self.steps += 1
         now = state()
         if self.steps >= 40:
-            now["loop"]["learner"]["online"]["heads.bias"][0] = torch.nan  # the state is the network's own
+            now["loop"]["learner"]["networks"]["online"]["heads.bias"][0] = torch.nan  # the state is the network's own
         self.save(now)
 
 
@@ -107,7 +107,7 @@ def test_nan_stops_and_the_last_good_checkpoint_stays(tmp_path: Path) -> None:
         run("light, shared, gaussian", tmp_path, checkpoints)
     saved = checkpoints.load()
     assert saved is not None and saved["loop"]["recorder"]["episodes"]["steps"] == 39 * 3
-    assert all(torch.isfinite(value).all() for value in saved["loop"]["learner"]["online"].values())
+    assert all(torch.isfinite(value).all() for value in saved["loop"]["learner"]["networks"]["online"].values())
 
 
 class Plain(Corridor):

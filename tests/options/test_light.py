@@ -20,23 +20,23 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
         engine.step(rng.integers(engine.n_actions, size=4))
     learner = LightLearner(engine, oracle_terminations(engine, range(5)), OptionConfig.of(environments=4), 0)
     with torch.no_grad():
-        for weight in learner.target.parameters():
+        for weight in learner.networks.target.parameters():
             weight.mul_(0.9)  # so that the target is another network
     s, following = rng.integers(20, size=(2, 64))
     weights = torch.from_numpy(rng.normal(size=(64, 5, 7)).astype(np.float32))
 
     def slopes(values: torch.Tensor) -> torch.Tensor:
         loss = (values * weights).sum()
-        gradients = torch.autograd.grad(loss, [*learner.online.parameters()])
+        gradients = torch.autograd.grad(loss, [*learner.networks.online.parameters()])
         return torch.cat([gradient.flatten() for gradient in gradients])
 
     here, next_online, next_target = learner._values(s, following)
     fast = slopes(here)
-    plain = apply_to_states(learner.online, engine, s)
+    plain = apply_to_states(learner.networks.online, engine, s)
     torch.testing.assert_close(here, plain)
     torch.testing.assert_close(fast, slopes(plain))
-    torch.testing.assert_close(next_online, apply_to_states(learner.online, engine, following).detach())
-    torch.testing.assert_close(next_target, apply_to_states(learner.target, engine, following).detach())
+    torch.testing.assert_close(next_online, apply_to_states(learner.networks.online, engine, following).detach())
+    torch.testing.assert_close(next_target, apply_to_states(learner.networks.target, engine, following).detach())
     assert not next_online.requires_grad
     assert not next_target.requires_grad
     assert not torch.allclose(next_online, next_target)

@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import NumericalError
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Outcome, RandomChooser
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop, offered_options
 from hypogoal.options.networks import LightQNetwork, apply_to_states
-from hypogoal.options.paper_network import PaperQNetwork
 from hypogoal.options.recording import Recorder
-from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -169,24 +168,6 @@ def test_the_tile_path_is_the_image_path() -> None:
         torch.testing.assert_close(image, tile, rtol=1e-4, atol=1e-3)
 
 
-def test_the_paper_network_unrolls_its_memory() -> None:
-    """Spec D2: step by step with the hidden state and all at once are the same; test_paper_network has PyTorch's."""
-    torch.manual_seed(0)
-    network = PaperQNetwork((64, 64, 3), 7).eval()
-    images = torch.randint(0, 256, (1, 5, 64, 64, 3), dtype=torch.uint8)
-    with torch.no_grad():
-        embedded = network.embed(images[0])[None]
-        whole, _ = network(embedded)
-        hidden, steps = None, []
-        for t in range(5):
-            values, hidden = network(embedded[:, t : t + 1], hidden)
-            steps.append(values)
-        alone, _ = network(embedded[:, 4:5])
-    torch.testing.assert_close(torch.cat(steps, 1), whole)
-    assert not torch.allclose(alone[:, 0], whole[:, 4])
-    assert sum(p.numel() for p in network.parameters()) == pytest.approx(10.5e6, rel=0.02)
-
-
 def run_corridor(learner_class: type, steps: int, seed: int = 0, **changes):
     engine = Corridor(4)
     config = OptionConfig.of(**(QUICK | changes))
@@ -205,7 +186,6 @@ def greedy(learner) -> list[list[int]]:
     paths = []
     for option, end in enumerate((0, LENGTH - 1)):
         engine = Corridor(1)
-        learner.hidden = torch.zeros(1, PaperQNetwork.HIDDEN)
         path = [2]
         while path[-1] != end and len(path) < 10:
             cell = np.array(path[-1:])
@@ -230,22 +210,16 @@ def test_the_paper_learner_learns_both_options() -> None:
     processors.
     """
     learner = run_corridor(
-        RecurrentLearner, 1600, experience="own", network="paper", option_batch=16, option_gamma=0.9,
+        PaperLearner, 1600, experience="own", network="paper", recurrence=10, option_batch=16, option_gamma=0.9,
         target_interval=5, option_learning_rate=1e-3,
     )  # fmt: skip
     assert greedy(learner) == [[2, 1, 0], [2, 3, 4, 5]]
 
 
-def test_shared_experience_needs_the_light_network() -> None:
-    """Spec D2: a clear line, not a silent change."""
-    with pytest.raises(UserError, match="experience=shared"):
-        run_corridor(RecurrentLearner, 4, experience="shared")
-
-
 def test_same_seed_same_bytes() -> None:
     """The project's rule: randomness is passed in."""
     one, two, other = (run_corridor(LightLearner, 200, seed=seed) for seed in (1, 1, 2))
-    assert one.updates
+    assert one.networks.updates
     for name, value in one.state().items():
         assert torch.equal(value, two.state()[name]), name
     assert any(not torch.equal(value, other.state()[name]) for name, value in one.state().items())
@@ -255,7 +229,7 @@ def test_a_nan_stops_training() -> None:
     """Spec G3: a NaN in the loss names itself."""
     learner = run_corridor(LightLearner, 80)
     with torch.no_grad():
-        learner.online.heads.bias.fill_(float("nan"))
+        learner.networks.online.heads.bias.fill_(float("nan"))
     with pytest.raises(NumericalError, match="the loss of options"):
         learner._update()
 

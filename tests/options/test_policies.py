@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from hypogoal.core.errors import UserError
+from hypogoal.options.conv_gru import PaperQNetwork
 from hypogoal.options.learner import Policies, make_policies
 from hypogoal.options.networks import LightQNetwork
-from hypogoal.options.paper_network import PaperQNetwork
 
 SHAPE, OPTIONS, ACTIONS = (24, 24, 3), 2, 5
 
@@ -33,7 +33,7 @@ def policies_of(network: str) -> Policies:
         name: value * 0 if "bias" in name else value * 6 if value.ndim > 1 else value for name, value in weights.items()
     }
     config: dict[str, Any] = {"termination": "learned", "network": network, "sub_goals": ["a", "b"], "members": 1}
-    config |= {"recurrence": "execution"} if network == "paper" else {"embedding": "auto"}
+    config |= {"recurrence": 10} if network == "paper" else {"embedding": "auto"}
     return make_policies(config, weights, {"observation_shape": SHAPE})
 
 
@@ -52,20 +52,6 @@ def test_policies_go_to_another_process(network: str) -> None:
     again = sent(1)
     assert [again(image) for image in images] == [*first, *rest]
     assert len({*first, *rest}) > 1, "a policy that always does the same would show nothing"
-
-
-def test_an_execution_begins_with_nothing_remembered() -> None:
-    """Spec D2: the GRU is unrolled over the option's own steps only; executions do not share what they remember."""
-    image = np.random.default_rng(1).integers(256, size=SHAPE, dtype=np.uint8)
-    policies = policies_of("paper")
-    one, other = policies(0), policies(0)
-    one(image)
-    one(image)
-    other(image)
-    fresh = policies(0)
-    fresh(image)
-    torch.testing.assert_close(other.hidden, fresh.hidden)  # type: ignore[attr-defined]
-    assert not torch.equal(one.hidden, fresh.hidden)  # type: ignore[attr-defined]
 
 
 def test_options_that_end_at_true_sub_goals_are_refused() -> None:

@@ -10,15 +10,12 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
-from hypogoal.options import recurrent
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels
-from hypogoal.options.paper_network import PaperQNetwork
+from hypogoal.options.networks import PictureEmbedding
 from hypogoal.options.recording import Recorder
-from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.tables import Executions
 from hypogoal.options.termination import oracle_terminations
 
@@ -147,12 +144,11 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
     assert (picture[:, :14] == 255).all() and not picture[:, 14:].any(), "cell 0"
 
 
-def learned(learner_class: type, steps: int, seed: int = 0, memory: int = 200_000, count: int = 4, **changes):
-    network = "paper" if learner_class is RecurrentLearner else "light"
-    config = OptionConfig.of(**(QUICK | BEGIN | {"network": network, "option_timeout": 10} | changes))
+def learned(steps: int, seed: int = 0, memory: int = 200_000, count: int = 4, **changes):
+    config = OptionConfig.of(**(QUICK | BEGIN | {"option_timeout": 10} | changes))
     engine = LongCorridor(count, memory=memory, seed=seed)
     verdicts = oracle_terminations(engine, (0, 1))
-    learner = learner_class(engine, verdicts, config, seed)
+    learner = LightLearner(engine, verdicts, config, seed)
     recorder = Recorder(2, engine)
     loop = OptionLoop(engine, verdicts, learner, RandomChooser(np.random.default_rng(seed)), recorder, config, 1.0)
     for _ in range(steps // count):
@@ -167,8 +163,8 @@ def learned(learner_class: type, steps: int, seed: int = 0, memory: int = 200_00
 )
 def test_the_light_learner_learns_from_pictures(changes: dict) -> None:
     """Spec D2, D4: own experience, one step and several: both options go straight to their ends."""
-    learner, recorder = learned(LightLearner, 1600, epsilon_final=0.02, **changes)
-    assert isinstance(learner.online.cells, PictureEmbedding)
+    learner, recorder = learned(1600, epsilon_final=0.02, **changes)
+    assert isinstance(learner.networks.online.cells, PictureEmbedding)
     for option, shortest in ((0, 2), (1, 3)):
         last = list(recorder.executions[option])[-20:]
         assert np.mean([row.reached for row in last]) >= 0.9
@@ -177,29 +173,25 @@ def test_the_light_learner_learns_from_pictures(changes: dict) -> None:
 
 def test_values_over_several_steps_are_the_discounted_ones() -> None:
     """Spec D2: in cell 1 the left end is one step away, in cell 2 two: values near 1 and gamma."""
-    learner, _ = learned(LightLearner, 2000, n_step=3, option_gamma=0.5, epsilon_final=0.3, option_learning_rate=2e-3)
+    learner, _ = learned(2000, n_step=3, option_gamma=0.5, epsilon_final=0.3, option_learning_rate=2e-3)
     engine = learner.engine
     at = {cell: engine.cell.index(cell, engine.n_states - 1000) for cell in (1, 2)}
     with torch.no_grad():
-        values = learner.online(torch.from_numpy(engine.images(np.array(list(at.values())))))[:, 0]
+        values = learner.networks.online(torch.from_numpy(engine.images(np.array(list(at.values())))))[:, 0]
     np.testing.assert_allclose(values[:, LEFT], [1.0, 0.5], atol=0.12)
 
 
 def test_a_step_of_several_needs_own_experience() -> None:
     """Spec D2: others' sub-goals may lie in between."""
     with pytest.raises(UserError, match="experience=own"):
-        learned(LightLearner, 4, n_step=3, experience="shared")
+        learned(4, n_step=3, experience="shared")
 
 
-@pytest.mark.usefixtures("small_gru")
-@pytest.mark.parametrize("learner_class", [LightLearner, RecurrentLearner])
-def test_a_replay_longer_than_the_memory_is_refused(learner_class: type) -> None:
+def test_a_replay_longer_than_the_memory_is_refused() -> None:
     """Spec D3: before it begins, with the number that fits; with that number it begins."""
     with pytest.raises(UserError, match=r"replay=1000\. Give --set replay=") as caught:
-        learned(learner_class, 4, memory=900, replay=1000)
-    fits = int(caught.value.do.split("replay=")[1].split()[0])
-    if learner_class is LightLearner:
-        learned(learner_class, 4, memory=900, replay=fits)
+        learned(4, memory=900, replay=1000)
+    learned(4, memory=900, replay=int(caught.value.do.split("replay=")[1].split()[0]))
 
 
 def test_forgotten_states_are_not_learned_from() -> None:
@@ -226,101 +218,16 @@ def test_the_replay_never_outlives_the_memory() -> None:
     config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 300, "n_step": 7}))
     smallest = LightLearner.reach(config, 2)
     slow = {"update_interval": 32, "option_batch": 300}  # few updates, each with most of the replay
-    learned(LightLearner, 2000, memory=smallest, replay=300, n_step=7, option_timeout=9, **slow)
-
-
-def test_the_paper_network_learns_from_pictures() -> None:
-    """Spec D2, D3: conv-GRU on (84, 84, 4), unrolled over each execution."""
-    torch.manual_seed(0)
-    network = PaperQNetwork((84, 84, 4), 18)
-    values, hidden = network(network.embed(torch.zeros(3, 84, 84, 4, dtype=torch.uint8))[None])
-    assert values.shape == (1, 3, 18) and hidden.shape == (1, 1, 512)
-    paper = {"network": "paper", "option_batch": 4, "update_interval": 16, "replay": 100, "option_timeout": 4}
-    learner, _ = learned(RecurrentLearner, 240, memory=256, **paper)
-    assert all(member.updates >= 2 for member in learner.members)
-    state = learner.state()
-    assert state["0.values.2.bias"].shape == (4,)
-
-
-@pytest.mark.usefixtures("small_gru")
-def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
-    """Spec D3: members of the paper's kind share the engine's memory; executions that are gone are not replayed."""
-    config = OptionConfig.of(**(QUICK | BEGIN | {"network": "paper", "replay": 100, "option_timeout": 4}))
-    config = config.model_copy(update={"warm_up": 100_000, "option_batch": 4})
-    engine = LongCorridor(4, memory=240)
-    verdicts = oracle_terminations(engine, (0, 1))
-    learner, chooser = RecurrentLearner(engine, verdicts, config, 0), Chosen([0] * 8 + [1] * 400)
-    loop = OptionLoop(engine, verdicts, learner, chooser, Recorder(2, engine), config, 1.0)
-    while learner.option_steps[1] < 20:
-        loop.step()
-    assert learner._update(0, learner.members[0]) > 0.0
-    while learner.option_steps[1] < 260:
-        loop.step()
-    assert learner._update(0, learner.members[0]) == 0.0
-    assert learner._update(1, learner.members[1]) > 0.0
-
-
-@pytest.mark.usefixtures("small_gru")
-def test_an_execution_whose_beginning_was_overwritten_is_not_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec D2, D3: five steps of an execution, then five of the next in a replay of eight: only those are unrolled."""
-    engine = LongCorridor(1)
-    config = OptionConfig.of(**(QUICK | BEGIN | {"network": "paper", "option_timeout": 5})).model_copy(
-        update={"replay": 8}
-    )
-    learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
-    states = [int(engine.ids[0]), *(int(engine.step(np.array([STAY])).next_ids[0]) for _ in range(10))]
-    for begin in (0, 5):
-        path = zip(states[begin : begin + 5], states[begin + 1 : begin + 6], strict=True)
-        learner._store(0, [(state, STAY, after, False, False, False) for state, after in path])
-    seen: set[int] = set()
-    images = engine.images
-    monkeypatch.setattr(engine, "images", lambda ids, *out: (seen.update(ids.tolist()), images(ids, *out))[1])
-    for _ in range(3):
-        learner._update(0, learner.members[0])
-    assert seen == set(states[5:])
-
-
-@pytest.mark.usefixtures("small_gru")
-def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec D1, D2: reward 1 there, and no value of what lies behind, though the episode goes on."""
-    engine = LongCorridor(1)
-    config = OptionConfig.of(**(QUICK | BEGIN | {"network": "paper", "option_timeout": 5})).model_copy(
-        update={"replay": 8}
-    )
-    learner = RecurrentLearner(engine, oracle_terminations(engine, (0, 1)), config, 0)
-    middle, beside, end = int(engine.ids[0]), *(int(engine.step(np.array([LEFT])).next_ids[0]) for _ in range(2))
-    learner._store(0, [(middle, LEFT, beside, False, False, False), (beside, LEFT, end, False, False, True)])
-    seen, targets = [], recurrent.double_q_targets
-    monkeypatch.setattr(recurrent, "double_q_targets", lambda *of, **more: (seen.append(of), targets(*of, **more))[1])
-    learner._update(0, learner.members[0])
-    ((rewards, terminal, *_),) = seen
-    assert set(rewards.tolist()) == {0.0, 1.0} and torch.equal(terminal, rewards == 1)
+    learned(2000, memory=smallest, replay=300, n_step=7, option_timeout=9, **slow)
 
 
 def test_same_seed_same_bytes_with_every_switch() -> None:
     """The project's rule: randomness is passed in."""
     every = {"n_step": 4, "exploration": "persistent"}
-    one, two, other = (learned(LightLearner, 240, seed=seed, **every)[0] for seed in (1, 1, 2))
+    one, two, other = (learned(240, seed=seed, **every)[0] for seed in (1, 1, 2))
     for name, value in one.state().items():
         assert torch.equal(value, two.state()[name]), name
     assert any(not torch.equal(value, other.state()[name]) for name, value in one.state().items())
-
-
-def test_pixels_are_the_images() -> None:
-    """Spec D2 (light): converted once, into memory in use, the network sees what it sees in the images."""
-    engine = LongCorridor(3)
-    for _ in range(4):
-        engine.step(np.array([LEFT, RIGHT, STAY]))
-    ids = np.arange(1, engine.n_states)
-    torch.manual_seed(0)
-    network, pixels = LightQNetwork(engine.observation_shape, 2, 4), Pixels(engine, 50, torch.device("cpu"))
-    expected = network(torch.from_numpy(engine.images(ids)))
-    torch.testing.assert_close(network(pixels.of(ids)), expected)
-    # Scaled weights are the same function as scaled pixels.
-    cells = network.cells
-    scaled = torch.from_numpy(engine.images(ids)).permute(0, 3, 1, 2).float() / 255.0
-    plain = torch.relu(cells.second(torch.relu(cells.first(scaled)))).flatten(1)
-    torch.testing.assert_close(cells(torch.from_numpy(engine.images(ids))), plain)
 
 
 def test_even_choice_gives_every_option_as_many_steps() -> None:

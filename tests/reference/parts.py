@@ -374,7 +374,7 @@ def rooms_one_by_one(work: Path) -> Table:
 # Options and the choice among them.
 
 
-def paper_network(work: Path, recurrence: str) -> Table:
+def paper_network(work: Path, recurrence: int) -> Table:
     """The weights and the loss after 50 updates of one option of the paper's network."""
     ensemble = made(
         work / "one-member",
@@ -390,12 +390,12 @@ def paper_network(work: Path, recurrence: str) -> Table:
 
 @part("paper-network-with-memory", traced=True)
 def paper_network_with_memory(work: Path) -> Table:
-    return paper_network(work, "execution")
+    return paper_network(work, 10)
 
 
 @part("paper-network-without-memory", traced=True, slow=True)
 def paper_network_without_memory(work: Path) -> Table:
-    return paper_network(work, "none")
+    return paper_network(work, 1)
 
 
 @part("gaussian-head", traced=True)

@@ -16,8 +16,9 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.meta.episodes import agent_of, play_episode
-from hypogoal.options.choosers import Chooser, Ids, Offered
+from hypogoal.options.choosers import Chooser, Offered
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.parts import Ids
 from hypogoal.options.tables import Choices
 from hypogoal.options.termination import Terminations
 

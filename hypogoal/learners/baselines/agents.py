@@ -88,7 +88,7 @@ class _Watch(BaseCallback):
         if episodes.steps >= self._next:
             self._next += LOG_INTERVAL
             check_finite(self.model, episodes.steps)
-            numbers = {"success": episodes.success() if episodes else 0.0, **_logged(self.model)}
+            numbers = {"success": episodes.recent()["success"] if episodes else 0.0, **_logged(self.model)}
             if isinstance(self.model, DQN):
                 numbers["epsilon"] = float(self.model.exploration_rate)
             if self.log:

@@ -1,0 +1,285 @@
+"""Option learning as in the paper: a conv-GRU network and a replay of its own for each member (Spec D2, D3).
+
+A state's *window* is the last ``recurrence`` states of its option's execution, itself the last. The GRU reads a window
+from its first state on, with nothing remembered; so it does in acting, in learning, and in what is loaded. A window of
+1 is a state alone (DEV-16).
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pack_padded_sequence
+
+from hypogoal.core.arrays import Columns
+from hypogoal.core.drawing import DrawsFrom
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import torch_generator
+from hypogoal.core.tensors import below, load_fitting
+from hypogoal.domains.base import Engine
+from hypogoal.learners.double_dqn import Batch, DoubleDQN
+from hypogoal.learners.replay import PrioritisedReplay
+from hypogoal.observations import PICTURE, Observations
+from hypogoal.options.config import STACK, PaperConfig
+from hypogoal.options.learner import FILE, Learner, Policies, SavedOptions, Transitions
+from hypogoal.options.parts import Ids
+
+
+class PaperQNetwork(nn.Module):
+    """Two of (convolution, BatchNorm, ReLU, pooling), a GRU, two dense layers.
+
+    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
+    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``).
+    """
+
+    HIDDEN = 512
+
+    def __init__(self, observation_shape: tuple[int, ...], actions: int):
+        super().__init__()
+        height, width, depth = observation_shape
+        self.features = nn.Sequential(
+            nn.Conv2d(depth, 16, 3),
+            nn.BatchNorm2d(16),
+            nn.ReLU(),
+            nn.MaxPool2d(2),
+            nn.Conv2d(16, 32, 3),
+            nn.BatchNorm2d(32),
+            nn.ReLU(),
+            nn.MaxPool2d(2),
+            nn.Flatten(),
+        )
+        sides = [((side - 2) // 2 - 2) // 2 for side in (height, width)]
+        self.gru = nn.GRU(32 * math.prod(sides), self.HIDDEN, batch_first=True)
+        self.values = nn.Sequential(nn.Linear(self.HIDDEN, 128), nn.ReLU(), nn.Linear(128, actions))
+
+    def see(self, images: Tensor) -> Tensor:
+        """uint8 (N, H, W, C) -> features float32 (N, F)."""
+        return self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+
+    def forward(self, features: Tensor, windows: Tensor, lengths: Tensor) -> Tensor:
+        """Values float32 (n, A) of the last states of windows.
+
+        ``windows`` int64 (n, T) say which of the features, float32 (N, F), each window has; of its T places the first
+        ``lengths`` (n,) are real.
+        """
+        frames = features.index_select(0, windows.flatten()).view(*windows.shape, -1)
+        packed = pack_padded_sequence(frames, lengths.cpu(), batch_first=True, enforce_sorted=False)
+        _, last = self.gru(packed)
+        return self.values(last[0])
+
+
+@dataclass(frozen=True)
+class Lived(Columns):
+    """Steps of executions, arrays (n, ...)."""
+
+    path: NDArray[np.int32]  # (n, recurrence + 1), ids: a window, its last states real, and the state that came next
+    length: NDArray[np.int32]  # of the window
+    action: NDArray[np.int16]
+    terminated: NDArray[np.bool_]  # the task is over
+
+    @classmethod
+    def empty(cls, rows: int, recurrence: int) -> Self:
+        """Rows of zeros."""
+        return cls(
+            path=np.zeros((rows, recurrence + 1), np.int32),
+            length=np.zeros(rows, np.int32),
+            action=np.zeros(rows, np.int16),
+            terminated=np.zeros(rows, np.bool_),
+        )
+
+
+class Member(DoubleDQN):
+    """One member's policy: networks, optimiser, replay, and the steps since its last update."""
+
+    CHANGING = (*DoubleDQN.CHANGING, "replay", "due")
+
+    def __init__(self, online: PaperQNetwork, config: PaperConfig):
+        super().__init__(online, config)
+        self.replay = PrioritisedReplay(Lived.empty(config.replay, config.recurrence))
+        self.due = 0
+
+
+class PaperLearner(Learner):
+    """The intra-option policies of all O options, each on its own; arguments as of :class:`Learner`."""
+
+    CHANGING = (*Learner.CHANGING, "members", "windows", "lengths")
+
+    @classmethod
+    def refuse(cls, config: PaperConfig, engine: Engine) -> None:
+        """It sees pictures only, and learns single steps of its members' own executions."""
+        if config.experience != "own":
+            fault = "network=paper needs experience=own"
+            raise UserError(fault, f"experience={config.experience}", "Give --set experience=own.")
+        if engine.observation_dtype != PICTURE:
+            raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
+
+    @classmethod
+    def policies(cls, saved: SavedOptions) -> Policies:
+        return PaperPolicies(saved)
+
+    def build(self, config: PaperConfig, seed: int) -> None:
+        self.members = []
+        for option in range(self.options):
+            with DrawsFrom(torch_generator(seed, "option-weights", option)):
+                network = PaperQNetwork(self.engine.observation_shape, self.engine.n_actions)
+            self.members.append(Member(network.to(self.device), config))
+        self.windows = np.zeros((self.engine.count, config.recurrence), np.int64)  # of running executions
+        self.lengths = np.zeros(self.engine.count, np.int64)  # of these, how many of the last states are real
+
+    @staticmethod
+    def reach(config: PaperConfig, options: int) -> int:
+        """How many states back the replays hold when each has had as many steps as another.
+
+        Of what a member that had fewer has stored, the oldest may be forgotten nevertheless; it is left out of its
+        batches.
+        """
+        return options * config.replay + (config.recurrence + STACK) * config.environments
+
+    @torch.no_grad()
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+        """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
+        self.windows = np.column_stack([self.windows[:, 1:], ids])
+        self.lengths = np.minimum(age + 1, self.config.recurrence)
+        chosen = np.empty_like(ids)
+        for option in np.unique(options):
+            rows = options == option
+            network = self.members[option].online.eval()
+            windows = left_aligned(self.windows[rows], self.lengths[rows])
+            states, places = np.unique(windows, return_inverse=True)
+            features = network.see(self.tensor(self.engine.images(states)))
+            windows = self.tensor(places.reshape(windows.shape))
+            values = network(features, windows, torch.from_numpy(self.lengths[rows]))
+            chosen[rows] = values.argmax(1).cpu().numpy()
+        return chosen
+
+    def observe(self, moved: Transitions) -> None:
+        path = np.column_stack([self.windows, moved.next_ids])
+        steps = Lived.cast(path, self.lengths, moved.actions, moved.terminated)
+        for option in np.unique(moved.options):
+            rows = moved.options == option
+            member = self.members[option]
+            member.replay.add(steps.at(rows))
+            member.due += rows.sum().item()
+        np.add.at(self.positives, moved.options[moved.reached], 1)
+        self.count(moved.options)
+
+    def learn(self) -> dict[str, float]:
+        """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
+        numbers: dict[str, float] = {}
+        for option, member in enumerate(self.members):
+            if member.replay.size < min(self.config.warm_up, self.config.replay):
+                member.due = 0
+            while member.due >= self.config.update_interval:
+                member.due -= self.config.update_interval
+                numbers["option_loss"] = self._update(option, member)
+        return numbers
+
+    def _update(self, option: int, member: Member) -> float:
+        """One update of a member's policy; returns the loss, 0 where all steps drawn are forgotten."""
+        config, most = self.config, self.config.recurrence
+        indices, weights = member.replay.sample(config.option_batch, self.rng)
+        steps = member.replay.data.at(indices)
+        padding = np.arange(most + 1) < most - steps.length[:, None]
+        known = (self.engine.remembers(steps.path) | padding).all(axis=1)
+        if not known.any():
+            return 0.0
+        indices, weights, steps = indices[known], weights[known], steps.at(known)
+
+        path, length = steps.path.astype(np.int64), steps.length.astype(np.int64)
+        later = np.minimum(length + 1, most)
+        windows = np.stack([left_aligned(path[:, :-1], length), left_aligned(path[:, 1:], later)])
+        states, places = np.unique(windows, return_inverse=True)
+        images = self.tensor(self.engine.images(states))  # each once; BatchNorm counts it once (DEV-51)
+        before, after = self.tensor(places.reshape(windows.shape))
+        online, target = member.online.train(), member.target
+        features = online.see(images)
+        values = online(features, before, torch.from_numpy(length))
+        with torch.no_grad():
+            next_online = online(features, after, torch.from_numpy(later))
+            next_target = target(target.see(images), after, torch.from_numpy(later))
+
+        next_states = path[:, -1]
+        reached = self.terminations.of_running(next_states, np.full_like(next_states, option))
+        rewards = self.tensor(reached).float()  # Spec D1: 1 where the option's own classifier is positive, else 0
+        terminal = self.tensor(reached | steps.terminated)
+        batch = Batch(
+            actions=self.tensor(steps.action.astype(np.int64)),
+            rewards=rewards[:, None],
+            terminal=terminal[:, None],
+            discounts=config.option_gamma,
+            weights=self.tensor(weights),
+            learns=torch.ones_like(terminal)[:, None],
+        )
+        each = [outputs[:, None] for outputs in (values, next_online, next_target)]
+        loss, errors = member.update(*each, batch, [option], self.option_steps[option])
+        member.replay.set_priorities(indices, errors)
+        return loss
+
+    def weights(self) -> dict[str, Tensor]:
+        found = {}
+        for option, member in enumerate(self.members):
+            for name, value in member.online.state_dict().items():
+                found[f"{option}.{name}"] = value
+        return found
+
+    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
+        for option, member in enumerate(self.members):
+            member.load(below(f"{option}.", weights), f"option {option} of {FILE}")
+
+
+def left_aligned(windows: Ids, lengths: Ids) -> Ids:
+    """Windows (n, T) whose last ``lengths`` (n,) places are real -> with these first, then the last state again."""
+    last = windows.shape[1] - 1
+    columns = np.arange(last + 1) + last + 1 - lengths[:, None]
+    return np.take_along_axis(windows, np.minimum(columns, last), axis=1)
+
+
+class PaperPolicies:
+    """Greedy policies of saved options that have a network each (Spec D2, D8), made when it is first played."""
+
+    def __init__(self, saved: SavedOptions):
+        self.weights, self.shape = dict(saved.weights), saved.shape
+        self.recurrence = saved.config["recurrence"]
+        if not isinstance(self.recurrence, int):
+            fault = "these options remember their executions in another way than this version's"
+            raise UserError(fault, f"recurrence={self.recurrence}", "Train them again with --set recurrence=N.")
+        self.actions = saved.actions("0.values.2.bias", 1)
+        self._networks: dict[int, PaperQNetwork] = {}
+
+    def network(self, option: int) -> PaperQNetwork:
+        """An option's network."""
+        if option not in self._networks:
+            make = partial(PaperQNetwork, self.shape, self.actions)
+            self._networks[option] = load_fitting(make, below(f"{option}.", self.weights), FILE).eval()
+        return self._networks[option]
+
+    def __call__(self, option: int) -> Callable[[Observations], int]:
+        """Start an execution."""
+        return _Execution(self.network(option), self.recurrence)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the networks, which are the weights again."""
+        return {**self.__dict__, "_networks": {}}
+
+
+class _Execution:
+    """One execution of an option, whose last states its network sees."""
+
+    def __init__(self, network: PaperQNetwork, recurrence: int):
+        self.network = network
+        self.window: deque[Observations] = deque(maxlen=recurrence)
+
+    @torch.no_grad()
+    def __call__(self, observation: Observations) -> int:
+        self.window.append(observation)
+        features = self.network.see(torch.from_numpy(np.stack(self.window)))
+        states = torch.arange(len(features))
+        values = self.network(features, states[None], torch.tensor([len(states)]))
+        return int(values.argmax())
