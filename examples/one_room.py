@@ -330,11 +330,12 @@ class Patience(Terminations):
         self._steps, self._executions, self._reaches = np.zeros((3, self.options), dtype=np.int64)
         self._highest = np.full(self.options, -np.inf, dtype=np.float32)
 
-    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        now = self.log_odds(ids, options)
-        self._best = np.where(age == 0, now, np.maximum(self._best, now))
+    def reached(
+        self, log_odds: NDArray[np.float32], options: NDArray[np.int64], age: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        self._best = np.where(age == 0, log_odds, np.maximum(self._best, log_odds))
         np.add.at(self._steps, options, 1)
-        return np.asarray(now > self.thresholds[options])
+        return self.positive(log_odds, options)
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
         np.add.at(self._executions, options, 1)

@@ -15,7 +15,7 @@ from hypogoal.hypotheses.wrappers import ensemble_at
 from hypogoal.made import Made
 from hypogoal.options.env import Options
 from hypogoal.options.learner import make_policies
-from hypogoal.options.termination import rule_of, set_thresholds
+from hypogoal.options.termination import saved_terminations
 from hypogoal.stages import Place
 
 
@@ -78,13 +78,13 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     weights = load_tensors(artefact.path / "options.safetensors")
     policies = make_policies(config, weights, source.config)
     goals, members = tuple(config["sub_goals"]), config["members"]
-    rule_of(config["termination"])  # a rule of the user's own is refused where it is not allowed
-    set_thresholds(ensembles, weights)
+    ends = saved_terminations(config["termination"], weights, len(goals) * members)
     return Options(
         goals,
         members,
         ensembles,
         policies,
+        ends,
         config["option_timeout"],
         config["mask_reached"],
         domain=config["domain"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
@@ -41,9 +42,15 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
         succeeded = step.succeeded
         if succeeded is None:
             succeeded = step.terminated & (self.rewards > 0)
-        for e in np.flatnonzero(over):
-            ends = int(step.terminated[e]), int(succeeded[e])
-            self.append((self.steps, int(self.lengths[e]), float(self.rewards[e]), *ends))
+        for environment in np.flatnonzero(over):
+            row = (
+                self.steps,
+                int(self.lengths[environment]),
+                float(self.rewards[environment]),
+                int(step.terminated[environment]),
+                int(succeeded[environment]),
+            )
+            self.append(row)
         self.lengths[over] = 0
         self.rewards[over] = 0.0
 
@@ -53,8 +60,13 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
 
     def recent(self) -> dict[str, float]:
         """Of the last episodes the share that succeeded, see ``Step``, and the mean steps; NaN before the first."""
-        last = self[-LAST:] or [(0, np.nan, 0.0, 0, np.nan)]
-        return {"success": fmean(row[4] for row in last), "length": fmean(row[1] for row in last)}
+        last = self[-LAST:]
+        if not last:
+            return {"success": math.nan, "length": math.nan}
+        return {
+            "success": fmean(row[4] for row in last),
+            "length": fmean(row[1] for row in last),
+        }
 
     def solved(self, share: float) -> bool:
         """Whether at least ``share`` of the last ``LAST`` episodes succeeded; never where there are fewer, or at 0."""
@@ -67,4 +79,5 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
         super().restore(snapshot)
         self.clear()
         for step, length, reward, terminated, succeeded in snapshot["rows"].tolist():
-            self.append((int(step), int(length), reward, int(terminated), int(succeeded)))
+            row = (int(step), int(length), reward, int(terminated), int(succeeded))
+            self.append(row)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Columns
-from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.checkpoints import Resumable, State
 
 Rows = TypeVar("Rows", bound=Columns)
 
@@ -39,19 +39,30 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
 
     CHANGING = ("size", "next", "largest")  # and the rows stored
 
-    def __init__(self, data: Rows, *, alpha: float = 0.6, beta: float = 0.4):
-        self.data, self.capacity, self.alpha, self.beta = data, len(data), alpha, beta
+    def __init__(
+        self,
+        data: Rows,
+        *,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+    ):
+        self.data = data
+        self.capacity = len(data)
+        self.alpha = alpha
+        self.beta = beta
         self.priorities = np.zeros(len(data))  # to the power alpha
-        self.size = self.next = 0
+        self.size = 0
+        self.next = 0
         self.largest = 1.0  # priority so far
 
     def add(self, rows: Rows) -> None:
         """Append n transitions with the largest priority so far."""
-        indices = (self.next + np.arange(len(rows))) % self.capacity
+        count = len(rows)
+        indices = (self.next + np.arange(count)) % self.capacity
         self.data.put(indices, rows)
         self.priorities[indices] = self.largest**self.alpha
-        self.next = (self.next + len(rows)) % self.capacity
-        self.size = min(self.size + len(rows), self.capacity)
+        self.next = (self.next + count) % self.capacity
+        self.size = min(self.size + count, self.capacity)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Stratified in proportion to priority: indices and importance weights (count,), the largest of these 1."""
@@ -59,8 +70,10 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         sums = priorities.cumsum()
         total = sums[-1]
         drawn = (np.arange(count) + rng.random(count)) * (total / count)
-        indices = np.searchsorted(sums, np.minimum(drawn, np.nextafter(total, 0)), side="right")
-        weights = (self.size * (priorities[indices] / total)) ** -self.beta
+        drawn = np.minimum(drawn, np.nextafter(total, 0))
+        indices = np.searchsorted(sums, drawn, side="right")
+        shares = priorities[indices] / total
+        weights = (self.size * shares) ** -self.beta
         return indices, (weights / weights.max()).astype(np.float32)
 
     def set_priorities(self, indices: NDArray[np.int64], errors: NDArray[np.floating]) -> None:
@@ -69,10 +82,13 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         self.largest = max(self.largest, float(priorities.max()))
         self.priorities[indices] = priorities**self.alpha
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> State:
         rows = slice(self.size)
-        stored = {"data": self.data.at(rows).snapshot(), "priorities": self.priorities[rows].copy()}
-        return super().snapshot() | stored
+        return {
+            **super().snapshot(),
+            "data": self.data.at(rows).snapshot(),
+            "priorities": self.priorities[rows].copy(),
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue, on a fresh replay, from a ``snapshot`` of one of the same capacity and fields."""
@@ -103,9 +119,14 @@ class StepsAhead(Resumable):
             return rows
         complete: list[tuple[int, int, int, int]] = []  # sequence, steps, state, action
         for sequence, steps in enumerate(self.open):
-            steps.append((int(rows.state[sequence]), int(rows.action[sequence])))
+            state, action = int(rows.state[sequence]), int(rows.action[sequence])
+            steps.append((state, action))
             while steps and (ended[sequence] or len(steps) == self.n):
                 complete.append((sequence, len(steps), *steps.pop(0)))
-        sequence, count, state, action = np.array(complete, dtype=np.int64).reshape(-1, 4).T
-        first = {"state": state.astype(np.int32), "action": action.astype(np.int16), "steps": count.astype(np.int16)}
-        return replace(rows.at(sequence), **first)
+        sequences, counts, states, actions = np.array(complete, dtype=np.int64).reshape(-1, 4).T
+        return replace(
+            rows.at(sequences),
+            state=states.astype(np.int32),
+            action=actions.astype(np.int16),
+            steps=counts.astype(np.int16),
+        )

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -63,14 +63,24 @@ class PaperQNetwork(nn.Module):
         """uint8 (N, H, W, C) -> features float32 (N, F)."""
         return self.features(images.permute(0, 3, 1, 2).float() / 255.0)
 
-    def forward(self, features: Tensor, windows: Tensor, lengths: Tensor) -> Tensor:
+    def forward(
+        self,
+        features: Tensor,
+        windows: Tensor,
+        lengths: Tensor,
+    ) -> Tensor:
         """Values float32 (n, A) of the last states of windows.
 
         ``windows`` int64 (n, T) say which of the features, float32 (N, F), each window has; of its T places the first
         ``lengths`` (n,) are real.
         """
         frames = features.index_select(0, windows.flatten()).view(*windows.shape, -1)
-        packed = pack_padded_sequence(frames, lengths.cpu(), batch_first=True, enforce_sorted=False)
+        packed = pack_padded_sequence(
+            frames,
+            lengths.cpu(),
+            batch_first=True,
+            enforce_sorted=False,
+        )
         _, last = self.gru(packed)
         return self.values(last[0])
 
@@ -143,7 +153,12 @@ class PaperLearner(Learner):
         return options * config.replay + (config.recurrence + STACK) * config.environments
 
     @torch.no_grad()
-    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+    def greedy(
+        self,
+        ids: Ids,
+        options: Ids,
+        age: Ids,
+    ) -> Ids:
         """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
         self.windows = np.column_stack([self.windows[:, 1:], ids])
         self.lengths = np.minimum(age + 1, self.config.recurrence)
@@ -161,7 +176,12 @@ class PaperLearner(Learner):
 
     def observe(self, moved: Transitions) -> None:
         path = np.column_stack([self.windows, moved.next_ids])
-        steps = Lived.cast(path, self.lengths, moved.actions, moved.terminated)
+        steps = Lived.cast(
+            path,
+            self.lengths,
+            moved.actions,
+            moved.terminated,
+        )
         for option in np.unique(moved.options):
             rows = moved.options == option
             member = self.members[option]
@@ -242,31 +262,20 @@ def left_aligned(windows: Ids, lengths: Ids) -> Ids:
 
 
 class PaperPolicies:
-    """Greedy policies of saved options that have a network each (Spec D2, D8), made when it is first played."""
+    """Greedy policies of saved options that have a network each (Spec D2, D8)."""
 
     def __init__(self, saved: SavedOptions):
-        self.weights, self.shape = dict(saved.weights), saved.shape
-        self.recurrence = saved.config["recurrence"]
+        self.saved, self.recurrence = saved, saved.config["recurrence"]
         if not isinstance(self.recurrence, int):
             fault = "these options remember their executions in another way than this version's"
             raise UserError(fault, f"recurrence={self.recurrence}", "Train them again with --set recurrence=N.")
         self.actions = saved.actions("0.values.2.bias", 1)
-        self._networks: dict[int, PaperQNetwork] = {}
-
-    def network(self, option: int) -> PaperQNetwork:
-        """An option's network."""
-        if option not in self._networks:
-            make = partial(PaperQNetwork, self.shape, self.actions)
-            self._networks[option] = load_fitting(make, below(f"{option}.", self.weights), FILE).eval()
-        return self._networks[option]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
-        return _Execution(self.network(option), self.recurrence)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the networks, which are the weights again."""
-        return {**self.__dict__, "_networks": {}}
+        make = partial(PaperQNetwork, self.saved.shape, self.actions)
+        network = load_fitting(make, below(f"{option}.", self.saved.weights), FILE)
+        return _Execution(network.eval(), self.recurrence)
 
 
 class _Execution:
@@ -280,6 +289,6 @@ class _Execution:
     def __call__(self, observation: Observations) -> int:
         self.window.append(observation)
         features = self.network.see(torch.from_numpy(np.stack(self.window)))
-        states = torch.arange(len(features))
-        values = self.network(features, states[None], torch.tensor([len(states)]))
+        count = len(features)
+        values = self.network(features, torch.arange(count)[None], torch.tensor([count]))
         return int(values.argmax())

@@ -1,5 +1,6 @@
 """Options played as the actions of a Gymnasium environment."""
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +9,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
@@ -17,6 +17,8 @@ from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.observations import Observations
 from hypogoal.options.learner import Policies
 from hypogoal.options.loop import offered_options
+from hypogoal.options.parts import Flags, Floats
+from hypogoal.options.termination import Terminations
 
 MASKED = ("warn", "run", "raise")  # what OptionEnv does when it is given an option that is masked
 
@@ -29,7 +31,8 @@ class Options:
         sub_goals: G names.
         members: K.
         ensembles: the termination classifiers, one ensemble per sub-goal.
-        policies: starts an option's greedy policy.
+        policies: starts an option's greedy policy, which :class:`OptionEnv` plays to its end.
+        ends: what ends options, as it was when they were saved; each environment plays with a copy.
         timeout: steps after which an option ends.
         mask_reached: whether options are withheld where their sub-goals already hold, as in training (D6).
         domain, domain_config: where they were trained, see :meth:`make_env`.
@@ -41,6 +44,7 @@ class Options:
     members: int
     ensembles: Sequence[Ensemble]
     policies: Policies
+    ends: Terminations
     timeout: int
     mask_reached: bool = True
     domain: str = ""
@@ -68,28 +72,26 @@ class Options:
         """For example ``open-red-door/2``."""
         return f"{self.sub_goals[option // self.members]}/{option % self.members}"
 
-    def predictions(self, observation: Observations) -> NDArray[np.bool_]:
-        """Which options' sub-goals hold in one observation (*obs): bool (G*K,)."""
-        return np.concatenate([ensemble.predictions(observation[None])[0] for ensemble in self.ensembles])
+    def log_odds(self, option: int, observation: Observations) -> Floats:
+        """How sure one option's member is of its sub-goal in an observation (*obs): float32 (1,)."""
+        ensemble = self.ensembles[option // self.members]
+        return ensemble.log_odds(observation[None])[:, option % self.members]
 
-    def offered(self, observation: Observations) -> NDArray[np.bool_]:
+    def offered(self, observation: Observations) -> Flags:
         """Spec D6: which options may start in an observation (*obs): bool (G*K,)."""
         if not self.mask_reached:
             return np.ones(self.count, dtype=np.bool_)
-        return offered_options(self.predictions(observation)[None])[0]
-
-    def holds(self, option: int, observation: Observations) -> bool:
-        """Whether one option's own sub-goal holds in an observation (*obs)."""
-        ensemble = self.ensembles[option // self.members]
-        return bool(ensemble.predictions(observation[None])[0, option % self.members])
+        log_odds = [ensemble.log_odds(observation[None]) for ensemble in self.ensembles]
+        return offered_options(self.ends.positive(np.concatenate(log_odds, axis=1)))[0]
 
 
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A Gymnasium environment whose actions are options (Spec E1): ``Discrete(G*K)``.
 
-    One step runs an option until its classifier is positive, its time is up or the episode ends. The reward is the sum
-    of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so that an agent can bootstrap with
-    gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached, ``info["option"]`` its name.
+    One step runs an option until its rule says so (by default: its classifier is positive), its time is up or the
+    episode ends. The reward is the sum of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so
+    that an agent can bootstrap with gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was
+    reached, ``info["option"]`` its name.
 
     sb3-contrib's MaskablePPO calls ``action_masks()``; for a ``gymnasium.vector.SyncVectorEnv``, use
     ``envs.call("action_masks")``. A masked option runs all the same, for agents without masks; ``info["masked"]`` says
@@ -118,17 +120,30 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     (True, 'open-red-door/2')
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], options: Options, gamma: float = 1.0, masked: str = MASKED[0]):
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma, masked=masked)
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        options: Options,
+        gamma: float = 1.0,
+        masked: str = MASKED[0],
+    ):
+        RecordConstructorArgs.__init__(
+            self,
+            _disable_deepcopy=True,
+            options=options,
+            gamma=gamma,
+            masked=masked,
+        )
         gymnasium.Wrapper.__init__(self, env)
         if masked not in MASKED:
             raise UserError("what should a masked option do?", f"masked={masked!r}", f"Choose of {', '.join(MASKED)}.")
         self.options, self.gamma, self.masked = options, gamma, masked
+        self.ends = copy.deepcopy(options.ends)
         self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._image: Observations | None = None
         self._warned = False
-        self._masks: NDArray[np.bool_] | None = None  # of the current observation, once they were asked for
+        self._masks: Flags | None = None  # of the current observation, once they were asked for
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Like the environment's own."""
@@ -136,7 +151,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._image, self._masks = self._look.read(observation), None
         return observation, info
 
-    def action_masks(self) -> NDArray[np.bool_]:
+    def action_masks(self) -> Flags:
         """Spec D6: which options may start here, bool (G*K,)."""
         image = self._current()
         if self._masks is None:
@@ -158,6 +173,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if masked and self.masked != "run":
             self._refuse(option)
         act = self.options.policies(option)
+        running = np.array([option])
         total, duration, reached, ended = 0.0, 0, False, False
         image, observation = self._current(), None
         terminated = truncated = False
@@ -166,8 +182,8 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observation, reward, terminated, truncated, info = self.env.step(act(image))
             image = self._look.read(observation)
             total += self.gamma**duration * float(reward)
+            reached = bool(self.ends.reached(self.options.log_odds(option, image), running, np.array([duration]))[0])
             duration += 1
-            reached = self.options.holds(option, image)
             ended = reached or terminated or truncated or duration >= self.options.timeout
         self._image, self._masks = image, None
         info = info | {"duration": duration, "reached": reached, "option": self.options.name(option), "masked": masked}

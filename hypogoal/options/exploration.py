@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.options.config import LearnerConfig
+from hypogoal.options.parts import Ids
 
 EXPONENT, LONGEST = 2.0, 10_000  # of how long a random action lasts, P(n) ~ n^-2, at most so many steps
 
@@ -18,15 +19,26 @@ class Exploration(Resumable):
     Source: Dabney, Ostrovski and Barreto 2020, Temporally-Extended epsilon-Greedy Exploration.
     """
 
-    CHANGING = ("_kept", "_left")  # the generator is its owner's
+    CHANGING = ("kept", "left")  # the generator is its owner's
 
-    def __init__(self, config: LearnerConfig, environments: int, actions: int, rng: np.random.Generator):
+    def __init__(
+        self,
+        config: LearnerConfig,
+        environments: int,
+        actions: int,
+        rng: np.random.Generator,
+    ):
         self.actions, self.rng = actions, rng
         self.persistent = config.exploration == "persistent"
-        self._kept = np.zeros(environments, dtype=np.int64)
-        self._left = np.zeros(environments, dtype=np.int64)
+        self.kept = np.zeros(environments, dtype=np.int64)  # random actions
+        self.left = np.zeros(environments, dtype=np.int64)  # steps for which these still last
 
-    def mix(self, policy: NDArray[np.int64], epsilon: NDArray[np.float64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def mix(
+        self,
+        policy: Ids,
+        epsilon: NDArray[np.float64],
+        age: Ids,
+    ) -> Ids:
         """Actions int64 (E,): the policy's (E,), or random ones, by ``epsilon`` (E,), ``age`` (E,) steps after
         executions began.
         """
@@ -35,10 +47,11 @@ class Exploration(Resumable):
         drawn = self.rng.integers(self.actions, size=count)
         if not self.persistent:
             return np.where(begins, drawn, policy)
-        self._left[age == 0] = 0
-        begins &= self._left == 0
-        self._kept[begins] = drawn[begins]
-        self._left[begins] = np.minimum(self.rng.zipf(EXPONENT, size=count), LONGEST)[begins]
-        random = self._left > 0
-        self._left[random] -= 1
-        return np.where(random, self._kept, policy)
+        self.left[age == 0] = 0
+        begins &= self.left == 0
+        lengths = np.minimum(self.rng.zipf(EXPONENT, size=count), LONGEST)
+        self.kept[begins] = drawn[begins]
+        self.left[begins] = lengths[begins]
+        random = self.left > 0
+        self.left[random] -= 1
+        return np.where(random, self.kept, policy)

@@ -71,7 +71,13 @@ class LightLearner(Learner):
         engine = self.engine
         with DrawsFrom(torch_generator(seed, "option-weights")):
             shape, embedding = engine.observation_shape, config.embedding
-            network = LightQNetwork(shape, self.options, engine.n_actions, engine.standard, embedding)
+            network = LightQNetwork(
+                shape,
+                self.options,
+                engine.n_actions,
+                engine.standard,
+                embedding,
+            )
         return network.to(self.device)
 
     @staticmethod
@@ -80,13 +86,25 @@ class LightLearner(Learner):
         return config.replay + (2 * config.n_step + STACK) * config.environments
 
     @torch.no_grad()
-    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+    def greedy(
+        self,
+        ids: Ids,
+        options: Ids,
+        age: Ids,
+    ) -> Ids:
         values = apply_to_states(self.networks.online, self.engine, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
         one = np.ones(len(moved.ids), np.int64)
-        steps = Lessons.cast(moved.ids, moved.actions, moved.next_ids, one, moved.options, moved.terminated)
+        steps = Lessons.cast(
+            moved.ids,
+            moved.actions,
+            moved.next_ids,
+            one,
+            moved.options,
+            moved.terminated,
+        )
         rows = self.ahead.add(steps, moved.ended)
         self.replay.add(rows)
         inside, reached = self._judged(rows)
@@ -192,8 +210,20 @@ class LightPolicies:
         weights, embedding = below("online.", saved.weights), saved.config["embedding"]
         actions = saved.actions("online.heads.weight", saved.count)
         standard = standard_of(saved.shape) if "cells.mean" in weights else None  # the weights' own replaces it
-        make = partial(LightQNetwork, saved.shape, saved.count, actions, standard, embedding)
-        self.network = load_fitting(make, weights, FILE, custom=embedding not in (AUTO, *NETWORKS))
+        make = partial(
+            LightQNetwork,
+            saved.shape,
+            saved.count,
+            actions,
+            standard,
+            embedding,
+        )
+        self.network = load_fitting(
+            make,
+            weights,
+            FILE,
+            custom=embedding not in (AUTO, *NETWORKS),
+        )
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""

@@ -71,7 +71,6 @@ class OptionLoop(Resumable):
         self.age = np.zeros(count, dtype=np.int64)
         self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
-        self._checked = False  # the engine's first step
         engine.reset()
 
     def step(self) -> dict[str, float]:
@@ -84,15 +83,16 @@ class OptionLoop(Resumable):
 
         Without ``learning`` the agent is frozen: options are greedy, and nothing is kept that could be learned from.
         """
+        first = (self.option == NONE).all()
         self._choose()
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=learning)
         layouts = [*self.engine.layouts.now] if self.engine.layouts else None
         step = self.engine.step(actions)
-        if not self._checked:
+        if first:
             check_step(self.engine, step)
-            self._checked = True
-        reached = self.terminations.reached(step.next_ids, option, self.age)
+        log_odds = self.terminations.log_odds(step.next_ids, option)
+        reached = self.terminations.reached(log_odds, option, self.age)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated

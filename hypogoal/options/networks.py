@@ -32,7 +32,12 @@ class CellEmbedding(nn.Module):
     def __init__(self, observation_shape: tuple[int, ...]):
         super().__init__()
         height, width, depth = observation_shape
-        self.conv = nn.Conv2d(depth, self.CHANNELS, CELL, stride=CELL)
+        self.conv = nn.Conv2d(
+            depth,
+            self.CHANNELS,
+            CELL,
+            stride=CELL,
+        )
         self._more = (0, 0, 0, -width % CELL, 0, -height % CELL)  # no channels; columns and rows behind the last
         self.features = self.CHANNELS * -(-height // CELL) * -(-width // CELL)
         self._tiles: NDArray[np.uint8] | None = None
@@ -66,17 +71,36 @@ class PictureEmbedding(nn.Module):
     def __init__(self, observation_shape: tuple[int, ...]):
         super().__init__()
         height, width, depth = observation_shape
-        self.first = nn.Conv2d(depth, 16, 6, 6, padding=((-height % 6 + 1) // 2, (-width % 6 + 1) // 2))
-        self.second = nn.Conv2d(16, 32, 3, 2, padding=(1 - -(-height // 6) % 2, 1 - -(-width // 6) % 2))
+        self.first = nn.Conv2d(
+            depth,
+            16,
+            6,
+            6,
+            padding=((-height % 6 + 1) // 2, (-width % 6 + 1) // 2),
+        )
+        self.second = nn.Conv2d(
+            16,
+            32,
+            3,
+            2,
+            padding=(1 - -(-height // 6) % 2, 1 - -(-width // 6) % 2),
+        )
         with torch.no_grad():
-            self.features = self.second(self.first(torch.zeros(1, depth, height, width))).numel()
+            blank = torch.zeros(1, depth, height, width)
+            self.features = self.second(self.first(blank)).numel()
 
     def forward(self, images: Tensor) -> Tensor:
         """uint8 or float32 (N, H, W, C), 0 to 255 -> float32 (N, features)."""
         pixels = images.permute(0, 3, 1, 2).float()
         # The first weights are scaled instead of the pixels: the same function, on a thousandth of the numbers.
         layer = self.first
-        first = nn.functional.conv2d(pixels, layer.weight / 255.0, layer.bias, layer.stride, layer.padding)
+        first = nn.functional.conv2d(
+            pixels,
+            layer.weight / 255.0,
+            layer.bias,
+            layer.stride,
+            layer.padding,
+        )
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
@@ -99,7 +123,12 @@ class OwnEmbedding(FullView):
     It stays in evaluation mode: what BatchNorm and Dropout make of a state depends on no other state.
     """
 
-    def __init__(self, name: str, observation_shape: tuple[int, ...], standard: Standard | None = None):
+    def __init__(
+        self,
+        name: str,
+        observation_shape: tuple[int, ...],
+        standard: Standard | None = None,
+    ):
         super().__init__(observation_shape, standard)
         network = build_network(name, observation_shape, None)
         last = network[-1]
@@ -139,7 +168,12 @@ class LightNetwork(nn.Module):
     def __init__(self, cells: Embedding):
         super().__init__()
         self.cells = cells
-        self.trunk = nn.Sequential(nn.Linear(cells.features, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU())
+        self.trunk = nn.Sequential(
+            nn.Linear(cells.features, WIDTH),
+            nn.ReLU(),
+            nn.Linear(WIDTH, WIDTH),
+            nn.ReLU(),
+        )
 
     def forward(self, images: Tensor) -> Tensor:
         """What :meth:`head` gives for observations (N, *obs); see also :class:`Pixels`."""

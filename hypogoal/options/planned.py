@@ -47,13 +47,25 @@ class PlannedLearner(Learner):
     def reach(config: OptionConfig, options: int) -> int:
         return 0
 
-    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+    def greedy(
+        self,
+        ids: Ids,
+        options: Ids,
+        age: Ids,
+    ) -> Ids:
         """Which of the plan's actions each option prefers."""
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
         nearest: NDArray[np.int64] = ahead.argmin(axis=1)
         return nearest
 
-    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
+    def act(
+        self,
+        ids: Ids,
+        options: Ids,
+        age: Ids,
+        *,
+        explore: bool = True,
+    ) -> Ids:
         """There is nothing to explore."""
         return self.actions[self.greedy(ids, options, age)]
 
@@ -73,7 +85,12 @@ class PlannedLearner(Learner):
         """There are none."""
 
 
-def plan_of(engine: Engine, terminations: Terminations, config: OptionConfig, starts: Ids | None = None) -> Plan:
+def plan_of(
+    engine: Engine,
+    terminations: Terminations,
+    config: OptionConfig,
+    starts: Ids | None = None,
+) -> Plan:
     """The engine's plan, from these states or where episodes begin; a ``UserError`` where options cannot be planned."""
     if type(terminations) is not Terminations:
         fault = "only options that end at a single positive prediction can be planned"

@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Outcome
+from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 
 STOPS_KEPT = 128  # per option
@@ -39,18 +41,23 @@ class Recorder(Resumable):
     Of an engine that forgets states, stops are kept as pictures.
     """
 
-    CHANGING = ("episodes", "choices", "stops", "executions", "_pictures", "_states", "_window", "_window_start")
+    CHANGING = ("episodes", "choices", "stops", "executions", "pictures", "paths", "counts", "counted_from")
 
-    def __init__(self, options: int, engine: Engine, window: int = 5_000):
+    def __init__(
+        self,
+        options: int,
+        engine: Engine,
+        window: int = 5_000,
+    ):
         self.options, self.engine, self.window = options, engine, window
         self.episodes = EpisodeRecorder(engine.count)
         self.choices: list[tuple[int, int, int, int, float, int, int]] = []
         self.stops: list[deque[int]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
         self.executions: list[deque[Execution]] = [deque(maxlen=LAST) for _ in range(options)]
-        self._pictures: list[deque[Observations]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
-        self._states: list[list[int]] = [[] for _ in range(engine.count)]  # that running executions came to
-        self._window_start = 0
-        self._window = np.zeros((options, 5))  # offered, chosen, expected, reached, duration
+        self.pictures: list[deque[Observations]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
+        self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # states that running executions came to
+        self.counts = np.zeros((options, 5))  # in the window: offered, chosen, expected, reached, duration
+        self.counted_from = 0  # the step at which the window began
 
     @property
     def steps(self) -> int:
@@ -59,62 +66,81 @@ class Recorder(Resumable):
 
     def start_at(self, steps: int) -> None:
         """Environment steps spent before (those of ``train-options``) count in every curve."""
-        self.episodes.steps = self._window_start = steps
+        self.episodes.steps = self.counted_from = steps
 
     def see(self, step: Step) -> None:
         """A step of every environment."""
         self.episodes.see(step)
-        for states, state in zip(self._states, step.next_ids.tolist(), strict=True):
-            states.append(state)
+        for path, state in zip(self.paths, step.next_ids.tolist(), strict=True):
+            path.append(state)
 
-    def chose(self, options: NDArray[np.int64], offered: NDArray[np.bool_]) -> None:
+    def chose(self, options: Ids, offered: Flags) -> None:
         """Decisions: the options chosen (n,) among those offered, bool (n, O)."""
-        if self.steps - self._window_start >= self.window:
+        if self.steps - self.counted_from >= self.window:
             self.flush()
-        self._window[:, 0] += offered.sum(0)
-        np.add.at(self._window[:, 1], options, 1)
-        self._window[:, 2] += (offered / offered.sum(1, keepdims=True)).sum(0)
+        self.counts[:, 0] += offered.sum(0)
+        np.add.at(self.counts[:, 1], options, 1)
+        self.counts[:, 2] += (offered / offered.sum(1, keepdims=True)).sum(0)
 
     def finished(self, outcome: Outcome) -> None:
         """Executions that ended."""
-        options, reached, ids = outcome.options, outcome.reached, outcome.next_ids
-        np.add.at(self._window[:, 3], options, reached)
-        np.add.at(self._window[:, 4], options, outcome.durations)
-        columns = (options, outcome.durations, reached, outcome.inside, outcome.terminated)
-        environments, began = outcome.environments.tolist(), outcome.began.tolist()
-        states = [self._states[environment] for environment in environments]
-        for row in zip(*(values.tolist() for values in columns), states, began, strict=True):
-            self.executions[row[0]].append(Execution(self.steps, *row))
-        for environment in environments:
-            self._states[environment] = []
-        for option, identity in zip(options[reached], ids[reached], strict=True):
-            self.stops[option].append(int(identity))
-        if self.engine.memory is not None and reached.any():
-            for option, picture in zip(options[reached], self.engine.images(ids[reached]), strict=True):
-                self._pictures[option].append(picture)
+        np.add.at(self.counts[:, 3], outcome.options, outcome.reached)
+        np.add.at(self.counts[:, 4], outcome.options, outcome.durations)
+        forgets = self.engine.memory is not None
+        for row, environment in enumerate(outcome.environments.tolist()):
+            option = int(outcome.options[row])
+            run = Execution(
+                step=self.steps,
+                option=option,
+                duration=int(outcome.durations[row]),
+                reached=bool(outcome.reached[row]),
+                inside_at_start=bool(outcome.inside[row]),
+                terminated=bool(outcome.terminated[row]),
+                states=self.paths[environment],
+                began=int(outcome.began[row]),
+            )
+            self.executions[option].append(run)
+            self.paths[environment] = []
+            if run.reached:
+                stop = outcome.next_ids[row]
+                self.stops[option].append(int(stop))
+                if forgets:
+                    self.pictures[option].append(self.engine.images(stop[None])[0])
 
     def recent(self, *, restarted: bool) -> dict[str, float]:
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
         if not restarted:
             return self.episodes.recent() if self.episodes else {}
-        rows = self._executions()
-        names = ("reached", "terminated", "duration") if rows else ()
-        return {name: sum(getattr(row, name) for row in rows) / len(rows) for name in names}
+        runs = self._executions()
+        if not runs:
+            return {}
+        return {
+            "reached": fmean(run.reached for run in runs),
+            "terminated": fmean(run.terminated for run in runs),
+            "duration": fmean(run.duration for run in runs),
+        }
 
     def _executions(self) -> list[Execution]:
-        return [execution for option in self.executions for execution in option]
+        """The last of all options, option by option."""
+        runs: list[Execution] = []
+        for of_option in self.executions:
+            runs.extend(of_option)
+        return runs
 
     def flush(self) -> None:
         """Close the current window of choices."""
-        for option, (offered, chosen, expected, reached, duration) in enumerate(self._window.tolist()):
+        for option, (offered, chosen, expected, reached, duration) in enumerate(self.counts.tolist()):
             row = (int(offered), int(chosen), round(expected, 6), int(reached), int(duration))
             self.choices.append((self.steps, option, *row))
-        self._window_start = self.steps
-        self._window[:] = 0
+        self.counted_from = self.steps
+        self.counts[:] = 0
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        self.executions = [deque((Execution(*row) for row in rows), LAST) for rows in self.executions]
+        for runs in self.executions:
+            restored = [Execution(*run) for run in runs]
+            runs.clear()
+            runs.extend(restored)
 
     def write(self, folder: Path) -> None:
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
@@ -124,31 +150,40 @@ class Recorder(Resumable):
         with create_hdf5(folder / "terminations.h5") as file:
             for option, stops in enumerate(self.stops):
                 if stops:
-                    kept = self._pictures[option]
+                    kept = self.pictures[option]
                     states = np.stack(kept) if kept else self.engine.images(np.array(stops, dtype=np.int64))
-                    file.create_dataset(str(option), data=states, compression="gzip", compression_opts=1)
+                    file.create_dataset(
+                        str(option),
+                        data=states,
+                        compression="gzip",
+                        compression_opts=1,
+                    )
 
-    def write_executions(
-        self, folder: Path, distances: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
-    ) -> None:
+    def write_executions(self, folder: Path, distances: Callable[[Ids, Ids], Ids]) -> None:
         """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
 
         ``distances`` are of positions (n, 3) from where the sub-goals of their options (n,) truly hold, int (n,).
         """
-        executions = self._executions()
-        stops = np.array([execution.states[-1] for execution in executions], dtype=np.int64)
+        runs = self._executions()
+        stops = np.array([run.states[-1] for run in runs], dtype=np.int64)
+        options = np.array([run.option for run in runs], dtype=np.int64)
         places = self.engine.positions(stops)
-        away = distances(places, np.array([execution.option for execution in executions], dtype=np.int64))
-        Executions.of_rows(
-            (run.step, run.option, run.duration, run.reached, run.inside_at_start, run.terminated, *place, far)
-            for run, place, far in zip(executions, places.tolist(), away.tolist(), strict=True)
-        ).write(folder)
+        away = distances(places, options)
+        rows = []
+        for run, place, distance in zip(
+            runs,
+            places.tolist(),
+            away.tolist(),
+            strict=True,
+        ):
+            rows.append((*run[:6], *place, distance))
+        Executions.of_rows(rows).write(folder)
 
     def write_exploits(
         self,
         folder: Path,
-        near: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]],
-        log_odds: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float32]],
+        near: Callable[[Ids, Ids], Flags],
+        log_odds: Callable[[Ids, Ids], Floats],
     ) -> None:
         """Spec H5: ``exploits.csv`` into ``folder``, of the same executions: how sure its own classifier was at most.
 
@@ -160,6 +195,11 @@ class Recorder(Resumable):
             states = np.array(run.states, dtype=np.int64)
             options = np.full_like(states, run.option)
             is_near, sure = near(states, options), log_odds(states, options)
-            best_near, best_far = (sure[part].max().item() if part.any() else math.nan for part in (is_near, ~is_near))
+            best_near, best_far = highest(sure[is_near]), highest(sure[~is_near])
             rows.append((run.step, run.option, run.reached, is_near[-1], best_near, best_far))
         Exploits.of_rows(rows).write(folder)
+
+
+def highest(values: NDArray[np.floating]) -> float:
+    """The highest of some numbers, NaN of none."""
+    return values.max().item() if len(values) else math.nan

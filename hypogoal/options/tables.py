@@ -18,6 +18,7 @@ from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, write_table
 from hypogoal.learners.episodes import LAST
+from hypogoal.options.parts import Flags, Ids
 
 MAX_INTEGER = 2**53  # integers that a float holds exactly
 MAX_OPTIONS = 2**16
@@ -45,14 +46,20 @@ class Table(Columns):
 
     def write(self, folder: Path) -> None:
         """The file of this table into ``folder``; a NaN is an empty cell."""
-        rows = [["" if value != value else value for value in row] for row in self.rows()]
+        rows = []
+        for row in self.rows():
+            rows.append(["" if value != value else value for value in row])
         write_table(folder / self.FILE, self.names(), rows)
 
     def rows(self) -> list[tuple[Any, ...]]:
         """Plain numbers, row by row; truth values are 0 and 1."""
-        columns = [getattr(self, name) for name in self.names()]
-        lists = [(values.astype(np.int64) if values.dtype == np.bool_ else values).tolist() for values in columns]
-        return list(zip(*lists, strict=True))
+        columns = []
+        for name in self.names():
+            values = getattr(self, name)
+            if values.dtype == np.bool_:
+                values = values.astype(np.int64)
+            columns.append(values.tolist())
+        return list(zip(*columns, strict=True))
 
 
 @dataclass(frozen=True)
@@ -61,12 +68,12 @@ class Episodes(Table):
 
     FILE = "episodes.csv"
 
-    step: NDArray[np.int64]  # environment steps when it ended, summed over parallel environments and stages
-    length: NDArray[np.int64]  # steps
+    step: Ids  # environment steps when it ended, summed over parallel environments and stages
+    length: Ids  # steps
     reward: NDArray[np.float64]  # undiscounted
-    terminated: NDArray[np.bool_]  # it reached a terminal state; else it was cut at the cap
+    terminated: Flags  # it reached a terminal state; else it was cut at the cap
     # Spec F5: as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
-    succeeded: NDArray[np.bool_]
+    succeeded: Flags
 
     def last(self, count: int = LAST) -> Episodes:
         """The last ``count`` episodes, or all where there are fewer."""
@@ -79,13 +86,13 @@ class Choices(Table):
 
     FILE = "choices.csv"
 
-    step: NDArray[np.int64]
-    option: NDArray[np.int64]  # g*K + k
-    offered: NDArray[np.int64]  # decisions in which it was offered
-    chosen: NDArray[np.int64]  # decisions for it
+    step: Ids
+    option: Ids  # g*K + k
+    offered: Ids  # decisions in which it was offered
+    chosen: Ids  # decisions for it
     expected: NDArray[np.float64]  # decisions for it under uniform-random choice
-    reached: NDArray[np.int64]  # executions that reached its sub-goal
-    duration: NDArray[np.int64]  # steps of its executions
+    reached: Ids  # executions that reached its sub-goal
+    duration: Ids  # steps of its executions
 
     def total(self, name: str, options: int) -> NDArray[np.float64]:
         """The sum of column ``name`` over all windows, (O,)."""
@@ -98,22 +105,22 @@ class Executions(Table):
 
     FILE = "executions.csv"
 
-    step: NDArray[np.int64]  # environment steps when it ended
-    option: NDArray[np.int64]  # g*K + k
-    duration: NDArray[np.int64]  # steps
-    reached: NDArray[np.bool_]  # its own termination classifier ended it
-    inside_at_start: NDArray[np.bool_]  # that classifier's prediction was positive where it began
-    terminated: NDArray[np.bool_]  # the episode ended in a terminal state: the agent died
-    room: NDArray[np.int64]  # where it stopped; x and y too
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
-    distance: NDArray[np.int64]  # from there to the nearest true sub-goal, in the domain's units
+    step: Ids  # environment steps when it ended
+    option: Ids  # g*K + k
+    duration: Ids  # steps
+    reached: Flags  # its own termination classifier ended it
+    inside_at_start: Flags  # that classifier's prediction was positive where it began
+    terminated: Flags  # the episode ended in a terminal state: the agent died
+    room: Ids  # where it stopped; x and y too
+    x: Ids
+    y: Ids
+    distance: Ids  # from there to the nearest true sub-goal, in the domain's units
 
     def of(self, option: int, last: int = LAST) -> Executions:
         """The last executions of one option."""
         return self.at(np.flatnonzero(self.option == option)[-last:])
 
-    def positions(self) -> NDArray[np.int64]:
+    def positions(self) -> Ids:
         """Where they stopped, (n, 3)."""
         return np.stack([self.room, self.x, self.y], axis=1)
 
@@ -124,10 +131,10 @@ class Exploits(Table):
 
     FILE = "exploits.csv"
 
-    step: NDArray[np.int64]  # environment steps when it ended
-    option: NDArray[np.int64]  # g*K + k
-    reached: NDArray[np.bool_]  # its own termination classifier ended it
-    near: NDArray[np.bool_]  # that was near its true sub-goal
+    step: Ids  # environment steps when it ended
+    option: Ids  # g*K + k
+    reached: Flags  # its own termination classifier ended it
+    near: Flags  # that was near its true sub-goal
     best_near: NDArray[np.float64]  # highest log-odds near the true sub-goal; NaN where it did not come near
     best_far: NDArray[np.float64]  # highest log-odds far from it; NaN where it always was near
 
@@ -143,16 +150,19 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, ND
         reader = csv.DictReader(io.StringIO(text, newline=""))
         header = list(reader.fieldnames or ())
         columns = header if columns is None else columns
+        rows = []
+        for row in reader:
+            rows.append([_number(row[name], name) for name in columns])
         if not set(columns) <= set(header):
             raise KeyError(path)
-        rows = [[_number(row[name], name) for name in columns] for row in reader]
     except (ValueError, KeyError, TypeError, csv.Error):
         raise UserError("the table is damaged", path, AGAIN) from None
     values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
-    # A NaN elsewhere is no number, and an integer column must not lose digits.
-    if not ((np.abs(values) < MAX_INTEGER) | (np.isnan(values) & np.isin(columns, BLANK))).all():
+    blank = np.isnan(values) & np.isin(columns, BLANK)
+    exact = np.abs(values) < MAX_INTEGER  # no NaN, and an integer that has not lost digits
+    if not (exact | blank).all():
         raise UserError("a number in the table is missing or too large", path, AGAIN)
-    table = {name: values[:, index] for index, name in enumerate(columns)}
+    table = dict(zip(columns, values.T, strict=True))
     options = table.get("option", np.zeros(0))
     if not ((options >= 0) & (options < MAX_OPTIONS)).all():
         raise UserError("an option in the table has an impossible number", path, AGAIN)

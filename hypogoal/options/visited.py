@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Resumable
@@ -16,6 +15,7 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected, Dataset, States, open_dataset, write_dataset
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.observations import Observations
+from hypogoal.options.parts import Flags, Ids
 
 VISITED = "visited.h5"
 ORIGINS = ("action", "previous_action")  # that led to a state; -1 where there was none
@@ -29,88 +29,97 @@ class Visited(Resumable):
     else their layout's seed, ``layout_seed`` where the engine does not say.
     """
 
-    def __init__(self, engine: Engine, most: int, layout_seed: int, seed: int):
+    def __init__(
+        self,
+        engine: Engine,
+        most: int,
+        layout_seed: int,
+        seed: int,
+    ):
         self.engine, self.most, self.layout_seed = engine, most, layout_seed
-        self._key = seed_for(seed, "visited").to_bytes(16, "little")
-        self._forgets = engine.memory is not None  # and gives every step a new id
-        self._known = np.zeros(1024, dtype=np.bool_)
-        self._before = np.full(engine.count, -1, dtype=np.int64)
-        self._kept: dict[int, tuple[Observations, NDArray[np.int64]]] = {}
-        self._worst: list[int] = []  # a heap of the hashes kept, negative: the largest first
+        self.names = (*ORIGINS, *(engine.position_names or ("layout_seed",)))  # of what is kept of origins
+        self.key = seed_for(seed, "visited").to_bytes(16, "little")
+        self.before = np.full(engine.count, -1, dtype=np.int64)  # the last actions
+        self.kept: dict[int, tuple[Observations, Ids]] = {}  # by their hashes: pictures and origins
+        self.largest: list[int] = []  # a heap of the hashes kept, negative
 
     def see(
         self,
-        ids: NDArray[np.int64],
-        actions: NDArray[np.int64],
-        over: NDArray[np.bool_],
+        ids: Ids,
+        actions: Ids,
+        over: Flags,
         layouts: Sequence[int] | None = None,
     ) -> None:
         """States (E,), the actions (E,) that led to them, whether episodes are over, bool (E,), and their layouts."""
-        fresh = np.arange(len(ids)) if self._forgets else self._unknown(ids)
-        if len(fresh):
-            where = np.array(layouts if layouts else [self.layout_seed] * len(ids))[fresh, None]
-            pictures = self.engine.images(ids[fresh])
-            places = self.engine.positions(ids[fresh]) if self.engine.position_names else where
-            steps = np.stack([actions[fresh], self._before[fresh]], axis=1)
-            for picture, origin in zip(pictures, np.concatenate([steps, places], axis=1), strict=True):
-                self._offer(picture, origin)
-        self._before = np.where(over, -1, actions)
+        if self.engine.position_names:
+            places = self.engine.positions(ids)
+        else:
+            places = np.array(layouts or [self.layout_seed] * len(ids))
+        origins = np.column_stack([actions, self.before, places])
+        for picture, origin in zip(self.engine.images(ids), origins, strict=True):
+            self._offer(picture, origin)
+        self.before = np.where(over, -1, actions)
 
-    def _unknown(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        highest = int(ids.max()) + 1
-        if highest > len(self._known):
-            self._known = np.concatenate([self._known, np.zeros(max(highest, len(self._known)), np.bool_)])
-        fresh = np.flatnonzero(~self._known[ids])
-        self._known[ids] = True
-        return fresh
-
-    @property
-    def origins(self) -> tuple[str, ...]:
-        """What is kept of where states come from."""
-        return (*ORIGINS, *(self.engine.position_names or ("layout_seed",)))
-
-    def _offer(self, picture: Observations, origin: NDArray[np.int64]) -> None:
-        digest = int.from_bytes(blake2b(picture.tobytes(), digest_size=7, key=self._key).digest(), "little")
-        if digest in self._kept or (len(self._kept) == self.most and digest > -self._worst[0]):
+    def _offer(self, picture: Observations, origin: Ids) -> None:
+        digest = int.from_bytes(blake2b(picture.tobytes(), digest_size=7, key=self.key).digest(), "little")
+        full = len(self.kept) == self.most
+        if digest in self.kept or (full and digest > -self.largest[0]):
             return
-        self._kept[digest] = (picture.copy(), origin)
-        heapq.heappush(self._worst, -digest)
-        if len(self._kept) > self.most:
-            del self._kept[-heapq.heappop(self._worst)]
+        self.kept[digest] = (picture.copy(), origin)
+        heapq.heappush(self.largest, -digest)
+        if full:
+            del self.kept[-heapq.heappop(self.largest)]
 
     def states(self) -> States:
         """The states kept, in the order of their hashes; their labels are not known."""
-        kept = [self._kept[digest] for digest in sorted(self._kept)]
+        kept = [self.kept[digest] for digest in sorted(self.kept)]
         pictures = self.engine.room_for(len(kept), None)
-        for row, (picture, _) in enumerate(kept):
+        origins = np.empty((len(kept), len(self.names)), np.int64)
+        for row, (picture, origin) in enumerate(kept):
             pictures[row] = picture
-        columns = np.array([origin for _, origin in kept], np.int64).reshape(-1, len(self.origins)).T
-        return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.origins, columns, strict=True)))
+            origins[row] = origin
+        return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.names, origins.T, strict=True)))
 
-    def write(self, folder: Path, domain: Domain, ensemble_config: Mapping[str, Any], seed: int) -> None:
+    def write(
+        self,
+        folder: Path,
+        domain: Domain,
+        ensemble_config: Mapping[str, Any],
+        seed: int,
+    ) -> None:
         """``visited.h5`` into ``folder``: a data file of unlabelled states, of the ensemble's domain."""
         sub_goals = domain.usual_sub_goals
         none = States(self.engine.room_for(0, None), np.zeros((0, len(sub_goals)), np.bool_))
-        collected = Collected(self.engine.observation_shape, sub_goals, none, self.states(), none)
+        collected = Collected(
+            self.engine.observation_shape,
+            sub_goals,
+            none,
+            self.states(),
+            none,
+        )
         named = {"domain": ensemble_config["domain"], "config": ensemble_config["domain_config"]}
-        write_dataset(folder / VISITED, collected, **named, seed=seed)
+        write_dataset(
+            folder / VISITED,
+            collected,
+            **named,
+            seed=seed,
+        )
 
     def snapshot(self) -> dict[str, Any]:
-        digests = sorted(self._kept)
+        states = self.states()
         return {
-            "known": self._known.copy(),
-            "before": self._before.copy(),
-            "digests": np.array(digests, np.int64),
-            "pictures": self.states().observations,
-            "origins": np.array([self._kept[digest][1] for digest in digests], np.int64).reshape(-1, len(self.origins)),
+            "before": self.before.copy(),
+            "digests": np.array(sorted(self.kept), np.int64),
+            "pictures": states.observations,
+            "origins": np.column_stack([states.origins[name] for name in self.names]),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        self._known, self._before = snapshot["known"].copy(), snapshot["before"].copy()
-        rows = zip(snapshot["digests"].tolist(), snapshot["pictures"], snapshot["origins"], strict=True)
-        self._kept = {digest: (picture, origin) for digest, picture, origin in rows}
-        self._worst = [-digest for digest in self._kept]
-        heapq.heapify(self._worst)
+        self.before = snapshot["before"].copy()
+        states = zip(snapshot["pictures"], snapshot["origins"], strict=True)
+        self.kept = dict(zip(snapshot["digests"].tolist(), states, strict=True))
+        self.largest = [-digest for digest in self.kept]
+        heapq.heapify(self.largest)
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:

@@ -395,7 +395,7 @@ def execution(rule: Terminations, option: int, states: tuple[int, ...]) -> list[
     """What is said at each state, and that the execution ends with the last."""
     options, said = np.array([option]), []
     for age, state in enumerate(states):
-        said.append(bool(rule.reached(np.array([state]), options, np.array([age]))[0]))
+        said.append(bool(rule.reached(LOG_ODDS[[state], options], options, np.array([age]))[0]))
     rule.finished(np.array([0]), options, np.array([said[-1]]))
     return said
 
@@ -453,7 +453,7 @@ def test_patience_goes_on_where_it_was() -> None:
 
     def play(rule: Patience, part: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]) -> None:
         for states, options, ends in part:
-            said = rule.reached(states, options, np.where(ends, 0, 1))
+            said = rule.reached(LOG_ODDS[states, options], options, np.where(ends, 0, 1))
             rule.finished(np.flatnonzero(ends), options[ends], said[ends])
 
     play(whole, steps)

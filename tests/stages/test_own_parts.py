@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+import torch
 from command_line import refuses, run, settings
 from numpy.typing import NDArray
 from torch import Tensor
@@ -15,12 +17,18 @@ from torch import Tensor
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
+from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.meta.episodes import agent_of, play_episode
-from hypogoal.options.choosers import Chooser, Offered
-from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.parts import Ids
+from hypogoal.options.choosers import Chooser, Offered, load_chooser
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.env import OptionEnv, Options
+from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions, load_learner, make_policies
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.parts import Flags, Floats, Ids
+from hypogoal.options.recording import Recorder
 from hypogoal.options.tables import Choices
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import Terminations, learned_terminations, saved_terminations
 
 FEW = [*settings("steps=300", "environments=4", "random_episodes=5"), "-q"]
 
@@ -32,8 +40,16 @@ class FirstOffered(Chooser):
         return offered.argmax(1)
 
 
+def preferred(picture: NDArray[np.uint8], option: int, actions: int) -> int:
+    return (int(picture.sum()) // 7 + option) % actions
+
+
 class Straight(Learner):
-    """Every option plays its number modulo the actions; it counts the steps and learns nothing."""
+    """Every option plays by its number and the sum of the pixels; it counts the steps and learns nothing."""
+
+    @classmethod
+    def policies(cls, saved: SavedOptions) -> Policies:
+        return lambda option: lambda picture: preferred(picture, option, 7)
 
     @classmethod
     def refuse(cls, config: Any, engine: Engine) -> None:
@@ -42,14 +58,15 @@ class Straight(Learner):
             raise UserError("straight options have no experience", f"experience={config.experience}", "Leave it out.")
 
     def build(self, config: Any, seed: int) -> None:
-        self.preferred = np.arange(self.options) % self.engine.n_actions
+        self.actions = self.engine.n_actions
 
     @staticmethod
     def reach(config: Any, options: int) -> int:
         return 0
 
     def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
-        return self.preferred[options]
+        pairs = zip(self.engine.images(ids), options.tolist(), strict=True)
+        return np.array([preferred(picture, option, self.actions) for picture, option in pairs])
 
     def observe(self, moved: Transitions) -> None:
         self.count(moved.options)
@@ -65,12 +82,25 @@ class Straight(Learner):
 
 
 class AtLeast(Terminations):
-    """No execution reaches its sub-goal in its first ``length`` steps."""
+    """No execution reaches its sub-goal in its first ``length`` steps, nor before two positive predictions in a row."""
 
     NUMBERED = True
+    CHANGING = (*Terminations.CHANGING, "row")
 
-    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return self.of_running(ids, options) & (age >= self.length)
+    def __init__(self, *arguments: Any, **more: Any):
+        super().__init__(*arguments, **more)
+        self.row = np.zeros(self.environments, dtype=np.int64)
+
+    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
+        self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
+        return (self.row >= 2) & (age >= self.length)
+
+
+class Never(Terminations):
+    """No execution reaches anything."""
+
+    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
+        return np.zeros(len(options), np.bool_)
 
 
 def train(stage: str, source: Path, out: Path, *pairs: str) -> dict[str, Any]:
@@ -131,3 +161,51 @@ def test_what_is_complete_is_not_built_again(
     run(*command)
     monkeypatch.setattr("hypogoal.meta.training.assemble", None)
     run(*command, "--resume")
+
+
+def ensembles_on(engine: DoorKeyEngine) -> list[Ensemble]:
+    """Two of two members each, that are positive in a part of the states, surely."""
+    pictures, ensembles = engine.images(engine.reachable()), []
+    for number in range(2):
+        generator = torch.Generator().manual_seed(number)
+        ensemble = Ensemble("doorkey", engine.observation_shape, 2, generator).eval()
+        chances = np.sort(ensemble.predict(pictures), axis=0)
+        middle = chances[len(chances) // 4 : 3 * len(chances) // 4]
+        widest = np.diff(middle, axis=0).argmax(0)
+        ensemble.set_thresholds(np.take_along_axis(middle, widest + np.array([[0], [1]]), 0).mean(0))
+        ensembles.append(ensemble)
+    return ensembles
+
+
+@pytest.mark.parametrize("rule", ["learned", f"{__name__}:AtLeast:2", f"{__name__}:Never"])
+def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D1, H4: execution by execution, one's own learner and chooser in the loop and in ``OptionEnv``."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+    network, timeout = f"{__name__}:Straight", 6
+    engine = DoorKeyEngine(100, 1)
+    ensembles = ensembles_on(engine)
+    config = OptionConfig.of(network=network, termination=rule, option_timeout=timeout, environments=1)
+    ends = learned_terminations(engine, ensembles, rule=rule)
+    learner = load_learner(network)(engine, ends, config, 0)
+    chooser = load_chooser(f"{__name__}:FirstOffered").create(engine, 4, config, 0, "cpu")
+    loop = OptionLoop(engine, ends, learner, chooser, Recorder(4, engine), config, gamma=0.9)
+    for _ in range(150):
+        loop.advance(learning=False)
+    wanted = sorted(
+        (execution for runs in loop.recorder.executions for execution in runs), key=lambda execution: execution.step
+    )
+
+    weights = learner.state() | ends.state()
+    named = config.model_dump() | {"sub_goals": ["a", "b"], "members": 2}
+    policies = make_policies(named, weights, {"observation_shape": engine.observation_shape})
+    options = Options(("a", "b"), 2, ensembles, policies, saved_terminations(rule, weights, 4), timeout)
+    env = OptionEnv(gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=100), options)
+    env.reset(seed=0)
+    for execution in wanted:
+        option = chooser.choose(np.zeros(1, np.int64), np.zeros(1, np.int64), env.action_masks()[None])[0]
+        *_, terminated, truncated, info = env.step(option)
+        assert (option, info["duration"], info["reached"]) == (execution.option, execution.duration, execution.reached)
+        if terminated or truncated:
+            env.reset(seed=0)
+    reached = [execution.reached for execution in wanted]
+    assert any(reached) == (rule != f"{__name__}:Never") and (rule == "learned" or not all(reached))
