@@ -86,7 +86,8 @@ def with_rule(case: str) -> OptionLoop:
     """The case with a rule that has state in place of the paper's, but where options are planned by that."""
     loop = loop_of(case)
     if "planned" not in case:
-        rule = Twice(loop.engine.labels, 2, environments=loop.engine.count)
+        engine = loop.engine
+        rule = Twice(lambda ids: engine.labels(ids)[:, :2], 2, environments=engine.count)
         loop.terminations = loop.learner.terminations = rule
     return loop
 

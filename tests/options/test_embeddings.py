@@ -69,17 +69,6 @@ def test_every_pixel_is_seen(shape: tuple[int, ...]) -> None:
     assert features.shape == (1, embedding.features) and (pixels.grad > 0).all()
 
 
-@pytest.mark.parametrize("side", [18, 42, 90])
-def test_where_strides_reach_all_there_is_no_margin(side: int) -> None:
-    """Spec D2: nothing changes for pictures that were seen whole before there was one, as windows of 42 pixels are."""
-    torch.manual_seed(0)
-    embedding, images = PictureEmbedding((side, side, 3)), torch.randint(256, (2, side, side, 3), dtype=torch.uint8)
-    first, second = embedding.first, embedding.second
-    plain = nn.functional.conv2d(images.permute(0, 3, 1, 2) / 255, first.weight, first.bias, stride=6).relu()
-    plain = nn.functional.conv2d(plain, second.weight, second.bias, stride=2).relu().flatten(1)
-    torch.testing.assert_close(embedding(images), plain)
-
-
 def test_an_own_embedding_learns_and_plays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2, H6: an encoder as members have it: both options go straight to their ends, also out of their weights."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")

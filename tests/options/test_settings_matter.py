@@ -8,7 +8,6 @@ import torch
 from corridor import Corridor
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.learners.episodes import LAST
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import load_learner
@@ -59,10 +58,3 @@ def test_other_settings_learn_other_weights(network: str, change: dict[str, Any]
         learned(network, **{"option_learning_rate": 5e-4, **change}),
     )
     assert any(not torch.equal(value, other[name]) for name, value in usual.items())
-
-
-def test_after_a_break_no_more_executions_are_kept_than_before() -> None:
-    """Spec F3: the last of each option; also when they were read back."""
-    loop, _ = learned("light")
-    loop.recorder.restore(loop.recorder.snapshot())
-    assert [kept.maxlen for kept in loop.recorder.executions] == [LAST] * 2

@@ -221,15 +221,6 @@ def test_the_replay_never_outlives_the_memory() -> None:
     learned(2000, memory=smallest, replay=300, n_step=7, option_timeout=9, **slow)
 
 
-def test_same_seed_same_bytes_with_every_switch() -> None:
-    """The project's rule: randomness is passed in."""
-    every = {"n_step": 4, "exploration": "persistent"}
-    one, two, other = (learned(240, seed=seed, **every)[0] for seed in (1, 1, 2))
-    for name, value in one.state().items():
-        assert torch.equal(value, two.state()[name]), name
-    assert any(not torch.equal(value, other.state()[name]) for name, value in one.state().items())
-
-
 def test_even_choice_gives_every_option_as_many_steps() -> None:
     """Spec D4: option 0 takes 2 steps each time, option 1 its full 10; uniform choice would give it 5 of 6 steps."""
     engine = LongCorridor(4)
