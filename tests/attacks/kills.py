@@ -118,7 +118,7 @@ def broken(out: str, whole: Path, kills: int, seconds: float, rng: random.Random
         if not folder.exists():
             shutil.copytree(whole, folder)
             _remove(folder / out)
-        resume = "" if out in WITHOUT_RESUME else " --resume"
+        resume = " --force" if out in WITHOUT_RESUME else " --resume"  # the kill may come when all is in place
         process = begin(f"{COMMANDS[out]}{resume} -q", folder, rng.choice(PACES))
         awaits_checkpoint = killed % 2 == 1 and out in SAVING
         moment = time.monotonic() + rng.uniform(0, seconds)

@@ -120,22 +120,21 @@ def hdf5_changed(data: bytes, rng: Rng) -> bytes:
         names: list[str] = []
         file.visit(names.append)
         if file.attrs and rng.random() < 0.4:
-            name, odd = rng.choice(sorted(file.attrs)), rng.choice(ODD)
-            file.attrs[name] = odd if isinstance(odd, int | float) else json.dumps(odd)
-            return _content(file, stored)
-        name = rng.choice(names)
-        values = np.atleast_1d(file[name][()]) if isinstance(file[name], h5py.Dataset) else np.zeros(3)
-        others: list[Any] = [  # nothing, fewer states, other shapes, types and values
-            None, values[:0], values[: len(values) // 2], 1, values[..., None], np.full(values.shape, -1),
-            np.full(values.shape, 0.5), np.full(values.shape[:1], np.nan), "a text", h5py.Empty("u1"),
-        ]  # fmt: skip
-        del file[name]
-        other = rng.choice(others)
-        if other is not None:
-            file[name] = other
-        return _content(file, stored)
-
-
-def _content(file: h5py.File, stored: io.BytesIO) -> bytes:
-    file.flush()
+            odd = rng.choice(ODD)
+            file.attrs[rng.choice(sorted(file.attrs))] = odd if isinstance(odd, int | float) else json.dumps(odd)
+        else:
+            _replace(file, rng.choice(names), rng)
     return stored.getvalue()
+
+
+def _replace(file: h5py.File, name: str, rng: Rng) -> None:
+    """Put nothing, fewer states, other shapes, types or values in a dataset's place."""
+    values = np.atleast_1d(file[name][()]) if isinstance(file[name], h5py.Dataset) else np.zeros(3)
+    others: list[Any] = [
+        None, values[:0], values[: len(values) // 2], 1, values[..., None], np.full(values.shape, -1),
+        np.full(values.shape, 0.5), np.full(values.shape[:1], np.nan), "a text", h5py.Empty("u1"),
+    ]  # fmt: skip
+    del file[name]
+    other = rng.choice(others)
+    if other is not None:
+        file[name] = other

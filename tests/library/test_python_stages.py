@@ -100,16 +100,13 @@ def test_what_would_end_a_command_is_an_error(run: Path, tmp_path: Path, given: 
 
 
 def test_domains_of_another_program_and_of_another_name(run: Path, tmp_path: Path) -> None:
-    """An object is found by its own name, in its program; a data file names no code."""
+    """An object is found by its own name, in its program."""
     with pytest.raises(UserError, match="unknown domain"):
         hypogoal.train_options(run / "ensemble", out=tmp_path / "out", **PLAY)
     domain = own_domain.CorridorDomain()
     domain.name = "doorkey"
     with pytest.raises(UserError, match=r"has the name of one of hypogoal's: doorkey\. Give it another name"):
         hypogoal.collect(domain, out=tmp_path / "out")
-    data = write(tmp_path / "data.h5", domain="own_domain:DOMAIN")
-    with pytest.raises(UserError, match="a file names code of its own"):
-        hypogoal.train_ensemble(data, out=tmp_path / "out", **FEW)
 
 
 def test_what_is_complete_is_kept(run: Path) -> None:
@@ -132,13 +129,3 @@ def test_settings_count_more_than_presets(run: Path, tmp_path: Path, capsys: pyt
     assert [config[name] for name in ("steps", "members", "learning_rate", "sub_goals")] == [4, 2, 0.01, ["left-end"]]
     said = capsys.readouterr()
     assert said.out == "" and 1 <= len(said.err.splitlines()) <= 4 and "\r" not in said.err and "\x1b" not in said.err
-
-
-def test_a_comparison_says_who_wins(run: Path, tmp_path: Path) -> None:
-    """Spec F5: the lines of the command, and their numbers."""
-    other = shutil.copytree(run, tmp_path / "other")
-    with pytest.raises(UserError, match="two or more different runs"):
-        hypogoal.compare(run, run, out=tmp_path / "both")
-    made = hypogoal.compare(run, other, out=tmp_path / "both")
-    assert made.metrics["comparisons"] and "no clear winner of run and other" in repr(made)
-    assert open_artefact(made.path).faults() == []

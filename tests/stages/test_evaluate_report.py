@@ -11,7 +11,7 @@ from openings import agrees
 from toy_data import reseal
 
 from hypogoal.cells import Cell
-from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.run import read_evaluation
 from hypogoal.experiments.run import begin
@@ -143,16 +143,6 @@ def test_the_page_is_whole_and_needs_nothing_else(tiny_run):
     assert not re.search(r"fetch\(|XMLHttpRequest|import\(|https?://(?!www\.w3\.org/)", "".join(found.scripts))
     assert not re.search(r"url\((?!#)|@import", page)
     assert all(target in inside for target in re.findall(r"url\((#[^)]*)\)", page))
-
-
-def test_texts_of_a_page_are_escaped(tiny_copy):
-    """A run's folder may be called like mark-up."""
-    file = tiny_copy / "evaluation" / "metrics.json"
-    metrics = json.loads(file.read_text(encoding="utf-8"))
-    file.write_text(json.dumps(metrics | {"run": "a&b<b>"}), encoding="utf-8")
-    reseal(file.parent, files={**Artefact(file.parent).manifest.files, file.name: sha256_of(file)})
-    page = page_of(tiny_copy, force=True)
-    assert "a&amp;b&lt;b&gt;" in page and "a&b<b>" not in page
 
 
 def test_the_page_shows_all_of_it_each_time_the_same(tiny_run, tiny_copy):
