@@ -36,7 +36,7 @@ def test_killed_commands_end_with_the_same_bytes() -> None:
     ("output", "name"),
     [
         ("run/ensemble", "hypogoal.hypotheses.training:Training.optimiser"),
-        ("run/options", "hypogoal.options.light:LightLearner.optimiser"),
+        ("run/options", "hypogoal.learners.double_dqn:DoubleDQN.optimiser"),
         ("run/meta", "hypogoal.meta.ppo:MetaPolicy.rng"),
     ],
 )
