@@ -32,7 +32,7 @@ def train_options(
 
     practice = open_artefact(options, "options") if options else None
     setup = agents.setup_of(call, ensemble, practice, FIXED)
-    config = setup.config
+    config: Any = setup.config
     steps = config.steps
     if config.restart_options:
         steps *= setup.options
