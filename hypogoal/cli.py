@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from typer import Argument, Context, Option
+from typer import Argument, Option
 from typer.core import TyperGroup
 
 from hypogoal import stages
@@ -38,6 +38,9 @@ class Commands(TyperGroup):
     """The commands; those of stages are made when they are called, since their settings take time to load."""
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
+        if words[0] == "sweep":
+            do = "Type 'hypogoal run' in its place, see 'hypogoal run --help'."
+            raise UserError("'sweep' is 'run' now", None, do)
         if words[0] in stages.LISTED:
             return words[0], stages.load_stage(words[0]).command, words[1:]
         return super().resolve_command(context, words)
@@ -126,7 +129,7 @@ def _commands() -> Any:
 
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
-    every = {name: command for name, command in _commands().commands.items() if not command.hidden}
+    every = dict(_commands().commands)
     for name in stages.LISTED:
         every[name] = stages.load_stage(name).command
     return every
@@ -230,14 +233,6 @@ def run(
     say(out / "report" / "index.html")
 
 
-@app.command(
-    hidden=True, rich_help_panel=MAKE, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
-)
-def sweep(context: Context) -> None:
-    """What is ``run`` now."""
-    raise UserError("'sweep' is 'run' now", None, "Type 'hypogoal run' in its place, see 'hypogoal run --help'.")
-
-
 @command(LOOK, "show runs/mine")
 def show(
     path: Made,
@@ -297,7 +292,7 @@ def config(
 
     if stage is None:
         helps = stages.LISTED | {"run": "Run all cells of an experiment."}
-        names = list(settings.TABLES)
+        names = settings.TABLES
         echo(names, as_json, [f"{name:15}{helps[name]}" for name in names])
         return
     rows = settings.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium.utils.env_checker import check_env
-from numpy.typing import NDArray
 
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.config import STAGES, model_of, resolve
@@ -81,21 +80,19 @@ class _Played:
 
     def steps(self) -> None:
         """Well-formed, counted, and episodes end in time."""
-        engine = self.make_engine()
-        for actions in self.actions(engine):
-            elapsed = engine.elapsed + 1
-            step = engine.step(actions)
-            check_step(engine, step)
-            over = step.terminated | step.truncated
+        engine, elapsed = self.make_engine(), np.zeros(COUNT, int)
+        for shown in self.play(engine):
+            elapsed += 1
+            over = shown["terminated"] | shown["truncated"]
             promise(
                 over[elapsed >= MAX_STEPS].all(),
                 "an episode went on after max_steps",
                 "Truncate it there.",
             )
-            counted = np.array_equal(engine.elapsed, np.where(over, 0, elapsed))
+            elapsed[over] = 0
             promise(
-                counted,
-                f"elapsed is {engine.elapsed}, ended {over}",
+                np.array_equal(engine.elapsed, elapsed),
+                f"elapsed is {engine.elapsed}, not {elapsed}",
                 "Count the steps of each episode.",
             )
 
@@ -103,15 +100,13 @@ class _Played:
         """The same when asked twice in the same state."""
         engine, goals = self.make_engine(), np.array(self.domain.sub_goals)
         seen = set()
-        for actions in self.actions(engine):
-            engine.step(actions)
+        for _ in self.play(engine):
             labels = engine.labels(engine.ids)
             _require_array("labels", labels, np.bool_, COUNT, len(goals))
             changed = (engine.labels_now() != labels).any(0)
-            text = f"asked twice in the same state, labels differ: {', '.join(goals[changed])}"
             promise(
                 not changed.any(),
-                text,
+                f"asked twice in the same state, labels differ: {', '.join(goals[changed])}",
                 STATE_NOW,
             )
             for image, row in zip(engine.images(engine.ids), labels, strict=True):
@@ -123,7 +118,7 @@ class _Played:
 
     def two_engines(self) -> None:
         """Of the same layout seed: the same actions show the same."""
-        _require_same(self.make_engine(), self.make_engine(), self.actions, SEEDED)
+        _require_same(self.play(self.make_engine()), self.play(self.make_engine()), SEEDED)
 
     def restore(self) -> str | None:
         """A restored engine goes on as the one whose snapshot it got."""
@@ -131,12 +126,10 @@ class _Played:
         if not saved.resumes:
             warnings.warn("it has no snapshot and restore: training on it cannot be resumed", stacklevel=1)
             return "not looked at"
-        for actions in self.actions(saved):
-            saved.step(actions)
+        for _ in self.play(saved):
+            pass
         restored.restore(saved.snapshot())
-        _require_same(
-            saved, restored, self.actions, "After restore() it is another: save all that the next steps need."
-        )
+        _require_same(self.play(saved), self.play(restored), "Save all that the next steps need.")
         return None
 
     def collect(self) -> str:
@@ -186,28 +179,21 @@ class _Played:
         arguments = {"start": starts[0], "memory": 10_000, "seed": self.seed} if starts else {}
         return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **arguments)
 
-    def actions(self, engine: Engine) -> NDArray[np.int64]:
-        """Random actions (steps, E), the same at every call."""
-        return rng_for(self.seed, "check").integers(engine.n_actions, size=(STEPS, COUNT))
+    def play(self, engine: Engine) -> Iterator[dict[str, Any]]:
+        """What an engine shows in each step, by name; the actions are random, the same at every call."""
+        for actions in rng_for(self.seed, "check").integers(engine.n_actions, size=(STEPS, COUNT)):
+            step = engine.step(actions)
+            check_step(engine, step)
+            shown = step._asdict()
+            ids = shown.pop("next_ids")
+            yield {**shown, "images": engine.images(ids), "labels": engine.labels(ids)}
 
 
-def _require_same(first: Engine, second: Engine, actions: Any, do: str) -> None:
+def _require_same(first: Iterator[dict[str, Any]], second: Iterator[dict[str, Any]], do: str) -> None:
     """Two engines show the same."""
-    for number, row in enumerate(actions(first), 1):
-        left, right = _shown(first, row), _shown(second, row)
+    for number, (left, right) in enumerate(zip(first, second, strict=True), 1):
         for name, values in left.items():
-            promise(
-                np.array_equal(values, right[name]),
-                f"{name} differ in step {number}",
-                do,
-            )
-
-
-def _shown(engine: Engine, actions: NDArray[np.int64]) -> dict[str, Any]:
-    """All that a step shows, by name."""
-    parts = engine.step(actions)._asdict()
-    ids = parts.pop("next_ids")
-    return {**parts, "images": engine.images(ids), "labels": engine.labels(ids)}
+            promise(np.array_equal(values, right[name]), f"{name} differ in step {number}", do)
 
 
 def _require_array(name: str, value: Any, dtype: Any, *shape: int) -> None:

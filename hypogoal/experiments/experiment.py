@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from hypogoal.cells import Value, reason
 from hypogoal.core import own_code
-from hypogoal.core.config import Config, integers, setting
+from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 
 MEND = "Mend the experiment, see docs/formats.md."
@@ -189,16 +189,15 @@ def read_toml(path: Path) -> Experiment:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
         fields: dict[str, Any] = {}
         for name, axis in file.axes.items():
-            values: Sequence[Value] = integers(axis) if isinstance(axis, str) else axis
-            kind: Any = type(values[0])
-            fields[name] = (tuple[kind, ...], tuple(values))
+            kind: Any = int if isinstance(axis, str) else type(axis[0])
+            fields[name] = (tuple[kind, ...], ())
         model = _model_of(fields)
 
     def commands(**axes: Any) -> list[Command]:
         with _readable(path):
             return [*file.commands(axes)]
 
-    given = {"workers": file.workers, "evaluate": file.evaluate}
+    given = {"workers": file.workers, "evaluate": file.evaluate, **file.axes}
     return Experiment(path.stem, commands, model, given=given)
 
 

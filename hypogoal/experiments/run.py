@@ -129,7 +129,8 @@ def discard(cells: Sequence[Cell], run: Path) -> None:
                 "Wait until it is done, or end it.",
             )
     for cell in cells:
-        for folder in (cell.draft(run).folder, run / cell.place):
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(cell.draft(run).folder, ignore_errors=True)
         if cell.stage == "collect":
             (run / cell.place).unlink(missing_ok=True)
+        elif cell.is_done(run):
+            shutil.rmtree(run / cell.place)

@@ -89,52 +89,42 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
     assert len(cells_of(str(ROOT / "examples" / "sweep-doorkey.toml"))) == 1 + 4 + 8 + 4 + 2
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
-        ('"collect doorkey"', '"rm -rf x"', "this is no stage"),
-        ('"collect doorkey"', '"collect \'doorkey"', "cannot be read"),
-        ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "reads what no cell before it makes"),
-        ('"collect doorkey"', "[3]", r"yields \(name, command\)"),
-        ('yield "data"', 'yield "../data"', "becomes a file's"),
-        ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "a name of its own"),
-        ('{"size": size}', '{"size": []}', r"yields \(name, command\)"),
-        ("--members {size}", "--members {size} --set stepps=3", "ensemble/size-1: train-ensemble has no setting"),
-        ("--members {size}", "--members {size} --steps 0", "ensemble/size-1: "),
-        ("small: bool = False", "small: bool", "cannot be a setting"),
-        ("small: bool = False", "workers: int = 3", "cannot be a setting"),
-        ("def members", "members = 3\ndef other", "not an experiment"),
-    ],
-)
+NO_FUNCTION = [
+    ('"collect doorkey"', '"rm -rf x"', "this is no stage"),
+    ('"collect doorkey"', '"collect \'doorkey"', "cannot be read"),
+    ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "reads what no cell before it makes"),
+    ('"collect doorkey"', "[3]", r"yields \(name, command\)"),
+    ('yield "data"', 'yield "../data"', "becomes a file's"),
+    ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "a name of its own"),
+    ("--members {size}", "--members {size} --set stepps=3", "ensemble/size-1: train-ensemble has no setting"),
+    ("--members {size}", "--members {size} --steps 0", "ensemble/size-1: "),
+    ("small: bool = False", "small: bool", "cannot be a setting"),
+    ("small: bool = False", "workers: int = 3", "cannot be a setting"),
+    ("def members", "members = 3\ndef other", "not an experiment"),
+]
+NO_TOML = [
+    ("format = 1", "format = 2", "format: "),
+    ("format = 1", "format = 1\nsubmit = 'rm'", "submit: "),
+    ('axes = ["seed"],', "axis = ['seed'],", "axis: "),
+    ("{ensemble}", "{ensembles}", "cannot be read"),
+    ('axes = ["seed"], command', "command", "cannot be read"),
+    ("[0, 1]", "[0, 0]", "a name of its own"),
+    ("[0, 1]", '"1-"', "seed"),
+    ('"collect doorkey --seed', "\"collect 'doorkey", "cannot be read"),
+    ("cells = [", "cells = [ [", "cannot be read"),
+    ("collect doorkey --seed", "collect evil:DOMAIN --seed", "a file names code of its own"),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "words"), NO_FUNCTION + NO_TOML)
 def test_what_is_no_experiment_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str, words: str
 ) -> None:
-    """Spec G2: as the user's to mend, before the first cell starts."""
-    assert before in MODULE
+    """Spec G2: as the user's to mend, before the first cell starts; stages only, into the run's folder only."""
+    function, toml = MODULE.replace(before, after), TOML.replace(before, after)
     with pytest.raises(UserError, match=words) as caught:
-        own(tmp_path, monkeypatch, MODULE.replace(before, after))
+        own(tmp_path, monkeypatch, function) if function != MODULE else of_toml(tmp_path, toml)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
-        ("format = 1", "format = 2", "format: "),
-        ("format = 1", "format = 1\nsubmit = 'rm'", "submit: "),
-        ('axes = ["seed"],', "axis = ['seed'],", "axis: "),
-        ("{ensemble}", "{ensembles}", "cannot be read"),
-        ('axes = ["seed"], command', "command", "cannot be read"),
-        ("[0, 1]", "[0, 0]", "a name of its own"),
-        ("collect doorkey", "collect 'doorkey", "cannot be read"),
-        ("cells = [", "cells = [ [", "cannot be read"),
-        ("collect doorkey", "collect evil:DOMAIN", "a file names code of its own"),
-    ],
-)
-def test_what_is_no_toml_experiment_is_told_in_one_line(tmp_path: Path, before: str, after: str, words: str) -> None:
-    """Spec G2: stages only, into the run's folder only."""
-    assert before in TOML
-    with pytest.raises(UserError, match=words):
-        of_toml(tmp_path, TOML.replace(before, after))
 
 
 @pytest.mark.parametrize("given", ["seeds=1", "seed=x", "workers=many", "train-ensemble.stepz=3", "bake.steps=3"])
@@ -190,8 +180,7 @@ def test_a_single_agent_has_short_names() -> None:
     """Contract: runs/demo/ensemble, runs/demo/options, runs/demo/meta."""
     cells = [cell.place for cell in cells_of("doorkey", preset="demo")]
     assert cells == ["data.h5", "ensemble", "options", "meta", "ppo-tuned", "evaluation", "report"]
-    more = cells_of("doorkey", preset="demo", seeds="0-1")
-    assert {cell.name for cell in more} >= {"ensemble/seed-0", "meta/layout-101-seed-1"}
+    assert "meta/layout-101-seed-1" in [cell.name for cell in cells_of("doorkey", preset="demo", seeds="0-1")]
 
 
 def settings(cell: Cell) -> dict[str, str]:
