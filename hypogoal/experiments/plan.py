@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 from pydantic import ValidationError
@@ -78,7 +77,6 @@ def plan(
     of_preset = read_preset(preset, "run", domain) if domain else {}
     config = resolve(experiment.model, of_preset, of_run, stage="run")
 
-    @cache
     def settings(stage: str) -> Any:
         return settings_of(stage, domain or DOMAIN, preset, of_stage.get(stage, {}))
 

@@ -97,7 +97,6 @@ BROKEN = [
     (domain_of(images=lambda self, ids, out=None: 1 // 0), "observations", "ZeroDivisionError"),
     (stepping(rewards=lambda values: values[:2]), "steps", "the engine's step gave rewards"),
     (stepping(rewards=lambda values: values * np.nan), "steps", "finite"),
-    (stepping(succeeded=lambda _: [False] * 3), "steps", "succeeded"),
     (domain_of(step=never_ending), "steps", "went on after max_steps"),
     (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "labels", "(3, 1)"),
     (domain_of(labels=moody), "labels", "asked twice in the same state, labels differ: right-end"),
@@ -185,15 +184,10 @@ def _as_printed(a: Tensor, b: Tensor) -> Tensor:
     return -(p * q + (1 - p) * (1 - q)).clamp(min=1e-9).log().sum(-1) / max(p.shape[-1], 1)
 
 
-def _distance(a: Tensor, b: Tensor) -> Tensor:
-    return -(a.softmax(-1) - b.softmax(-1)).square().sum((-2, -1)) / max(a.shape[-2], 1)
-
-
 PAIRS = [
     (none.pair_loss, "gradients"),
     (_from_probabilities, "finite"),
     (_as_printed, "disagreement"),
-    (_distance, "disagreement"),
     (lambda a, b: dbat.pair_loss(a.detach(), b), "gradients"),
     (lambda a, b: a.square().mean(-1), "finite"),
     (lambda a, b: dbat.pair_loss(a, b) * a.shape[-2] / a.shape[-2], "finite"),
