@@ -65,7 +65,7 @@ def plan(
     """
     experiment = find_experiment(name, preset)
     preset = preset or experiment.preset
-    of_run = {"seeds" if "seeds" in experiment.model.model_fields else "seed": seeds, **experiment.given}
+    of_run = {"seeds" if "seeds" in experiment.model.model_fields else "seed": seeds}
     of_stage: dict[str, dict[str, str]] = {}
     for key, value in assigned(assignments).items():
         stage, dot, setting = key.partition(".")
@@ -75,7 +75,7 @@ def plan(
             of_run[key] = value
     domain = experiment.domain
     of_preset = read_preset(preset, "run", domain) if domain else {}
-    config = resolve(experiment.model, of_preset, of_run, stage="run")
+    config = resolve(experiment.model, of_preset, experiment.given, of_run, stage="run")
 
     def settings(stage: str) -> Any:
         return settings_of(stage, domain or DOMAIN, preset, of_stage.get(stage, {}))
