@@ -190,7 +190,7 @@ def test_objectives(objective: Any, fault: str, told: Callable[..., str], data: 
     """Spec C1, G2."""
     words = ["train-ensemble", str(data), "--diversity", NAME, *settings("steps=5", "workers=1"), "-q"]
     told(objective, words, fault)
-    assert f"FAIL shape: {fault}" in fails("check", "--diversity", NAME).out
+    assert f"FAIL finite: {fault}" in fails("check", "--diversity", NAME).out
 
 
 class Raises(nn.Module):
@@ -204,8 +204,8 @@ class Raises(nn.Module):
     ("layers", "fault"),
     [
         (lambda channels: None, "the network gave None"),
-        (lambda channels: ([nn.Conv2d(channels, 4, 3, 2)], (0,)), "the network gave layers"),
-        (lambda channels: (["layer"], (8,)), "the network gave layers"),
+        (lambda channels: ([nn.Conv2d(channels, 4, 3, 2)], (0,)), "the network gave ("),
+        (lambda channels: (["layer"], (8,)), "the network gave ("),
         (lambda channels: ([nn.Conv2d(channels, 4, 3, 2).double()], (8,)), "does not take these observations"),
         (lambda channels: ([Raises()], (8,)), "your code raised ZeroDivisionError"),
     ],

@@ -15,9 +15,11 @@ from hypogoal.core.checkpoints import Resumable, State
 if TYPE_CHECKING:
     import torch
 
-Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 Bytes: TypeAlias = NDArray[np.uint8]  # pictures, and the console's memory
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float32]
+Doubles: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

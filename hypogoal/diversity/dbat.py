@@ -4,7 +4,10 @@ import torch
 from torch import Tensor
 
 
-def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
+def pair_loss(
+    logits_a: Tensor,
+    logits_b: Tensor,
+) -> Tensor:
     """Eq. (1), second term, Spec C2: ``-log(p_a (1 - p_b) + (1 - p_a) p_b)``, mean over unlabelled states.
 
     Eq. (1) as printed multiplies matching classes, which literally rewards agreement. D-BAT's term is the log

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from hypogoal.diversity import Context
-from hypogoal.diversity.mutual_information import pair_loss
+from hypogoal.diversity.mutual_information import log_mean, pair_loss
 
 RATIO_WEIGHT = 1.0  # of the ratio term beside the mutual information: own choice; the source tunes it
 
@@ -36,7 +36,7 @@ def ensemble_loss(context: Context) -> Tensor:
     if len(frozen):
         terms += [pair_loss(frozen, member.expand_as(frozen)).sum() for member in logits]
     log_classes = torch.log_softmax(logits, dim=-1)
-    log_shares = torch.logsumexp(log_classes, dim=1) - math.log(states)  # (K, 2)
+    log_shares = log_mean(log_classes, dim=1)  # (K, 2)
     priors = (1.0 - context.positives, context.positives)
     for log_share, prior in zip(log_shares.unbind(-1), priors, strict=True):
         ratio = log_share.exp() * (log_share - math.log(prior))

@@ -8,7 +8,10 @@ from torch import Tensor
 SMALLEST_LOG = -1e30  # replaces log 0, so that 0 log 0 is 0 instead of NaN
 
 
-def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
+def pair_loss(
+    logits_a: Tensor,
+    logits_b: Tensor,
+) -> Tensor:
     """Spec C1: mutual information of two members' classes over the unlabelled states, to be minimised.
 
     ``KL(mean_n p_a(y|n) p_b(z|n)  ||  mean_n p_a(y|n) x mean_n p_b(z|n))``: the joint distribution of both members'
@@ -29,14 +32,23 @@ def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
     """
     states = logits_a.shape[-2]
     if states == 0:
-        return (logits_a.sum(dim=-1) + logits_b.sum(dim=-1)).sum(dim=-1)
-    log_a = torch.log_softmax(logits_a, dim=-1).clamp(min=SMALLEST_LOG)
-    log_b = torch.log_softmax(logits_b, dim=-1).clamp(min=SMALLEST_LOG)
-    log_states = math.log(states)
-    both = log_a[..., :, None] + log_b[..., None, :]  # (..., N, 2, 2)
-    joint = torch.logsumexp(both, dim=-3) - log_states  # (..., 2, 2)
-    marginal_a = torch.logsumexp(log_a, dim=-2) - log_states  # (..., 2)
-    marginal_b = torch.logsumexp(log_b, dim=-2) - log_states
-    product = marginal_a[..., :, None] + marginal_b[..., None, :]
+        return (logits_a + logits_b).sum(dim=(-2, -1))
+    log_a = torch.log_softmax(logits_a, dim=-1)
+    log_b = torch.log_softmax(logits_b, dim=-1)
+    log_a = log_a.clamp(min=SMALLEST_LOG)
+    log_b = log_b.clamp(min=SMALLEST_LOG)
+    both = log_a.unsqueeze(-1) + log_b.unsqueeze(-2)  # (..., N, 2, 2)
+    joint = log_mean(both, dim=-3)  # (..., 2, 2)
+    marginal_a = log_mean(log_a, dim=-2)  # (..., 2)
+    marginal_b = log_mean(log_b, dim=-2)
+    product = marginal_a.unsqueeze(-1) + marginal_b.unsqueeze(-2)
     information = joint.exp() * (joint - product)
     return information.sum(dim=(-2, -1))
+
+
+def log_mean(
+    logs: Tensor,
+    dim: int,
+) -> Tensor:
+    """The logarithm of the mean of what these are the logarithms of."""
+    return torch.logsumexp(logs, dim=dim) - math.log(logs.shape[dim])

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from itertools import chain, cycle, islice, repeat
+from itertools import (
+    chain,
+    cycle,
+    islice,
+    repeat,
+)
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import as_input, as_tensor, at_once
+from hypogoal.hypotheses.networks import (
+    as_input,
+    as_tensor,
+    at_once,
+)
 from hypogoal.hypotheses.views import Origins
 from hypogoal.observations import Observations, values_in
 
-Numbers = NDArray[np.int64]  # of states, (B,)
+Numbers = Ints  # of states, (B,)
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
 NONE = np.zeros(0, dtype=np.int64)
 
@@ -44,7 +51,7 @@ class TrainingStates(Resumable):
             differ in their use of the second.
 
     Raises:
-        UserError: shapes that do not fit, or labels of one class only.
+        UserError: labels of one class only.
     """
 
     CHANGING = ("changes",)
@@ -53,34 +60,33 @@ class TrainingStates(Resumable):
     def __init__(
         self,
         observations: Observations,
-        labels: NDArray[np.bool_],
+        labels: Bools,
         unlabelled: Observations,
         ensemble: Ensemble,
         origins: Origins,
     ):
-        if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
-            shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
-            raise UserError("the states do not fit together", shapes, "Collect them again.")
         require_classes(labels[:, None], ["the sub-goal"], None, "Collect others.")
         self.labels, self.n_unlabelled = labels, len(unlabelled)
         self.view, self.device = ensemble.view, ensemble.thresholds.device
         self._origins = origins
         self._dtype = observations.dtype
-        self._values = values_in(observations.shape[1:], observations.dtype)
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(self.device)
         self._standard: list[Tensor] = []
-        kept = [observations, unlabelled]
         if self._dtype.names:
             self._standard = [torch.from_numpy(values).to(self.device) for values in self.view.standard or ()]
         else:
-            kept = [self.view.to_change(states) for states in kept]
-        kept = [np.require(states, requirements=["C", "W"]) for states in kept]
+            observations, unlabelled = self.view.to_change(observations), self.view.to_change(unlabelled)
+        kept = [np.require(states, requirements=["C", "W"]) for states in (observations, unlabelled)]
         self._tables: patches.Tables | None = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
             self._tables = patches.make_tables(kept, ensemble.networks[0])
         self._states: list[Tensor] = []
         if self._tables is None:
             self._states = [as_tensor(states).to(self.device) for states in kept]
+        self._at_once = at_once(
+            EVALUATED_AT_ONCE,
+            (values_in(kept[0].shape[1:], self._dtype),),
+        )
 
     def begin(self, seed: int) -> None:
         """Begin the random changes of one training; before any :meth:`logits`."""
@@ -110,28 +116,23 @@ class TrainingStates(Resumable):
         on_labelled, on_unlabelled = logits.split(sizes, dim=1)
         return on_labelled, on_unlabelled
 
-    def count_in(self, networks: Sequence[nn.Sequential], unlabelled: Numbers) -> None:
-        """Include unlabelled states in BatchNorm's running statistics, where no loss needs their logits."""
-        with torch.no_grad():
-            inputs = self._inputs((NONE, unlabelled), changing=True)
-            for network in networks:
-                _forward(_up_to_last_norm(network), inputs, [0, len(unlabelled)], counted=True)
-
     def frozen_logits(self, networks: Sequence[nn.Sequential]) -> Tensor:
         """F trained networks' logits, float (F, M, 2), of all unlabelled states, in evaluation mode."""
         if not networks:
             return torch.zeros(0, self.n_unlabelled, 2, device=self.device)
         for network in networks:
             network.eval()
-        size = at_once(EVALUATED_AT_ONCE, (self._values,))
         chunks = []
         with torch.no_grad():
-            for start in range(0, self.n_unlabelled, size):
-                some = np.arange(start, min(start + size, self.n_unlabelled))
+            for some in np.split(np.arange(self.n_unlabelled), range(self._at_once, self.n_unlabelled, self._at_once)):
                 chunks.append(self.logits(networks, unlabelled=some)[1])
         return torch.cat(chunks, dim=1)
 
-    def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[Numbers, Numbers]]:
+    def batches(
+        self,
+        config: EnsembleConfig,
+        seed: int,
+    ) -> Iterator[tuple[Numbers, Numbers]]:
         """``config.steps`` batches: numbers of labelled (B,) and of unlabelled states (B,).
 
         Half of the labelled ones are positive, unless the view has other pools (:meth:`View.pools`). Every state of a
@@ -142,13 +143,27 @@ class TrainingStates(Resumable):
         negatives = np.flatnonzero(~self.labels)
         others = config.batch_size if self.n_unlabelled else 0
         drawn_positives = _draws(pools, positives, seed, "positives")
-        drawn_negatives = _draws([negatives], config.batch_size - positives, seed, "negatives")
-        drawn_unlabelled = _draws([np.arange(self.n_unlabelled)], others, seed, "unlabelled")
+        drawn_negatives = _draws(
+            [negatives],
+            config.batch_size - positives,
+            seed,
+            "negatives",
+        )
+        drawn_unlabelled = _draws(
+            [np.arange(self.n_unlabelled)],
+            others,
+            seed,
+            "unlabelled",
+        )
         for _ in range(config.steps):
             labelled = np.concatenate([next(drawn_positives), next(drawn_negatives)])
             yield labelled, next(drawn_unlabelled)
 
-    def _inputs(self, groups: tuple[Numbers, Numbers], changing: bool) -> Tensor | patches.Batch:
+    def _inputs(
+        self,
+        groups: tuple[Numbers, Numbers],
+        changing: bool,
+    ) -> Tensor | patches.Batch:
         """The networks' inputs for labelled and unlabelled states: pictures, or their patches."""
         if self._tables is not None:
             labelled, unlabelled = groups
@@ -160,13 +175,21 @@ class TrainingStates(Resumable):
                 continue
             seen = states[torch.from_numpy(numbers).to(self.device)]
             if self.view.changes:
-                changed = self.view.change(seen.cpu().numpy(), rng if changing else None)
+                changed = self.view.change(
+                    seen.cpu().numpy(),
+                    rng if changing else None,
+                )
                 seen = torch.from_numpy(np.ascontiguousarray(changed)).to(self.device)
             rows.append(seen)
         return as_input(torch.cat(rows), self._dtype, self._standard)
 
 
-def _draws(pools: Sequence[Numbers], count: int, seed: int, name: str) -> Iterator[Numbers]:
+def _draws(
+    pools: Sequence[Numbers],
+    count: int,
+    seed: int,
+    name: str,
+) -> Iterator[Numbers]:
     """Endlessly, ``count`` items of the pools in turn; a pool is shuffled again once all its items were drawn."""
     streams = []
     for number, pool in enumerate(pools):
@@ -178,14 +201,24 @@ def _draws(pools: Sequence[Numbers], count: int, seed: int, name: str) -> Iterat
         yield np.fromiter(islice(items, count), np.int64, count)
 
 
-def _forward(network: nn.Sequential, inputs: Tensor | patches.Batch, sizes: Sequence[int], counted: bool) -> Tensor:
+def _forward(
+    network: nn.Sequential,
+    inputs: Tensor | patches.Batch,
+    sizes: Sequence[int],
+    counted: bool,
+) -> Tensor:
     """A network's outputs, up to rounding the same for either kind of inputs (a test asserts it)."""
     if isinstance(inputs, patches.Batch):
         return patches.forward(network, inputs, counted)
     return plain_forward(network, inputs, sizes, counted)
 
 
-def plain_forward(network: nn.Sequential, inputs: Tensor, sizes: Sequence[int], counted: bool) -> Tensor:
+def plain_forward(
+    network: nn.Sequential,
+    inputs: Tensor,
+    sizes: Sequence[int],
+    counted: bool,
+) -> Tensor:
     """A network's outputs for so many labelled inputs and, behind them, so many unlabelled ones.
 
     In training, BatchNorm standardises each of the two groups by the group's own mean and variance, as if the other
@@ -195,40 +228,19 @@ def plain_forward(network: nn.Sequential, inputs: Tensor, sizes: Sequence[int], 
     """
     values = inputs
     for layer in network:
-        norms = _norms(layer)
+        norms = [part for part in layer.modules() if isinstance(part, _BatchNorm) and part.training]
         if not norms:
             values = layer(values)
             continue
-        labelled, unlabelled = values.split(list(sizes))
         normed = []
-        if len(labelled):
-            normed.append(layer(labelled))
-        if len(unlabelled):
-            with _uncounted([] if counted else norms):
-                normed.append(layer(unlabelled))
+        for number, group in enumerate(values.split(list(sizes))):
+            if not len(group):
+                continue
+            still = [norm for norm in norms if norm.track_running_stats and number == 1 and not counted]
+            for norm in still:
+                norm.track_running_stats = False
+            normed.append(layer(group))
+            for norm in still:
+                norm.track_running_stats = True
         values = torch.cat(normed)
     return values
-
-
-def _norms(layer: nn.Module) -> list[_BatchNorm]:
-    """The BatchNorms of a layer, itself included, that are in training mode."""
-    return [part for part in layer.modules() if isinstance(part, _BatchNorm) and part.training]
-
-
-@contextmanager
-def _uncounted(norms: Sequence[_BatchNorm]) -> Iterator[None]:
-    """Within the block these do not update their running statistics."""
-    tracking = [norm for norm in norms if norm.track_running_stats]
-    for norm in tracking:
-        norm.track_running_stats = False
-    yield
-    for norm in tracking:
-        norm.track_running_stats = True
-
-
-def _up_to_last_norm(network: nn.Sequential) -> nn.Sequential:
-    """The layers that BatchNorm's running statistics depend on."""
-    layers = list(network)
-    while layers and not _norms(layers[-1]):
-        layers.pop()
-    return nn.Sequential(*layers)

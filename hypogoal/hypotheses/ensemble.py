@@ -3,33 +3,41 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
-from math import prod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.errors import UserError
-from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
-from hypogoal.hypotheses import patches
-from hypogoal.hypotheses.config import FULL
-from hypogoal.hypotheses.networks import (
-    NETWORKS,
-    as_input,
-    as_tensor,
-    at_once,
-    build_network,
-    folded,
-    names_in,
-    network_for,
-    reordered,
+from hypogoal.core.tensors import (
+    load_fitting,
+    load_tensors,
+    save_tensors,
 )
-from hypogoal.hypotheses.views import FullView, View, own_view, standard_shape
-from hypogoal.observations import NUMBERS, PICTURE, Observations, packed, type_of, type_text, values_in
+from hypogoal.hypotheses import (
+    deep_lift,
+    networks,
+    patches,
+)
+from hypogoal.hypotheses.thresholds import log_odds_of
+from hypogoal.hypotheses.views import (
+    FullView,
+    View,
+    saved_view,
+)
+from hypogoal.observations import (
+    NUMBERS,
+    Observations,
+    Shape,
+    packed,
+    type_text,
+    values_in,
+)
 
 THRESHOLD = 0.5  # of the probability, unless another is set
 IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many
@@ -39,8 +47,16 @@ PATCHES_FROM = 256  # images from which looking for distinct patches pays
 NO_OBSERVATIONS = "these observations do not fit the ensemble"
 
 
+@contextmanager
+def predicting(device: torch.device) -> Iterator[None]:
+    """Within the block without gradients, and in float32 whatever autocast is around."""
+    kind = "cuda" if device.type == "cuda" else "cpu"
+    with torch.inference_mode(), torch.autocast(kind, enabled=False):
+        yield
+
+
 class Ensemble(nn.Module):
-    """K member networks of one sub-goal with fresh weights; ``training.fit`` trains them.
+    """K member networks of one sub-goal with fresh weights; a ``training.Training`` trains them.
 
     Args:
         network: a name in ``networks.NETWORKS``.
@@ -64,7 +80,7 @@ class Ensemble(nn.Module):
     def __init__(
         self,
         network: str,
-        observation_shape: tuple[int, ...],
+        observation_shape: Shape,
         members: int,
         generator: torch.Generator,
         view: View | None = None,
@@ -72,29 +88,28 @@ class Ensemble(nn.Module):
         super().__init__()
         self.observation_shape = tuple(int(size) for size in observation_shape)
         self.view = view or FullView(self.observation_shape)
-        self.network = network = network_for(network, self.view.dtype)
-        shape, dtype = self.view.shape, self.view.dtype
-        built = [build_network(network, shape, generator, dtype) for _ in range(members)]
+        self.network = networks.network_for(network, self.view.dtype)
+        built = []
+        for _ in range(members):
+            built.append(networks.build_network(self.network, self.view.shape, generator, self.view.dtype))
         self.members = nn.ModuleList(built)
-        self.networks = tuple(reordered(member) for member in built)
+        self.networks = tuple(map(networks.reordered, built))
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self.train()
 
     def __repr__(self) -> str:
-        observations = f"observations {type_text(self.view.dtype)} {self.observation_shape}"
-        return f"Ensemble({len(self)} members, network {self.network!r}, {observations})"
+        kind = type_text(self.view.dtype)
+        return f"Ensemble({len(self)} members, network {self.network!r}, observations {kind} {self.observation_shape})"
 
     def __len__(self) -> int:
         """K, the number of members."""
         return len(self.members)
 
-    def thresholds_as_log_odds(self) -> NDArray[np.float32]:
+    def thresholds_as_log_odds(self) -> Floats:
         """The thresholds (K,) as log-odds, with the same predictions up to rounding."""
-        probabilities = self.thresholds.cpu().numpy().astype(np.float64)
-        log_odds: NDArray[np.float32] = (np.log(probabilities) - np.log1p(-probabilities)).astype(np.float32)
-        return log_odds
+        return log_odds_of(self.thresholds.cpu().numpy()).astype(np.float32)
 
-    def set_thresholds(self, thresholds: NDArray[np.float32]) -> None:
+    def set_thresholds(self, thresholds: Floats) -> None:
         """Set the probabilities (K,) above which predictions are positive."""
         self.thresholds.copy_(torch.from_numpy(thresholds))
 
@@ -103,33 +118,29 @@ class Ensemble(nn.Module):
 
         For observations other than pictures: float32 (N, *shape), standardised; mixed ones (N,), their numbers so.
         """
-        if self.view.dtype.names and isinstance(observations, Mapping):
-            try:
-                observations = packed(observations, self.view.dtype)
-            except ValueError as error:
-                do = f"Give arrays (N, ...) by key: {type_text(self.view.dtype)}."
-                raise UserError(NO_OBSERVATIONS, error, do) from None
+        dtype = self.view.dtype
+        expected = f"{type_text(dtype)} (N, {', '.join(map(str, self.observation_shape))})"
         try:
+            if dtype.names and isinstance(observations, Mapping):
+                observations = packed(observations, dtype)
             observations = np.asarray(observations)
-        except ValueError:  # of different shapes
-            raise UserError(NO_OBSERVATIONS, "they differ in shape", f"Give {self.view.dtype} (N, ...).") from None
-        if self.view.dtype == NUMBERS and observations.dtype == np.float64:
+        except ValueError as error:  # other keys, or of different shapes
+            raise UserError(NO_OBSERVATIONS, error, f"Give {expected}.") from None
+        if dtype == NUMBERS and observations.dtype == np.float64:
             observations = observations.astype(NUMBERS)
-        if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
-            kind = f"{observations.dtype} {observations.shape}"
-            expected = f"{type_text(self.view.dtype)} (N, {', '.join(map(str, self.observation_shape))})"
-            raise UserError(NO_OBSERVATIONS, kind, f"Give {expected}.")
+        if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
+            given = f"{observations.dtype} {observations.shape}"
+            raise UserError(NO_OBSERVATIONS, given, f"Give {expected}.")
         return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
-    def predictions(self, observations: Observations) -> NDArray[np.bool_]:
+    def predictions(self, observations: Observations) -> Bools:
         """Every member's prediction, whether the sub-goal holds: bool (N, K); see :meth:`predict`.
 
         Within rounding of its threshold, some 1e-6, a prediction may depend on the other states of the call.
         """
-        positive: NDArray[np.bool_] = self.predict(observations) > self.thresholds.cpu().numpy()
-        return positive
+        return np.asarray(self.predict(observations) > self.thresholds.cpu().numpy())
 
-    def predict(self, observations: Observations) -> NDArray[np.float32]:
+    def predict(self, observations: Observations) -> Floats:
         """Every member's probability that the sub-goal holds.
 
         Args:
@@ -143,32 +154,35 @@ class Ensemble(nn.Module):
             UserError: observations of another shape or type.
         """
         both = torch.from_numpy(self.logits(observations))
-        probabilities: NDArray[np.float32] = both.softmax(dim=-1)[..., 1].numpy()
-        return probabilities
+        return np.asarray(both.softmax(dim=-1)[..., 1])
 
-    def log_odds(self, observations: Observations) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations) -> Floats:
         """Every member's log-odds that the sub-goal holds: float32 (N, K); see :meth:`predict`."""
         both = self.logits(observations)
-        gaps: NDArray[np.float32] = both[..., 1] - both[..., 0]
-        return gaps
+        return np.asarray(both[..., 1] - both[..., 0])
 
-    def logits(self, observations: Observations) -> NDArray[np.float32]:
+    def logits(self, observations: Observations) -> Floats:
         """Every member's logits of negative and positive: float32 (N, K, 2); see :meth:`predict`."""
-        observations = self.see(observations)
+        seen = self.see(observations)
+        device = self.thresholds.device
+        size = PATCH_CHUNK if device.type == "cpu" else IMAGES_AT_ONCE * 16
+        logits = np.empty((len(seen), len(self), 2), dtype=np.float32)
         was_training = self.training
         if was_training:
             self.eval()
-        logits = np.empty((len(observations), len(self), 2), dtype=np.float32)
-        chunk = PATCH_CHUNK if self.thresholds.device.type == "cpu" else IMAGES_AT_ONCE * 16
-        with torch.inference_mode():
-            for start in range(0, len(observations), chunk):
-                part = self._logits(observations[start : start + chunk])
-                logits[start : start + chunk] = part.transpose(0, 1).cpu().numpy()
+        with predicting(device):
+            for start in range(0, len(seen), size):
+                part = self._logits(seen[start : start + size])
+                logits[start : start + size] = part.transpose(0, 1).cpu().numpy()
         if was_training:
             self.train()
         return logits
 
-    def attributions(self, observations: Observations, against: Observations) -> NDArray[np.float32]:
+    def attributions(
+        self,
+        observations: Observations,
+        against: Observations,
+    ) -> Floats:
         """Spec F2, Figure 2: what each member looks at in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
 
         The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
@@ -176,92 +190,111 @@ class Ensemble(nn.Module):
         baseline's. Of mixed observations (N, K), with a field for each key. ``UserError`` as for :meth:`predict`, or
         without states.
         """
-        from hypogoal.hypotheses.deep_lift import AT_ONCE, attributed, by_key, mean_state
-
         if not (len(observations) and len(against)):
-            raise UserError("attributions need states, and others to compare with", None, "Give one or more of each.")
-        seen, baseline, fixed = self.see(observations), mean_state(self.see(against)), copy.deepcopy(self).cpu().eval()
-        parts = (seen[start : start + AT_ONCE] for start in range(0, len(seen), AT_ONCE))
-        values = np.concatenate([attributed(fixed, part, baseline).values.astype(np.float32) for part in parts])
-        return by_key(values, self.view.dtype) if self.view.dtype.names else values
+            raise UserError(
+                "attributions need states, and others to compare with",
+                None,
+                "Give one or more of each.",
+            )
+        seen = self.see(observations)
+        baseline = deep_lift.mean_state(self.see(against))
+        fixed = copy.deepcopy(self).cpu().eval()
+        parts = []
+        for start in range(0, len(seen), deep_lift.AT_ONCE):
+            found = deep_lift.attributed(
+                fixed,
+                seen[start : start + deep_lift.AT_ONCE],
+                baseline,
+            )
+            parts.append(found.values.astype(np.float32))
+        values = np.concatenate(parts)
+        return deep_lift.by_key(values, self.view.dtype) if self.view.dtype.names else values
 
     def _logits(self, observations: Observations) -> Tensor:
         """Logits (K, N, 2); computes each distinct patch once if that pays."""
-        networks, device = self.networks, self.thresholds.device
+        members, device = self.networks, self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables([observations], networks[0])
+            tables = patches.make_tables([observations], members[0])
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
-                return torch.stack([patches.forward(network, batch) for network in networks])
+                return torch.stack([patches.forward(member, batch) for member in members])
         if len(observations) >= FOLD_FROM:
-            networks = tuple(map(folded, networks))
-        size = (values_in(observations.shape[1:], observations.dtype),)
-        chunk = at_once(IMAGES_AT_ONCE, size) if device.type == "cpu" else len(observations)
+            members = tuple(map(networks.folded, members))
+        size = len(observations)
+        if device.type == "cpu":
+            size = networks.at_once(
+                IMAGES_AT_ONCE,
+                (values_in(observations.shape[1:], observations.dtype),),
+            )
         logits = []
-        for start in range(0, len(observations), chunk):
-            inputs = as_input(as_tensor(observations[start : start + chunk]).to(device), observations.dtype)
-            logits.append(torch.stack([network(inputs) for network in networks]))
+        for start in range(0, len(observations), size):
+            states = networks.as_tensor(observations[start : start + size]).to(device)
+            inputs = networks.as_input(states, observations.dtype)
+            logits.append(torch.stack([member(inputs) for member in members]))
         return torch.cat(logits, dim=1)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and BatchNorm statistics by name, as contiguous CPU tensors for safetensors."""
-        return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.state_dict().items()}
+        return {name: tensor.cpu().clone().contiguous() for name, tensor in self.state_dict().items()}
 
     @classmethod
     def from_state(
         cls,
         network: str,
-        observation_shape: tuple[int, ...],
+        observation_shape: Shape,
         members: int,
         state: Mapping[str, Tensor],
         view: View | None = None,
     ) -> Ensemble:
         """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit."""
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
-        numbers = {name.split(".")[1] for name in state if name.startswith("members.")}
-        if len(numbers) != members:
-            fault = f"the weights do not fit the ensemble (of {len(numbers)} members)"
-            raise UserError(fault, where, "Train it again.")
+        own = not set(networks.names_in(network)) <= networks.NETWORKS.keys()
 
         def make() -> Ensemble:
             return cls(network, observation_shape, members, torch.Generator(), view)
 
-        return load_fitting(make, state, where, custom=not NETWORKS.keys() >= {*names_in(network)}).eval()
+        return load_fitting(make, state, where, custom=own).eval()
 
 
-def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:
+def write_ensemble(
+    folder: Path,
+    sub_goal: str,
+    ensemble: Ensemble,
+) -> None:
     """Write ``<sub-goal>.safetensors`` to ``folder``."""
     save_tensors(folder / f"{sub_goal}.safetensors", ensemble.state())
 
 
-def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ensemble:
+def read_ensemble(
+    folder: Path,
+    config: Mapping[str, Any],
+    sub_goal: str,
+) -> Ensemble:
     """One sub-goal's ensemble, from an ensemble artefact's folder and its manifest's configuration.
 
     An unknown sub-goal, or missing or damaged weights, are a ``UserError``.
     """
     if sub_goal not in config["sub_goals"]:
-        raise UserError("unknown sub-goal", sub_goal, f"{folder} has {', '.join(config['sub_goals'])}.")
+        raise UserError(
+            "unknown sub-goal",
+            sub_goal,
+            f"{folder} has {', '.join(config['sub_goals'])}.",
+        )
     path = folder / f"{sub_goal}.safetensors"
     state = load_tensors(path)
     try:
         shape = tuple(config["observation_shape"])
-        view = _view(shape, config, state)
-        return Ensemble.from_state(config["network"], shape, config["members"], state, view)
+        view = saved_view(shape, config, state)
+        return Ensemble.from_state(
+            config["network"],
+            shape,
+            config["members"],
+            state,
+            view,
+        )
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):
-        raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
-
-
-def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]) -> View:
-    """The view that the settings ask for, without its weights."""
-    dtype = type_of(config["observation_dtype"])
-    if dtype != PICTURE:
-        size = standard_shape(observation_shape, dtype)
-        if not prod(size):
-            return FullView(observation_shape, None, dtype)
-        mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
-        if mean.shape != size:  # a damaged manifest may ask for terabytes
-            raise ValueError(observation_shape)
-        return FullView(observation_shape, (mean, deviation), dtype)
-    if config["view"] == FULL:
-        return FullView(observation_shape)
-    return own_view(config["view"], config["view_settings"], observation_shape)
+        raise UserError(
+            "the weights do not fit the manifest",
+            path,
+            "Train the ensemble again.",
+        ) from None

@@ -79,14 +79,16 @@ def fit(
     class_weights = torch.tensor([config.class_weight_negative, config.class_weight_positive], device=states.device)
     frozen_logits = states.frozen_logits(frozen if objective else [])  # (F, M, 2)
     positives = float(states.labels.mean())
+    compared = objective is not None or taught is not None
     for labelled, unlabelled in batches:
         classes = states.targets(labelled)
-        if objective or taught is not None:
+        if compared:
             on_labelled, on_unlabelled = states.logits(members, labelled, unlabelled, counted=config.unlabelled_bn)
         else:
             on_labelled, on_unlabelled = states.logits(members, labelled)  # (K, B, 2), and none
             if config.unlabelled_bn and len(unlabelled):
-                states.count_in(members, unlabelled)
+                with torch.no_grad():
+                    states.logits(members, unlabelled=unlabelled)  # for BatchNorm's running statistics
         numbers = torch.from_numpy(unlabelled).to(states.device)
         context = Context(classes, on_labelled, on_unlabelled, frozen_logits[:, numbers], positives)
 

@@ -13,7 +13,7 @@ network, which the paper does not have.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from math import prod
 from typing import Any, TypeAlias
@@ -27,7 +27,16 @@ from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.hypotheses.load import ByKey
-from hypogoal.observations import NUMBERS, PICTURE, Observations, fields_of, standardised, values_in
+from hypogoal.observations import (
+    NUMBERS,
+    PICTURE,
+    DType,
+    Observations,
+    Shape,
+    fields_of,
+    standardised,
+    values_in,
+)
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
@@ -38,9 +47,20 @@ MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB
 ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
 
 
-def _convolution(channels: int, features: int, kernel: int, stride: int) -> list[nn.Module]:
+def _convolution(
+    channels: int,
+    features: int,
+    kernel: int,
+    stride: int,
+) -> list[nn.Module]:
     """A convolution, BatchNorm, ReLU."""
-    layer = nn.Conv2d(channels, features, kernel_size=kernel, stride=stride, bias=False)
+    layer = nn.Conv2d(
+        channels,
+        features,
+        kernel_size=kernel,
+        stride=stride,
+        bias=False,
+    )
     return [layer, nn.BatchNorm2d(features), nn.ReLU()]
 
 
@@ -94,7 +114,7 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
 """By name: channels (size of the last axis) -> convolutional part, and widths of the hidden dense layers behind it."""
 
 
-def network_for(name: str, dtype: np.dtype[Any]) -> str:
+def network_for(name: str, dtype: DType) -> str:
     """Resolve ``auto`` by the type of observations; any other name stays.
 
     Of mixed observations the names by key, ``front=doorkey,state=mlp``. A name without a key is for all pictures; a
@@ -107,7 +127,11 @@ def network_for(name: str, dtype: np.dtype[Any]) -> str:
         key, _, network = part.strip().rpartition("=")
         named[key] = network
     if unknown := {*named} - {"", *dtype.names}:
-        raise UserError("no such key in the observations", ", ".join(unknown), f"Known are {', '.join(dtype.names)}.")
+        raise UserError(
+            "no such key in the observations",
+            ", ".join(unknown),
+            f"Known are {', '.join(dtype.names)}.",
+        )
     resolved = []
     for key in dtype.names:
         kind = dtype[key].base
@@ -121,7 +145,7 @@ def names_in(network: str) -> list[str]:
     return [part.strip().rpartition("=")[2] for part in network.split(",")]
 
 
-def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
+def load_network(name: str) -> Callable[[Shape], Parts]:
     """A function from an observation shape to network ``name``: of :data:`NETWORKS`, an entry point, or
     ``module:function``.
 
@@ -133,9 +157,13 @@ def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
     built_in = dict.fromkeys(NETWORKS, __name__)
     function = load(name, "network", ENTRY_POINTS, built_in)
     if not callable(function):
-        raise UserError("this is not a member network", name, "Give a function of channels or of observation_shape.")
+        raise UserError(
+            "this is not a member network",
+            name,
+            "Give a function of channels or of observation_shape.",
+        )
 
-    def parts(shape: tuple[int, ...]) -> Parts:
+    def parts(shape: Shape) -> Parts:
         by_shape = "observation_shape" in inspect.signature(function).parameters
         network = function(shape if by_shape else shape[-1])
         if isinstance(network, nn.Module):
@@ -145,7 +173,7 @@ def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
     return parts
 
 
-def _encoder(name: str, network: nn.Module, shape: tuple[int, ...]) -> Parts:
+def _encoder(name: str, network: nn.Module, shape: Shape) -> Parts:
     """A user's encoder, :func:`as_input` -> (N, F), as parts."""
     with torch.no_grad():
         features = network.eval()(as_input(torch.zeros(1, *shape)))
@@ -166,15 +194,19 @@ def _layers(name: str, network: Any) -> Parts:
     except (TypeError, ValueError):
         proper = False
     if not proper:
-        raise UserError(f"the network gave {network!r}", name, "Give (modules, hidden widths above 0), or an encoder.")
+        raise UserError(
+            f"the network gave {network!r}",
+            name,
+            "Give (modules, hidden widths above 0), or an encoder.",
+        )
     return list(layers), widths
 
 
 def build_network(
     name: str,
-    observation_shape: tuple[int, ...],
+    observation_shape: Shape,
     generator: torch.Generator | None,
-    dtype: np.dtype[Any] = PICTURE,
+    dtype: DType = PICTURE,
 ) -> nn.Sequential:
     """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
@@ -193,7 +225,7 @@ def build_network(
             raise UserError(
                 f"the network {name!r} does not take these observations",
                 f"observation shape {tuple(observation_shape)}",
-                f"Give {_ways(example)}, larger pictures, or a network of your own (--set network=module:function).",
+                "Give another network (mlp takes any), larger pictures, or a network of your own.",
             )
         widths = [features.numel(), *hidden]
         dense: list[nn.Module] = []
@@ -203,7 +235,11 @@ def build_network(
     return nn.Sequential(*layers, nn.Flatten(), *dense).train()
 
 
-def _by_key(name: str, generator: torch.Generator | None, dtype: np.dtype[Any]) -> ByKey:
+def _by_key(
+    name: str,
+    generator: torch.Generator | None,
+    dtype: DType,
+) -> ByKey:
     """The encoders of mixed observations."""
     shapes, encoders = [], []
     names = names_in(network_for(name, dtype))
@@ -213,7 +249,7 @@ def _by_key(name: str, generator: torch.Generator | None, dtype: np.dtype[Any]) 
     return ByKey(shapes, encoders)
 
 
-def _features(layers: list[nn.Module], example: Tensor) -> Tensor | None:
+def _features(layers: Iterable[nn.Module], example: Tensor) -> Tensor | None:
     """A convolutional part's output for an input; None if it does not take it."""
     try:
         with torch.no_grad():
@@ -221,16 +257,6 @@ def _features(layers: list[nn.Module], example: Tensor) -> Tensor | None:
             return features
     except (RuntimeError, ValueError):
         return None
-
-
-def _ways(example: Tensor) -> str:
-    """The settings of the built-in networks that take an input."""
-    channels = example.shape[1]
-    ways = []
-    for name, parts_of in NETWORKS.items():
-        if _features(parts_of(channels)[0], example) is not None:
-            ways.append(f"--set network={name}")
-    return ", ".join(ways)
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:
@@ -242,7 +268,8 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
     layers: list[nn.Module] = []
     for layer in network:
         if isinstance(layer, ByKey):
-            layer = ByKey(layer.shapes, map(reordered, layer.encoders))
+            encoders = [reordered(each) for each in layer.encoders if isinstance(each, nn.Sequential)]
+            layer = ByKey(layer.shapes, encoders)
         place = len(layers)
         if isinstance(layer, nn.MaxPool2d) and layers and isinstance(layers[-1], nn.ReLU):
             place -= 1
@@ -265,11 +292,18 @@ def folded(network: nn.Sequential) -> nn.Sequential:
 def as_tensor(observations: Observations) -> Tensor:
     """Observations (N, ...) in the same memory; mixed ones as their bytes, uint8 (N, B), for :func:`as_input`."""
     if observations.dtype.names:
-        observations = observations.view(np.uint8).reshape(len(observations), observations.dtype.itemsize)
+        observations = observations.view(np.uint8).reshape(
+            len(observations),
+            observations.dtype.itemsize,
+        )
     return torch.from_numpy(observations)
 
 
-def as_input(observations: Tensor, dtype: np.dtype[Any] = PICTURE, standard: Sequence[Tensor] = ()) -> Tensor:
+def as_input(
+    observations: Tensor,
+    dtype: DType = PICTURE,
+    standard: Sequence[Tensor] = (),
+) -> Tensor:
     """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
 
     Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too. Mixed ones
@@ -282,7 +316,11 @@ def as_input(observations: Tensor, dtype: np.dtype[Any] = PICTURE, standard: Seq
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
 
 
-def _inputs_by_key(rows: Tensor, dtype: np.dtype[Any], standard: Sequence[Tensor]) -> Tensor:
+def _inputs_by_key(
+    rows: Tensor,
+    dtype: DType,
+    standard: Sequence[Tensor],
+) -> Tensor:
     """See :func:`as_input`."""
     inputs, first = [], 0
     for key, (kind, shape) in fields_of((), dtype).items():
@@ -300,6 +338,6 @@ def _inputs_by_key(rows: Tensor, dtype: np.dtype[Any], standard: Sequence[Tensor
     return torch.cat(inputs, dim=1)
 
 
-def at_once(most: int, shape: tuple[int, ...]) -> int:
+def at_once(most: int, shape: Shape) -> int:
     """How many states of this shape to pass through a network at once: ``most``, or fewer if they are large."""
     return max(1, min(most, MOST_NUMBERS // prod(shape)))

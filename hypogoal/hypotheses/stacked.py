@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.arrays import tensor
-from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble
-from hypogoal.hypotheses.networks import as_input, at_once, folded
+from hypogoal.core.arrays import Floats, tensor
+from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble, predicting
+from hypogoal.hypotheses.networks import (
+    as_input,
+    at_once,
+    folded,
+)
 from hypogoal.hypotheses.views import FullView
 from hypogoal.observations import Observations
 
@@ -33,26 +36,32 @@ class StackedMembers:
     def __init__(self, ensembles: Sequence[Ensemble]):
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
-        plain = [isinstance(ensemble.view, FullView) and ensemble.view.standard is None for ensemble in ensembles]
-        self._one_view = all(plain)
-        networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
+        self._one_view = all(type(each.view) is FullView and each.view.standard is None for each in ensembles)
+        networks: list[nn.Sequential] = []
+        for ensemble in ensembles:
+            networks += map(folded, ensemble.eval().networks)
         self.count = len(networks)
         self.joined = _can_be_joined(networks[0])
-        self._steps: list[tuple[nn.Module, list[Tensor]]] = []
+        self._layers: list[tuple[nn.Module, dict[str, Tensor]]] = []
         if self.joined:
-            self._steps = [(layers[0], _stack(list(layers))) for layers in zip(*networks, strict=True)]
+            for layers in zip(*networks, strict=True):
+                self._layers.append((layers[0], _stack(layers)))
 
-    def log_odds(self, observations: Observations) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations) -> Floats:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
         if not self.joined:
-            return np.concatenate([ensemble.log_odds(observations) for ensemble in self.ensembles], axis=1)
+            return np.concatenate(
+                [ensemble.log_odds(observations) for ensemble in self.ensembles],
+                axis=1,
+            )
         seen = self._see(observations)
         rows = [np.empty((0, self.count), dtype=np.float32)]
-        with torch.inference_mode():
-            chunk = at_once(IMAGES_AT_ONCE, seen.shape[1:])
-            for start in range(0, len(seen), chunk):
-                logits = self._logits(seen[start : start + chunk])
-                rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
+        size = at_once(IMAGES_AT_ONCE, seen.shape[1:])
+        with predicting(self.device):
+            for start in range(0, len(seen), size):
+                logits = self._logits(seen[start : start + size])
+                gaps = logits[..., 1] - logits[..., 0]
+                rows.append(gaps.T.cpu().numpy())
         return np.concatenate(rows)
 
     def _see(self, observations: Observations) -> Any:
@@ -69,47 +78,53 @@ class StackedMembers:
         """What :meth:`_see` returns -> logits (members, N, 2)."""
         x = as_input(tensor(seen, self.device))
         groups = 1 if self._one_view else len(self.ensembles)
-        for layer, weights in self._steps:
+        for layer, weights in self._layers:
             if isinstance(layer, nn.Conv2d):
-                bias = weights[1] if len(weights) > 1 else None
-                x = functional.conv2d(x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups)
+                bias = weights.get("bias")
+                x = functional.conv2d(x, weights["weight"], bias, layer.stride, layer.padding, layer.dilation, groups)
                 groups = self.count
             elif isinstance(layer, nn.Flatten):
                 x = x.reshape(len(x), groups, -1).transpose(0, 1)
-                if groups < self.count:  # all layers before were shared
-                    x = x.repeat_interleave(self.count // groups, dim=0)
+                x = x.repeat_interleave(
+                    self.count // groups,
+                    dim=0,
+                )  # where all layers before were shared
             elif isinstance(layer, nn.Linear):
-                x = torch.baddbmm(weights[1], x, weights[0])
+                x = torch.baddbmm(weights["bias"], x, weights["weight"])
             else:
                 x = layer(x)
         return x
 
 
 def _can_be_joined(network: nn.Sequential) -> bool:
+    """Whether it is convolutions, one Flatten and dense layers, with what has no weights between them."""
     flat = False
+    layer: Any
     for layer in network:
-        if type(layer) is nn.Flatten:
-            fits, flat = (layer.start_dim, layer.end_dim) == (1, -1) and not flat, True
-        elif type(layer) is nn.Conv2d:
+        kind = type(layer)
+        if kind is nn.Flatten and not flat:
+            flat = (layer.start_dim, layer.end_dim) == (1, -1)
+            fits = flat
+        elif kind is nn.Conv2d:
             fits = not flat and layer.groups == 1 and layer.padding_mode == "zeros"
+        elif kind is nn.Linear:
+            fits = flat and layer.bias is not None
         else:
-            fits = (type(layer) is nn.Linear and flat) or type(layer) in WITHOUT_WEIGHTS
+            fits = kind in WITHOUT_WEIGHTS
         if not fits:
             return False
     return flat
 
 
-def _stack(layers: list[nn.Module]) -> list[Tensor]:
-    """Join the weights of one layer of every member as :meth:`StackedMembers._logits` needs them."""
-    first = layers[0]
-    state = [layer.state_dict() for layer in layers]
-
-    def joined(name: str) -> Tensor:
-        return torch.cat([values[name] for values in state]).clone()
-
-    if isinstance(first, nn.Conv2d):
-        return [joined(name) for name in ("weight", "bias") if name in state[0]]
-    if isinstance(first, nn.Linear):
-        weight = torch.stack([values["weight"].T for values in state]).contiguous()
-        return [weight, torch.stack([values["bias"] for values in state])[:, None]]
-    return []
+def _stack(layers: Sequence[nn.Module]) -> dict[str, Tensor]:
+    """The weights of one layer of every member, joined as :meth:`StackedMembers._logits` needs them."""
+    weights = {}
+    for name in layers[0].state_dict():
+        each = [layer.state_dict()[name] for layer in layers]
+        if isinstance(layers[0], nn.Conv2d):
+            weights[name] = torch.cat(each)
+        elif name == "weight":
+            weights[name] = torch.stack([weight.T for weight in each]).contiguous()
+        else:
+            weights[name] = torch.stack(each)[:, None]
+    return weights

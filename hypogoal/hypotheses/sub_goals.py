@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hypogoal.core.artefacts import Draft
-from hypogoal.core.checkpoints import State
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_log
 from hypogoal.core.processes import prepare
@@ -17,14 +17,10 @@ from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
-from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
+from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.hypotheses.networks import load_network, names_in, network_for
-from hypogoal.hypotheses.scores import best_mean_worst, member_scores
-from hypogoal.hypotheses.teacher import load_teacher
-from hypogoal.hypotheses.thresholds import threshold_rule
-from hypogoal.hypotheses.training import CHECKED_EVERY, Training
-from hypogoal.hypotheses.views import StateOrigins, own_view
+from hypogoal.hypotheses.training import Training
 from hypogoal.observations import spread_rows
 
 LOOKED_AT = 1_000  # held-out states, cheap beside training
@@ -33,14 +29,14 @@ LOOKED_AT = 1_000  # held-out states, cheap beside training
 def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
     """The settings with the network that fits the data, and the sub-goals; what cannot be trained is refused."""
     load_objective(config.diversity)
-    threshold_rule(config.threshold)
+    thresholds.threshold_rule(config.threshold)
     if config.teacher:
-        load_teacher(config.teacher)
-    if config.view != FULL:
-        own_view(config.view, config.view_settings, dataset.observation_shape)
-    config = config.model_copy(update={"network": network_for(config.network, dataset.observation_dtype)})
-    for name in names_in(config.network):
-        load_network(name)
+        teacher.load_teacher(config.teacher)
+    if config.view != views.FULL:
+        views.own_view(config.view, config.view_settings, dataset.observation_shape)
+    config = config.model_copy(update={"network": networks.network_for(config.network, dataset.observation_dtype)})
+    for name in networks.names_in(config.network):
+        networks.load_network(name)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
         raise UserError("a sub-goal is named twice", ", ".join(sub_goals), "Name each once.")
@@ -76,19 +72,19 @@ def train_sub_goal(
         unlabelled.observations,
         config,
         seed_for(seed, "ensemble", sub_goal),
-        origins=StateOrigins(labelled.origins, unlabelled.origins),
+        origins=views.StateOrigins(labelled.origins, unlabelled.origins),
         device=device,
         saved=saved["training"] if saved else None,
     )
     log = MetricsLog(log_of(draft, sub_goal), tensorboard)
     log.restore(saved["log"] if saved else 0)
 
-    def state() -> State:
+    def state() -> dict[str, Any]:
         return {"training": training.snapshot(), "log": log.snapshot()}
 
     with contextlib.closing(log), checkpoints:
         for step, losses in training.steps():
-            if step % config.steps % CHECKED_EVERY == 0:
+            if training.due:
                 log.write(sub_goal=sub_goal, step=step, **losses.numbers())
             checkpoints.offer(state)
     checkpoints.save(state())
@@ -117,5 +113,5 @@ def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dic
         states = states.where(spread_rows(len(states.labels), LOOKED_AT))
         predictions = ensemble.predictions(states.observations)
     except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
-        return best_mean_worst(np.full(len(ensemble), np.nan))
-    return best_mean_worst(member_scores(predictions, states.labels)["balanced_accuracy"])
+        return scores.best_mean_worst(np.full(len(ensemble), np.nan))
+    return scores.best_mean_worst(scores.member_scores(predictions, states.labels)["balanced_accuracy"])

@@ -17,13 +17,26 @@ def load_teacher(name: str) -> Callable[..., Any]:
     return teacher
 
 
-def taught_by(name: str, observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Tensor:
+def taught_by(
+    name: str,
+    observations: Any,
+    labels: Any,
+    unlabelled: Any,
+    members: int,
+    seed: int,
+) -> Tensor:
     """A teacher's scores of unlabelled states, float32 (K, M); others than finite ones are a ``UserError``.
 
     It gets labelled observations (N, *obs), labels bool (N,), unlabelled observations (M, *obs), K and a seed.
     """
-    teacher, shape = load_teacher(name), (members, len(unlabelled))
-    scores = np.array(teacher(observations, labels, unlabelled, members, seed), dtype=np.float32)
+    teacher = load_teacher(name)
+    shape = (members, len(unlabelled))
+    given = teacher(observations, labels, unlabelled, members, seed)
+    scores = np.array(given, dtype=np.float32)
     if scores.shape != shape or not np.isfinite(scores).all():
-        raise UserError(f"the teacher gave scores {scores.shape}", name, f"Give finite ones, {shape}.")
+        raise UserError(
+            f"the teacher gave scores {scores.shape}",
+            name,
+            f"Give finite ones, {shape}.",
+        )
     return torch.from_numpy(scores)

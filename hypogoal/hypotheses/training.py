@@ -11,22 +11,30 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.core import seeding
+from hypogoal.core.arrays import Bools
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.seeding import global_state, restore_global, seed_for, torch_generator
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.fit import Losses, fit, objective_of
+from hypogoal.hypotheses.fit import (
+    Losses,
+    fit,
+    objective_of,
+)
 from hypogoal.hypotheses.teacher import taught_by
-from hypogoal.hypotheses.thresholds import PAPER, SPLIT, thresholds
+from hypogoal.hypotheses.thresholds import (
+    PAPER,
+    SPLIT,
+    thresholds,
+)
 from hypogoal.hypotheses.views import StateOrigins, view_of
 from hypogoal.observations import Observations
 
-CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log: each makes a GPU wait
+CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
 
 
 class Training(Resumable):
@@ -57,7 +65,7 @@ class Training(Resumable):
     def __init__(
         self,
         observations: Observations,
-        labels: NDArray[np.bool_],
+        labels: Bools,
         unlabelled: Observations,
         config: EnsembleConfig,
         seed: int,
@@ -68,20 +76,44 @@ class Training(Resumable):
     ):
         if not len(unlabelled) and (objective_of(config) or config.teacher or config.threshold == SPLIT):
             do = "Give some, or set diversity=none, threshold=0.5 and no teacher."
-            raise UserError("unlabelled states are needed to make members differ", None, do)
+            raise UserError(
+                "unlabelled states are needed to make members differ",
+                None,
+                do,
+            )
         origins = origins or StateOrigins()
         self.config, self.seed = config, seed
         self.observations, self.labels, self.unlabelled = observations, labels, unlabelled
-        view = view_of(observations, unlabelled, config, origins, seed, fitted=saved is None)
-        weights = torch_generator(seed, "weights")
+        view = view_of(
+            observations,
+            unlabelled,
+            config,
+            origins,
+            seed,
+            fitted=saved is None,
+        )
+        weights = seeding.torch_generator(seed, "weights")
         self.ensemble = Ensemble(config.network, observations.shape[1:], config.members, weights, view).to(device)
         self.taught: Tensor | None = None
         if saved:
             self.ensemble.load_state_dict(saved["ensemble"])  # with what the view has learned
         elif config.teacher:
-            drawn = seed_for(seed, "proposals")
-            self.taught = taught_by(config.teacher, observations, labels, unlabelled, config.members, drawn)
-        self.states = TrainingStates(observations, labels, unlabelled, self.ensemble, origins.labelled)
+            drawn = seeding.seed_for(seed, "proposals")
+            self.taught = taught_by(
+                config.teacher,
+                observations,
+                labels,
+                unlabelled,
+                config.members,
+                drawn,
+            )
+        self.states = TrainingStates(
+            observations,
+            labels,
+            unlabelled,
+            self.ensemble,
+            origins.labelled,
+        )
         members = list(range(config.members))
         self.rounds = [[member] for member in members] if config.schedule == "sequential" else [members]
         self._begin(saved["number"] if saved else 0)
@@ -92,7 +124,7 @@ class Training(Resumable):
 
     def snapshot(self) -> State:
         """All that the next steps depend on."""
-        return {**super().snapshot(), "layers": global_state(self.states.device)}
+        return {**super().snapshot(), "layers": seeding.global_state(self.states.device)}
 
     def steps(self) -> Iterator[tuple[int, Losses]]:
         """Take the steps that are left, then set thresholds; yields each step's number and losses.
@@ -110,14 +142,19 @@ class Training(Resumable):
         if self.config.threshold != PAPER:
             on_labelled = self.ensemble.predict(self.observations)
             on_unlabelled = self.ensemble.predict(self.unlabelled)
-            chosen = thresholds(self.config.threshold, on_labelled, self.labels, on_unlabelled)
+            chosen = thresholds(
+                self.config.threshold,
+                on_labelled,
+                self.labels,
+                on_unlabelled,
+            )
             self.ensemble.set_thresholds(chosen)
 
     def _begin(self, number: int) -> None:
         """Begin to train the members of one round."""
         self.number, self.done = number, 0
         self.networks = [self.ensemble.networks[member].train() for member in self.rounds[number]]
-        self._round_seed = seed_for(self.seed, "batches", number)
+        self._round_seed = seeding.seed_for(self.seed, "batches", number)
         self.states.begin(self._round_seed)
         self.optimiser = torch.optim.Adam(
             nn.ModuleList(self.networks).parameters(),
@@ -129,24 +166,33 @@ class Training(Resumable):
     def _round(self) -> Iterator[tuple[int, Losses]]:
         """Train the members of the round that has begun."""
         config, members, device = self.config, self.rounds[self.number], self.states.device
-        torch.manual_seed(seed_for(self._round_seed, "layers"))
+        torch.manual_seed(seeding.seed_for(self._round_seed, "layers"))
         if self._layers is not None:
-            restore_global(self._layers, device)
+            seeding.restore_global(self._layers, device)
             self._layers = None
         earlier = self.ensemble.networks[: members[0]]
         taught = None if self.taught is None else self.taught[members].to(device)
-        batches = islice(self.states.batches(config, self._round_seed), self.done, None)
+        batches = islice(
+            self.states.batches(config, self._round_seed),
+            self.done,
+            None,
+        )
         unchecked: list[Losses] = []
         for losses in fit(self.networks, earlier, self.states, batches, self.optimiser, config, taught):
             self.done += 1
             unchecked.append(losses)
-            if self.done % CHECKED_EVERY == 0 or self.done == config.steps:
+            if self.due:
                 self._require_finite(unchecked)
                 unchecked.clear()
             yield self.step, losses
         for member, network in zip(members, self.networks, strict=True):
             if not all(weight.isfinite().all() for weight in network.state_dict().values()):
                 raise NumericalError(f"a weight of member {member} is NaN or Inf after step {self.step}")
+
+    @property
+    def due(self) -> bool:
+        """Whether losses are due to be checked and logged: every some steps, since each makes a GPU wait."""
+        return self.done % CHECKED_EVERY == 0 or self.done == self.config.steps
 
     @property
     def step(self) -> int:

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.config import Config, assigned, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
@@ -20,16 +20,19 @@ from hypogoal.hypotheses.config import FULL, EnsembleConfig
 from hypogoal.observations import (
     NUMBERS,
     PICTURE,
+    DType,
     Observations,
+    Shape,
     Standard,
     fields_of,
     numbers_of,
     standard_of,
     standardised,
+    type_of,
 )
 
 ENTRY_POINTS = "hypogoal.views"  # with which other packages add views
-Origins = Mapping[str, NDArray[np.int64]]
+Origins = Mapping[str, Ints]
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,8 @@ class View(nn.Module):
 
     Settings: ClassVar[type[Config]] = Config
     changes: ClassVar[bool] = False
-    dtype: np.dtype[Any] = PICTURE
-    shape: tuple[int, ...]
+    dtype: DType = PICTURE
+    shape: Shape
 
     @property
     def standard(self) -> Standard | None:
@@ -81,7 +84,7 @@ class View(nn.Module):
         """
         return batch
 
-    def pools(self, labels: NDArray[np.bool_], origins: Origins) -> tuple[list[NDArray[np.int64]], float]:
+    def pools(self, labels: Bools, origins: Origins) -> tuple[list[Ints], float]:
         """The positives in pools that take turns, by number, and their share of labelled batches.
 
         By default all in one, and half, so that the class weights apply (DEV-13).
@@ -98,27 +101,34 @@ class FullView(View):
     mean: Tensor
     deviation: Tensor
 
-    def __init__(
-        self, observation_shape: tuple[int, ...], standard: Standard | None = None, dtype: np.dtype[Any] | None = None
-    ):
+    def __init__(self, observation_shape: Shape, standard: Standard | None = None, dtype: DType | None = None):
         super().__init__()
-        self.shape, self.dtype = observation_shape, (NUMBERS if standard else PICTURE) if dtype is None else dtype
-        for name, values in zip(("mean", "deviation"), standard or (), strict=False):
-            self.register_buffer(name, torch.from_numpy(values.copy()))
+        self.shape = observation_shape
+        self.dtype = dtype or (NUMBERS if standard else PICTURE)
+        if standard:
+            mean, deviation = standard
+            self.register_buffer("mean", torch.from_numpy(mean.copy()))
+            self.register_buffer("deviation", torch.from_numpy(deviation.copy()))
 
     @property
     def standard(self) -> Standard | None:
         """Mean and deviation (*shape) of numbers; None for pictures."""
-        return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if "mean" in self._buffers else None
+        if "mean" not in self._buffers:
+            return None
+        return self.mean.cpu().numpy(), self.deviation.cpu().numpy()
 
     def see(self, observations: Observations) -> Observations:
         """The observations (N, *shape)."""
-        if self.standard is None or not self.dtype.names:
-            return standardised(observations, *self.standard) if self.standard else observations
-        seen, numbers, place = observations.copy(), standardised(numbers_of(observations), *self.standard), 0
+        if self.standard is None:
+            return observations
+        if not self.dtype.names:
+            return standardised(observations, *self.standard)
+        seen = observations.copy()
+        numbers, place = standardised(numbers_of(observations), *self.standard), 0
         for key, (dtype, shape) in fields_of((), self.dtype).items():
             if dtype == NUMBERS:
-                seen[key] = numbers[:, place : place + prod(shape)].reshape(-1, *shape)
+                of_key = numbers[:, place : place + prod(shape)]
+                seen[key] = of_key.reshape(-1, *shape)
                 place += prod(shape)
         return seen
 
@@ -127,17 +137,20 @@ def full_view(like: Observations, *observations: Observations) -> FullView:
     """All of observations ``like`` these, their numbers standardised by mean and deviation of ``observations``."""
     shape, dtype = like.shape[1:], like.dtype
     size = standard_shape(shape, dtype)
-    rows = (numbers_of(some).reshape(len(some), *size) for some in observations)
-    return FullView(shape, standard_of(size, *rows) if prod(size) else None, dtype)
+    if not prod(size):
+        return FullView(shape, None, dtype)
+    rows = [numbers_of(some).reshape(len(some), *size) for some in observations]
+    return FullView(shape, standard_of(size, *rows), dtype)
 
 
-def standard_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
+def standard_shape(shape: Shape, dtype: DType) -> Shape:
     """The shape of an observation's standard: that of numbers, else (D,), how many numbers it has."""
-    sizes = [prod(size) for kind, size in fields_of(shape, dtype).values() if kind == NUMBERS]
-    return shape if dtype == NUMBERS else (sum(sizes),)
+    if dtype == NUMBERS:
+        return shape
+    return (sum(prod(size) for kind, size in fields_of(shape, dtype).values() if kind == NUMBERS),)
 
 
-def own_view(name: str, settings: Sequence[str], observation_shape: tuple[int, ...]) -> View:
+def own_view(name: str, settings: Sequence[str], observation_shape: Shape) -> View:
     """The view ``module:Class`` with its settings, ``KEY=VALUE``.
 
     No such view or setting, and code that the user did not allow, are a ``UserError``.
@@ -145,13 +158,22 @@ def own_view(name: str, settings: Sequence[str], observation_shape: tuple[int, .
     kind = load(name, "view", ENTRY_POINTS, {})
     if not (inspect.isclass(kind) and issubclass(kind, View)):
         raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
-    values = assigned(settings)
-    fields = kind.Settings.model_fields
-    for key in values:
-        if key not in fields:
-            raise UserError("the view has no such setting", f"view.{key}", f"It has {', '.join(fields) or 'none'}.")
-    view: View = kind(observation_shape, resolve(kind.Settings, values, stage=name))
+    view: View = kind(observation_shape, resolve(kind.Settings, assigned(settings), stage=name))
     return view
+
+
+def saved_view(observation_shape: Shape, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> View:
+    """The view that the settings ask for, without its weights."""
+    dtype = type_of(config["observation_dtype"])
+    if config.get("view", FULL) != FULL:
+        return own_view(config["view"], config["view_settings"], observation_shape)
+    size = standard_shape(observation_shape, dtype)
+    if dtype == PICTURE or not prod(size):
+        return FullView(observation_shape, None, dtype)
+    standard = state["view.mean"].numpy(), state["view.deviation"].numpy()
+    if standard[0].shape != size:  # a damaged manifest may ask for terabytes
+        raise ValueError(observation_shape)
+    return FullView(observation_shape, standard, dtype)
 
 
 def view_of(

@@ -5,13 +5,18 @@ from __future__ import annotations
 import operator
 import os
 from pathlib import Path
-from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
+from typing import (
+    Any,
+    SupportsFloat,
+    SupportsIndex,
+    TypeAlias,
+)
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.gymnasium.reader import Reader, reader_of
@@ -28,7 +33,11 @@ def require_observations(env: Env, ensemble: Ensemble) -> Reader:
     if (reader.shape, reader.dtype) != (shape, dtype):
         mismatch = f"{reader.dtype} {reader.shape}, not {dtype} {shape}"
         do = "Use the environment they were trained on, with its wrappers."
-        raise UserError("these members were trained on other observations", mismatch, do)
+        raise UserError(
+            "these members were trained on other observations",
+            mismatch,
+            do,
+        )
     return reader
 
 
@@ -36,7 +45,11 @@ def ensemble_at(path: Path, sub_goal: str) -> Ensemble:
     """One sub-goal's ensemble in an artefact; without a name its only one."""
     artefact = open_artefact(path, "ensemble")
     goals = artefact.config["sub_goals"]
-    return read_ensemble(artefact.path, artefact.config, sub_goal or (goals[0] if len(goals) == 1 else ""))
+    return read_ensemble(
+        artefact.path,
+        artefact.config,
+        sub_goal or (goals[0] if len(goals) == 1 else ""),
+    )
 
 
 class SubgoalReward:
@@ -55,30 +68,45 @@ class SubgoalReward:
         UserError: no such ensemble, sub-goal, member or rule.
     """
 
-    def __init__(self, source: str | os.PathLike[str] | Ensemble, sub_goal: str = "", by: By = "vote"):
-        ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
-        rule = by if isinstance(by, str) else _member(by)
-        if rule not in RULES and rule not in range(len(ensemble)):
-            do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
-            raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
-        self.ensemble, self.by = ensemble, rule
+    def __init__(
+        self,
+        source: str | os.PathLike[str] | Ensemble,
+        sub_goal: str = "",
+        by: By = "vote",
+    ):
+        self.ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
+        self.by = by if isinstance(by, str) else _member(by)
+        if self.by not in RULES and self.by not in range(len(self.ensemble)):
+            do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(self.ensemble) - 1}."
+            raise UserError(
+                "unknown rule for whether the sub-goal holds",
+                f"by={by!r}",
+                do,
+            )
 
-    def __call__(self, observations: Any) -> NDArray[np.float32]:
+    def __call__(self, observations: Any) -> Floats:
         """The rewards (N,) of observations."""
         return self.holds(observations).astype(np.float32)
 
-    def holds(self, observations: Any) -> NDArray[np.bool_]:
+    def holds(self, observations: Any) -> Bools:
         """Whether the sub-goal holds in observations: bool (N,)."""
         if self.by == "mean":
             return np.asarray(self.ensemble.predict(observations).mean(1) > 0.5)
         predictions = self.ensemble.predictions(observations)
         if not isinstance(self.by, str):
             return np.asarray(predictions[:, self.by])
-        members = predictions.shape[1]
+        members = len(self.ensemble)
         least = {"any": 1, "vote": members // 2 + 1, "all": members}[self.by]
         return np.asarray(predictions.sum(1) >= least)
 
-    def wrap(self, env: Env, *, scale: float = 1.0, add: bool = False, ends: bool = True) -> RewardedEnv:
+    def wrap(
+        self,
+        env: Env,
+        *,
+        scale: float = 1.0,
+        add: bool = False,
+        ends: bool = True,
+    ) -> RewardedEnv:
         """An environment that pays ``scale`` where the sub-goal holds, else 0.
 
         ``add``: that is added to its own reward instead of replacing it. ``ends``: its episode terminates there; else
@@ -99,7 +127,15 @@ def _member(by: Any) -> int | None:
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """See :meth:`SubgoalReward.wrap`."""
 
-    def __init__(self, env: Env, reward: SubgoalReward, *, scale: float = 1.0, add: bool = False, ends: bool = True):
+    def __init__(
+        self,
+        env: Env,
+        reward: SubgoalReward,
+        *,
+        scale: float = 1.0,
+        add: bool = False,
+        ends: bool = True,
+    ):
         kept = {"reward": reward, "scale": scale, "add": add, "ends": ends}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
         gymnasium.Wrapper.__init__(self, env)

@@ -327,7 +327,7 @@ def test_what_is_saved_is_what_was_trained(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--set", "view.jiter=1"], "the view has no such setting: view.jiter. It has jitter, localiser_steps"),
+        (["--set", "view.jiter=1"], "one_room:AgentView has no setting: jiter. Did you mean 'jitter'"),
         (["--set", "view.jitter=21"], "value not allowed: jitter='21' in one_room:AgentView. Allowed: 0 .. 20"),
     ],
 )

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.diversity import OBJECTIVES
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import INTEGRATED, attributed, mean_state, method_of
@@ -26,47 +25,6 @@ from hypogoal.options.termination import learned_terminations
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FEW = EnsembleConfig(members=2, steps=3, batch_size=4, diversity_weight=0.1, learning_rate=1e-3)
-
-
-class Block(nn.Module):
-    """A basic block of He et al. 2016: BatchNorm inside, a way around."""
-
-    def __init__(self, channels: int, features: int, stride: int):
-        super().__init__()
-        self.first = nn.Conv2d(channels, features, 3, stride, 1, bias=False)
-        self.second = nn.Conv2d(features, features, 3, 1, 1, bias=False)
-        self.norms = nn.ModuleList(nn.BatchNorm2d(features) for _ in range(2))
-        around = [nn.Conv2d(channels, features, 1, stride, bias=False), nn.BatchNorm2d(features)]
-        self.around = nn.Sequential(*(around if stride > 1 else []))
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.norms[1](self.second(self.norms[0](self.first(x)).relu()))
-        return (y + self.around(x)).relu()
-
-
-class ResNet18(nn.Sequential):
-    """As torchvision's, 11.2 million weights."""
-
-    def __init__(self, channels: int):
-        stem = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)]
-        blocks = [Block(64, 64, 1), Block(64, 64, 1)]
-        for width in (128, 256, 512):
-            blocks += [Block(width // 2, width, 2), Block(width, width, 1)]
-        super().__init__(*stem, *blocks, nn.AdaptiveAvgPool2d(1), nn.Flatten())
-
-
-class Small(nn.Module):
-    """GroupNorm, GELU, attention, LayerNorm and Dropout."""
-
-    def __init__(self, observation_shape: tuple[int, ...]):
-        super().__init__()
-        self.first = nn.Sequential(nn.Conv2d(observation_shape[2], 8, 8, 8), nn.GroupNorm(2, 8), nn.GELU())
-        self.attend, self.norm = nn.MultiheadAttention(8, 2, batch_first=True), nn.LayerNorm(8)
-        self.drop = nn.Dropout(0.1)
-
-    def forward(self, images: Tensor) -> Tensor:
-        x = self.first(images).flatten(2).mT
-        return self.drop(self.norm(x + self.attend(x, x, x)[0])).mean(1)
 
 
 class Whole(nn.Module):
@@ -97,21 +55,17 @@ def trained(network: str, config: EnsembleConfig = FEW, side: int = 16, **settin
     return train(images[:12], labels[:12], images[12:], config, 0)
 
 
-@pytest.mark.parametrize("network", ["test_encoders:ResNet18", "frozen_backbone:vit"])
-def test_large_networks_are_members(network: str, tmp_path: Path) -> None:
-    """Spec C5, A8, D1, F2: a ResNet-18 and a frozen transformer train, store, load, end options and are explained."""
+def test_a_large_network_is_a_member(tmp_path: Path) -> None:
+    """Spec C5, A8, D1, F2: a frozen transformer trains, is stored, loaded, ends options and is explained."""
     engine = DoorKeyEngine(100, 4)
     rng = np.random.default_rng(0)
     for _ in range(6):
         engine.step(rng.integers(engine.n_actions, size=4))
     ids = np.arange(min(engine.n_states, 12))
     images, labels = engine.images(ids), np.arange(len(ids)) % 2 == 0
-    config = FEW.model_copy(update={"network": network})
+    config = FEW.model_copy(update={"network": "frozen_backbone:vit"})
     half = len(ids) // 2
     ensemble = train(images[:half], labels[:half], images[half:], config, 0)
-    weights = sum(weight.numel() for weight in ensemble.members[0].parameters())
-    assert weights > (2e5 if network.endswith("vit") else 1.1e7)
-
     write_ensemble(tmp_path, "goal", ensemble)
     about = {**config.model_dump(), "observation_shape": list(images.shape[1:]), "sub_goals": ["goal"]}
     about["observation_dtype"] = "uint8"
@@ -156,16 +110,6 @@ def test_batchnorm_inside_an_encoder_is_as_outside(unlabelled_bn: bool, diversit
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
     counted = inside["members.0.0.layers.1.num_batches_tracked"].item()
     assert counted == (6 if unlabelled_bn else 3)
-
-
-@pytest.mark.parametrize("diversity", [name for name in OBJECTIVES if name != "none"])
-def test_every_objective_trains_encoders(diversity: str) -> None:
-    """Spec C2, C4: attention, GELU and layer normalisation under all objectives."""
-    ensemble = trained("test_encoders:Small", diversity=diversity)
-    fresh = Ensemble("test_encoders:Small", (16, 16, 3), 2, torch_generator(0, "weights")).state()
-    learned = {name: value for name, value in ensemble.state().items() if name != "thresholds"}
-    assert not any(torch.equal(value, fresh[name]) for name, value in learned.items())
-    assert not ensemble.training
 
 
 def still(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:

@@ -15,13 +15,9 @@ from command_line import refuses, run, settings
 from stable_baselines3 import DQN, PPO
 
 import hypogoal
-from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains.gymnasium.reader import reader_of
-from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, network_for
-from hypogoal.hypotheses.training import Training, train
 from hypogoal.hypotheses.views import full_view
 from hypogoal.observations import packed, type_of, type_text
 from tests.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
@@ -102,22 +98,6 @@ def test_a_joint_network_uses_every_key(made: Path) -> None:
             assert not torch.allclose(network(as_input(as_tensor(other), dtype)), before, atol=1e-7)
 
 
-def test_a_break_leaves_no_trace(tmp_path: Path) -> None:
-    """Spec G1: weights, BatchNorm of each key's encoder, and what standardises the numbers."""
-    (seen, labels), (others, _) = states(40), states(20, 1)
-    config = EnsembleConfig(members=2, steps=8, batch_size=16)
-
-    unbroken = train(packed(seen), labels, packed(others), config, 0).state()
-    broken = Training(packed(seen), labels, packed(others), config, 0)
-    checkpoints = Checkpoints(tmp_path / "e.safetensors")
-    for step, _ in broken.steps():
-        if step == 3:
-            checkpoints.save(broken.snapshot())
-    resumed = train(packed(seen), labels, packed(others), config, 0, saved=checkpoints.load()).state()
-    assert resumed.keys() == unbroken.keys() and {"view.mean", "view.deviation"} <= resumed.keys()
-    assert all(torch.equal(resumed[name], value) for name, value in unbroken.items())
-
-
 def test_attributions_are_by_key_and_complete(made: Path) -> None:
     """Spec F2: a field for each key; over all keys they add up to the difference in log-odds."""
     ensemble = hypogoal.load_ensemble(made / "ensemble", GOAL)
@@ -139,15 +119,6 @@ def test_evaluation_and_report(made: Path) -> None:
     run("report", made, "-q")
     page = (made / "report" / "index.html").read_text(encoding="utf-8")
     assert f"What members go by: {GOAL}" in page and f"Where members look: {GOAL}" in page
-
-
-def test_the_environments_dictionary_is_read_in_any_order(made: Path) -> None:
-    """Spec B6, H6: keys are sorted, as in the file."""
-    env = DoorEnv()
-    reader, observation = reader_of(env), env.reset(seed=0)[0]
-    assert reader.dtype == open_dataset(made / "data.h5").observation_dtype
-    for key in observation:
-        np.testing.assert_array_equal(reader.read(observation)[key], observation[key])
 
 
 @pytest.mark.parametrize("agent", [PPO, DQN])
@@ -223,21 +194,3 @@ def test_a_folder_for_a_hub_loads_without_hypogoal(made: Path, tmp_path: Path) -
     wanted = hypogoal.load_ensemble(made / "ensemble", GOAL).predict(seen)
     np.testing.assert_allclose(torch.load(tmp_path / "p.pt", weights_only=True).numpy(), wanted, atol=1e-5)
     run("export", made / "ensemble", "--out", hub, "--force")
-
-
-def test_a_layer_that_others_cannot_build_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G2, H6: of a network of the user's, for one key; nothing is written."""
-    (tmp_path / "half.py").write_text(
-        "from torch import nn\nclass Half(nn.Module):\n    def forward(self, x):\n        return x / 2\n"
-        "def half(channels):\n    return [Half(), nn.Conv2d(channels, 4, 8, 8), nn.ReLU()], (8,)\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    np.savez(tmp_path / "own.npz", **arrays())
-    run("import", tmp_path / "own.npz", "--out", tmp_path / "d.h5", "-q")
-    words = ["--set", "network=wrist=half:half", "--set", "steps=2", "-q"]
-    run("train-ensemble", tmp_path / "d.h5", "--out", tmp_path / "e", *words)
-    command = ["export", tmp_path / "e", "--out", tmp_path / "hub"]
-    refuses("a file names code of its own as its network: half:half", *command)
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    refuses("only hypogoal can build the layer Half", "export", tmp_path / "e", "--out", tmp_path / "hub")
-    assert not (tmp_path / "hub").exists()

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.networks import ENTRY_POINTS, NETWORKS, as_input, build_network, folded, reordered
+from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network, folded, reordered
 
 SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "tiles": (48, 48, 3), "mlp": (6, 7, 3)}
 
@@ -49,17 +49,6 @@ def test_the_layers_are_the_papers(name: str, convolutions: int, dense: int, par
     assert sum(weight.numel() for layer in layers for weight in layer.parameters()) == parameters
 
 
-@pytest.mark.parametrize("name", sorted(NETWORKS))
-def test_logits_of_each_state(name: str) -> None:
-    """Spec C5: float (N, C, H, W) -> (N, 2), each state on its own in evaluation mode."""
-    network = network_of(name).eval()
-    height, width, channels = SHAPES[name]
-    images = torch.rand(5, channels, height, width, generator=torch.Generator().manual_seed(1))
-    logits = network(images)
-    assert logits.shape == (5, 2)
-    torch.testing.assert_close(network(images[3:4]), logits[3:4])
-
-
 @pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36), ("tiles", 24)])
 def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     """Spec C5, G2: dense layers take what the convolutions leave; too small an image is one clear line."""
@@ -72,44 +61,12 @@ def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     assert f"{smallest}x{smallest}" in page
 
 
-def test_images_too_small_are_told_where_to_go() -> None:
-    """Spec C5, G2: the networks that take them as they are, and one's own always."""
-    told = []
-    for side in (40, 30, 12):
-        with pytest.raises(UserError) as caught:
-            network_of("doorkey", (side, side, 3))
-        told.append(caught.value.do)
-    own = "--set network=mlp, larger pictures, or a network of your own (--set network=module:function)."
-    assert told == [
-        f"Give --set network=montezuma, --set network=tiles, {own}",
-        f"Give --set network=tiles, {own}",
-        f"Give {own}",
-    ]
-
-
 def test_wrong_names_and_shapes_are_one_clear_line() -> None:
     """Spec G2."""
     with pytest.raises(UserError, match=r"unknown network: resnet\. Choose one of doorkey, mlp, montezuma"):
         network_of("resnet", (64, 64, 3))
     with pytest.raises(UserError, match=r"does not take these observations: observation shape \(8,\)"):
         network_of("doorkey", (8,))
-
-
-def test_another_package_adds_its_own_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Spec C5: an installed distribution with an entry point is found by name."""
-    folder = tmp_path / "own-1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\ntiny = own_network:tiny\nbad = own_network:nothing\n")
-    code = "from torch import nn\ndef tiny(channels):\n    return [nn.Conv2d(1, 2, 3)], (5,)\n"
-    (tmp_path / "own_network.py").write_text(code)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    layers = list(network_of("tiny", (8, 8, 1)))
-    assert [layer.in_features for layer in layers if isinstance(layer, nn.Linear)] == [2 * 6 * 6, 5]
-    with pytest.raises(UserError, match="cannot be loaded"):
-        network_of("bad", (8, 8, 1))
-    with pytest.raises(UserError, match="the network 'tiny' does not take these observations"):
-        network_of("tiny", (8, 8, 3))
 
 
 def test_weights_come_from_the_generator_alone() -> None:
@@ -160,18 +117,3 @@ def test_as_input_scales_and_turns() -> None:
     assert inputs.shape == (2, 3, 4, 5)
     assert inputs[1, 0, 2, 3] == 1.0
     assert inputs.sum() == 1.0
-
-
-@pytest.mark.parametrize("name", sorted(NETWORKS))
-@pytest.mark.filterwarnings("ignore:Setting forward, backward hooks:UserWarning")
-def test_deeplift_is_complete(name: str) -> None:
-    """Spec F2, C5: attributions sum to the output's difference from the baseline's, as they should."""
-    captum = pytest.importorskip("captum.attr")
-    network = network_of(name).eval()
-    height, width, channels = SHAPES[name]
-    image = torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(2)).requires_grad_()
-    baseline = torch.full_like(image, 0.5)
-    attributions = captum.DeepLift(network).attribute(image, baseline, target=1)
-    difference = (network(image) - network(baseline))[0, 1]
-    assert abs(difference) > 1e-3
-    assert attributions.sum().item() == pytest.approx(difference.item(), rel=1e-3)
