@@ -38,10 +38,9 @@ class Reading(NamedTuple):
     axes: Shape = ()
 
     def arranged(self, values: Bytes) -> Bytes:
-        """Observations (N, ...) as pictures (N, H, W, C); needs ``axes``."""
-        axes = [axis + 1 for axis in self.axes]
-        moved = values.transpose(0, *axes)
-        return moved.reshape(len(values), *self.shape)
+        """An observation as a picture (H, W, C); needs ``axes``."""
+        moved = values.transpose(self.axes)
+        return moved.reshape(self.shape)
 
 
 def reading_of(shape: Shape, dtype: DType) -> Reading:

@@ -45,7 +45,7 @@ def take(
         raise UserError(f"{where} {fault}", f"{state.dtype} {state.shape}", do)
     if reading.dtype != PICTURE:
         return state.reshape(reading.shape), None
-    [picture] = reading.arranged(state[None])
+    picture = reading.arranged(state)
     small = shrunk_picture(picture, side)
     if not reading.fault:
         return small, None
