@@ -40,7 +40,7 @@ class LongCorridorDomain(Domain):
     def make_engine(self, layout_seed, count, max_steps, **arguments):
         return LongCorridor(count, max_steps, **arguments)
 
-    def distance(self, positions):
+    def distance_to(self, sub_goal, positions):
         return np.minimum(positions[:, 1], 5 - positions[:, 1])
 
 
