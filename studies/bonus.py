@@ -25,7 +25,7 @@ from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import Setup, of_ensemble
+from hypogoal.meta.setup import Setup, of_ensemble
 from hypogoal.options.tables import Episodes
 from hypogoal.options.termination import Terminations
 from studies.figure6 import read_agents, rows_of, training_numbers, write_agents

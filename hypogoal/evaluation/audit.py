@@ -26,7 +26,7 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.episodes import Frame
-from hypogoal.meta.training import Setup
+from hypogoal.meta.setup import Setup
 from hypogoal.observations import PICTURE, Standard, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
@@ -103,6 +103,7 @@ def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Set
         if engine.observation_dtype != PICTURE:
             engine.standard = target.standard or standard_of(engine.observation_shape)
         rule, length = rule_of(setup.config.termination)
+        rule.refuse(setup.config, engine)
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 
     return ends

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.learners.world import columns_of
-from hypogoal.meta.training import Setup
+from hypogoal.meta.setup import Setup
 from hypogoal.options.termination import ORACLE
 
 Near = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]]
@@ -25,7 +25,11 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     labels, shape = engine.labels(engine.ids[:1]), (1, len(domain.sub_goals))
     if labels.shape != shape or labels.dtype != np.bool_:
         fault = f"the engine's labels of one state are {labels.dtype} {labels.shape}, not bool {shape}"
-        raise UserError(fault, type(engine).__name__, "Give a truth value for each state and sub-goal.")
+        raise UserError(
+            fault,
+            type(engine).__name__,
+            "Give a truth value for each state and sub-goal.",
+        )
     if setup.config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
         return None
     columns = np.repeat(columns_of(domain, sub_goals), setup.members)

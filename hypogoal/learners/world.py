@@ -26,7 +26,11 @@ def played_world(domain: Domain, collected: Mapping[str, Any], config: WorldConf
 
 
 def make_engine(
-    domain: Domain, world: Mapping[str, Any], config: WorldConfig, environments: int, **begins: Any
+    domain: Domain,
+    world: Mapping[str, Any],
+    config: WorldConfig,
+    environments: int,
+    **begins: Any,
 ) -> Engine:
     """So many environments of a :func:`played_world`; ``begins`` are arguments that say where episodes begin.
 
@@ -36,7 +40,12 @@ def make_engine(
         check_start(domain, config.start)
         begins["start"] = config.start
     arguments = domain.world(world) | begins
-    engine = domain.make_engine(config.layout_seed, environments, config.max_episode_steps, **arguments)
+    engine = domain.make_engine(
+        config.layout_seed,
+        environments,
+        config.max_episode_steps,
+        **arguments,
+    )
     require_one_kind(engine)
     if config.cap:
         shortest = engine.shortest_path()
@@ -65,7 +74,13 @@ def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termin
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 
-def write_layout(folder: Path, engine: Engine, config: WorldConfig, seed: int, layouts: str = "") -> None:
+def write_layout(
+    folder: Path,
+    engine: Engine,
+    config: WorldConfig,
+    seed: int,
+    layouts: str = "",
+) -> None:
     """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
     Both are null where the engine does not know them; then no episode of random play is played. ``layouts`` are those

@@ -60,17 +60,14 @@ class PlayConfig(OptionConfig, WorldConfig):
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
     """The seeds that ``layouts`` names, each once, a bare number so many from ``first`` on; else a ``UserError``."""
-    if not layouts.strip() and first is not None:
-        return [first]
-    do = f"Give 1 to {MOST}, or seeds as 2000-2099."
-    if not layouts.strip():
+    text = layouts.strip()
+    if text and not text.isdecimal():
+        return list(dict.fromkeys(integers(text)))
+    count = int(text or 1)
+    if first is None or not 0 < count <= MOST:
+        do = f"Give 1 to {MOST}, or seeds as 2000-2099."
         raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
-    if layouts.strip().isdecimal():
-        count = int(layouts)
-        if first is None or not 0 < count <= MOST:
-            raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
-        return list(range(first, first + count))
-    return list(dict.fromkeys(integers(layouts)))
+    return list(range(first, first + count))
 
 
 class PracticeConfig(PlayConfig):

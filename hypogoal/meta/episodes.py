@@ -11,7 +11,8 @@ from hypogoal.core.config import known, resolve
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import Setup, assemble, continue_with
+from hypogoal.meta.setup import Setup
+from hypogoal.meta.training import assemble, continue_with
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import FILE
 from hypogoal.options.loop import OptionLoop, Transitions
@@ -43,29 +44,36 @@ class Episode:
     terminated: bool  # the task was over; otherwise the episode was cut
 
 
-def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequence[int] = ()) -> OptionLoop:
+def agent_of(
+    artefact: Artefact,
+    seed: int,
+    environments: int = 1,
+    layouts: Sequence[int] = (),
+) -> OptionLoop:
     """Environments in which the agent of a meta artefact plays; ``seed`` is of the draws.
 
     ``layouts``: one of these in each environment, instead of those that it was trained in; without its ``cap``.
 
     A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
     """
-    source, files = Artefact(artefact.input("ensemble")), artefact.manifest.files
-    settings = known(TrainMetaConfig, artefact.config) | {
-        "environments": environments,
-        "replay": REPLAY,
-        "decisions": 2,
-        "save_visited": 0,
-        "chooser": artefact.config["chooser"] if artefact.kind == "meta" else "random",
-    }
+    source = Artefact(artefact.input("ensemble"))
+    settings = known(TrainMetaConfig, artefact.config)
+    settings |= {"environments": environments, "replay": REPLAY, "decisions": 2, "save_visited": 0}
+    if artefact.kind != "meta":
+        settings["chooser"] = "random"
     if layouts:
         settings |= {"layouts": "", "cap": 0.0}
     config = resolve(TrainMetaConfig, settings, {}, stage="train-meta")
-    domain = load_domain(artefact.config["domain"])
-    setup = Setup(domain, source.config, source.path, config, seed)
+    setup = Setup(
+        load_domain(artefact.config["domain"]),
+        source.config,
+        source.path,
+        config,
+        seed,
+    )
     loop = assemble(setup, layouts=Layouts(layouts) if layouts else None)
     continue_with(loop, artefact)
-    if FILE in files:
+    if FILE in artefact.manifest.files:
         loop.chooser.load(load_tensors(artefact.path / FILE))
     return loop
 
@@ -73,20 +81,46 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
 def play_episode(loop: OptionLoop, members: int) -> list[Frame]:
     """One episode of :func:`agent_of`, K ``members``: a frame per step, and one for where each execution ended."""
     frames = []
-    for step, moved in enumerate(_steps(loop)):
-        option, left = int(moved.options[0]), loop.config.option_timeout - int(loop.age[0])
+
+    def see(
+        ids: NDArray[np.int64],
+        step: int,
+        left: int,
+        moved: Transitions,
+        *,
+        ended: bool,
+    ) -> None:
+        [option] = moved.options.tolist()
         first = option - option % members
-        before, after = (
-            (loop.engine.images(ids)[0].copy(), tuple(loop.terminations.of(ids)[0, first : first + members].tolist()))
-            for ids in (moved.ids, moved.next_ids)
+        predictions = loop.terminations.of(ids)[0, first : first + members].tolist()
+        why = _why(loop, moved, predictions[option - first]) if ended else ""
+        frames.append(
+            Frame(
+                loop.engine.images(ids)[0].copy(),
+                step,
+                option,
+                tuple(predictions),
+                left,
+                why,
+            )
         )
-        frames.append(Frame(before[0], step, option, before[1], left + 1, ""))
+
+    for step, moved in enumerate(_steps(loop)):
+        left = loop.config.option_timeout - int(loop.age[0])
+        see(moved.ids, step, left + 1, moved, ended=False)
         if moved.ended[0]:
-            why = "its classifier is positive" if after[1][option - first] else "the episode is cut"
-            over = SOLVED if moved.terminated[0] and loop.recorder.episodes[-1][4] else "the episode, unsolved"
-            why = over if moved.terminated[0] else "its time is up" if moved.timed_out[0] else why
-            frames.append(Frame(after[0], step + 1, option, after[1], left, why))
+            see(moved.next_ids, step + 1, left, moved, ended=True)
     return frames
+
+
+def _why(loop: OptionLoop, moved: Transitions, positive: bool) -> str:
+    """Why an option ended."""
+    if moved.terminated[0]:
+        *_, succeeded = loop.recorder.episodes[-1]
+        return SOLVED if succeeded else "the episode, unsolved"
+    if moved.timed_out[0]:
+        return "its time is up"
+    return "its classifier is positive" if positive else "the episode is cut"
 
 
 def play_episodes(loop: OptionLoop, count: int) -> Iterator[Episode]:
@@ -96,12 +130,13 @@ def play_episodes(loop: OptionLoop, count: int) -> Iterator[Episode]:
         for moved in _steps(loop):
             observations.append(loop.engine.images(moved.ids)[0].copy())
             steps.append(moved)
+        observations.append(loop.engine.images(moved.next_ids)[0])
         yield Episode(
-            np.stack([*observations, loop.engine.images(steps[-1].next_ids)[0]]),
+            np.stack(observations),
             np.array([moved.actions[0] for moved in steps], dtype=np.int64),
             np.array([moved.options[0] for moved in steps], dtype=np.int64),
             np.array([moved.rewards[0] for moved in steps], dtype=np.float32),
-            bool(steps[-1].terminated[0]),
+            bool(moved.terminated[0]),
         )
 
 

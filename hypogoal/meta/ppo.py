@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.arrays import Columns, tensor
-from hypogoal.core.checkpoints import State
+from hypogoal.core.checkpoints import snapshot_of
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
+from hypogoal.meta import networks
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.networks import HEADS, meta_network
 from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
@@ -40,135 +40,159 @@ class Draws(Columns):
     log_prob: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Decisions(Draws):
-    """Choices and what came of them."""
-
-    environment: NDArray[np.int64]
-    returned: NDArray[np.float64]  # rewards inside the option, discounted from its start
-    discount: NDArray[np.float64]  # gamma ** tau
-    next_state: NDArray[np.int64]  # in which the option ended
-    terminated: NDArray[np.bool_]  # nothing follows it
-    ended: NDArray[np.bool_]  # the episode ended there, for whatever reason
-
-
 class MetaPolicy(Chooser):
     """Chooses among O options for every environment and learns from what they return.
 
     ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
     """
 
-    CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "updates")
+    CHANGING = ("policy", "optimiser", "generator", "rng", "running", "updates")  # and the decisions
 
-    def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int, device: torch.device | str = "cpu"):
-        self.engine, self.options, self.config = engine, options, config
-        self.device = torch.device(device)
+    def __init__(
+        self,
+        engine: Engine,
+        options: int,
+        config: MetaConfig,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ):
+        self.engine, self.config, self.device = engine, config, torch.device(device)
+        shape, name = engine.observation_shape, config.meta_network
         with DrawsFrom(torch_generator(seed, "meta-weights")):
-            network = meta_network(config.meta_network, engine.observation_shape, options, engine.standard)
-            self.network = network.to(self.device)
-            self.head = HEADS[config.head](options).to(self.device)
-        self.policy = nn.ModuleDict({"network": self.network, "head": self.head})
-        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=config.meta_learning_rate, eps=1e-5, fused=True)
+            if name == "paper":
+                self.network: nn.Module = networks.PaperMetaNetwork(shape, options)
+            else:
+                self.network = networks.LightMetaNetwork(
+                    shape,
+                    options,
+                    engine.standard,
+                    name,
+                )
+            self.head = networks.HEADS[config.head](options)
+        self.policy = nn.ModuleDict({"network": self.network, "head": self.head}).to(self.device)
+        self.optimiser = torch.optim.Adam(
+            self.policy.parameters(),
+            lr=config.meta_learning_rate,
+            eps=1e-5,
+            fused=True,
+        )
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         count = engine.count
-        self._open = Draws(  # the last one of every environment
+        self.running = Draws(  # the last one of every environment
             state=np.zeros(count, np.int64),
             offered=np.zeros((count, options), np.bool_),
             drawn=np.zeros((count, self.head.remembered), np.float32),
             log_prob=np.zeros(count, np.float32),
         )
-        self._finished: list[Decisions] = []  # as they ended
+        self.draws: list[Draws] = []  # decisions since the last update, as they ended,
+        self.outcomes: list[Outcome] = []  # and what came of them
         self.updates = 0
 
     @classmethod
     def refuse(cls, config: Any, engine: Engine) -> None:
-        """Without settings of PPO there is nothing to learn by; the paper's network sees pictures only."""
-        if not isinstance(config, MetaConfig):
-            raise UserError("only train-meta learns the meta-policy", "chooser=ppo", "Give chooser=random or even.")
+        """The paper's network sees pictures only."""
         if config.meta_network == "paper" and engine.observation_dtype != PICTURE:
             do = "Give --set meta_network=light."
-            raise UserError("the paper's networks see pictures only", "meta_network=paper", do)
+            raise UserError(
+                "the paper's networks see pictures only",
+                "meta_network=paper",
+                do,
+            )
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+    def create(
+        cls,
+        engine: Engine,
+        options: int,
+        config: Any,
+        seed: int,
+        device: str,
+    ) -> Self:
         return cls(engine, options, config, seed, device)
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+        mask = torch.from_numpy(offered)
         with torch.no_grad():
             scores = self._outputs(ids)[:, :-1].cpu()
-            mask = torch.from_numpy(offered)
             options, drawn = self.head.draw(scores, mask, self.generator)
-            log_prob = self.head.log_prob(scores, mask, drawn)[0]
-        self._open.put(environments, Draws(ids, offered, drawn.numpy(), log_prob.numpy()))
+            log_prob, _ = self.head.log_prob(scores, mask, drawn)
+        self.running.put(
+            environments,
+            Draws(
+                ids,
+                offered,
+                drawn.numpy(),
+                log_prob.numpy(),
+            ),
+        )
         return options.numpy()
 
     def record(self, outcome: Outcome) -> None:
-        draws = self._open.at(outcome.environments)
-        decisions = Decisions(
-            **vars(draws),
-            environment=outcome.environments,
-            returned=outcome.returns,
-            discount=outcome.discounts,
-            next_state=outcome.next_ids,
-            terminated=outcome.terminated,
-            ended=outcome.terminated | outcome.truncated,
-        )
-        self._finished.append(decisions)
+        self.draws.append(self.running.at(outcome.environments))
+        self.outcomes.append(outcome)
 
     def begin_anew(self) -> None:
-        self._finished = []
+        self.draws, self.outcomes = [], []
 
     def learn(self) -> dict[str, float]:
-        if sum(map(len, self._finished)) < self.config.decisions:
+        if sum(map(len, self.draws)) < self.config.decisions:
             return {}
-        decisions, self._finished = Decisions.joined(self._finished), []
-        return self._update(decisions.at(np.argsort(decisions.environment, kind="stable")))
+        draws, outcomes = Draws.joined(self.draws), Outcome.joined(self.outcomes)
+        self.begin_anew()
+        order = np.argsort(outcomes.environments, kind="stable")
+        return self.update(draws.at(order), outcomes.at(order))
 
-    def _outputs(self, ids: NDArray[np.int64]) -> Tensor:
+    def _outputs(self, ids: Ids) -> Tensor:
         return apply_to_states(self.network, self.engine, ids)
 
-    def _update(self, decisions: Decisions) -> dict[str, float]:
+    def update(self, draws: Draws, outcomes: Outcome) -> dict[str, float]:
         """Learn from decisions, those of an environment side by side in the order in which they were taken."""
-        config, states = self.config, decisions.state
+        config = self.config
         with torch.no_grad():
-            outputs = self._outputs(states)
-            values = outputs[:, -1].double().cpu().numpy()
-            next_values = self._outputs(decisions.next_state)[:, -1].double().cpu().numpy()
-        begins = np.flatnonzero(np.diff(decisions.environment)) + 1
-        advantages = np.concatenate(
-            [
-                smdp_advantages(
-                    decisions.returned[rows],
-                    decisions.discount[rows],
-                    values[rows],
-                    next_values[rows],
-                    decisions.terminated[rows],
-                    decisions.ended[rows],
-                    config.gae_lambda,
-                )
-                for rows in np.split(np.arange(len(states)), begins)
-            ]
+            outputs = self._outputs(draws.state)
+            following = self._outputs(outcomes.next_ids)
+        values = outputs[:, -1].double().cpu().numpy()
+        last = np.diff(outcomes.environments, append=-1) != 0  # what comes next is another environment's
+        advantages = smdp_advantages(
+            outcomes.returns,
+            outcomes.discounts,
+            values,
+            following[:, -1].double().cpu().numpy(),
+            outcomes.terminated,
+            outcomes.terminated | outcomes.truncated | last,
+            config.gae_lambda,
         )
-        offered, drawn, old = (
-            tensor(values, self.device) for values in (decisions.offered, decisions.drawn, decisions.log_prob)
-        )
+        goals = tensor(advantages + values, self.device).float()
+        scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
+        offered = tensor(draws.offered, self.device)
+        drawn = tensor(draws.drawn, self.device)
+        old = tensor(draws.log_prob, self.device)
         with torch.no_grad():
             certainty = certainty_of(self.head.probabilities(outputs[:, :-1], offered))
-        goal = tensor(advantages + values, self.device).float()
-        scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
         for epoch in range(config.epochs):
-            order = self.rng.permutation(len(states))
-            for begin in range(0, len(states), config.meta_batch):
+            order = self.rng.permutation(len(draws))
+            for begin in range(0, len(order), config.meta_batch):
                 rows = order[begin : begin + config.meta_batch]
                 pick = tensor(rows, self.device)
-                out = self._outputs(states[rows])
-                log_prob, entropy = self.head.log_prob(out[:, :-1], offered[pick], drawn[pick])
+                out = self._outputs(draws.state[rows])
+                log_prob, entropy = self.head.log_prob(
+                    out[:, :-1],
+                    offered[pick],
+                    drawn[pick],
+                )
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], CLIP)
-                loss = loss + VALUE_WEIGHT * (out[:, -1] - goal[pick]).square().mean()
+                loss = loss + VALUE_WEIGHT * (out[:, -1] - goals[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
                 where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"
-                descend(loss, self.policy, self.optimiser, "the meta-policy", where, GRADIENT_NORM)
+                descend(
+                    loss,
+                    self.policy,
+                    self.optimiser,
+                    "the meta-policy",
+                    where,
+                    GRADIENT_NORM,
+                )
         self.updates += 1
         return {**certainty, "value": float(values.mean())}
 
@@ -179,16 +203,15 @@ class MetaPolicy(Chooser):
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
         load_into(self.policy, state, FILE)
 
-    def snapshot(self) -> State:
-        """As of :class:`Resumable`, and the decisions, in one array for each column."""
-        draws = vars(self._open.at(slice(0)))
-        outcomes = {name: np.zeros(0, kind) for name, kind in Decisions.types().items() if name not in draws}
-        self._finished = [Decisions.joined([Decisions(**draws, **outcomes), *self._finished])]
-        return {**super().snapshot(), "finished": dict(vars(self._finished[0]))}
+    def snapshot(self) -> dict[str, Any]:
+        if self.draws:  # one array for each column
+            self.draws, self.outcomes = [Draws.joined(self.draws)], [Outcome.joined(self.outcomes)]
+        return {**super().snapshot(), "draws": snapshot_of(self.draws), "outcomes": snapshot_of(self.outcomes)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        self._finished = [Decisions(**snapshot["finished"])]
+        self.draws = [Draws(**part) for part in snapshot["draws"]]
+        self.outcomes = [Outcome(**part) for part in snapshot["outcomes"]]
 
 
 def certainty_of(probabilities: Tensor) -> dict[str, float]:
@@ -206,10 +229,19 @@ def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[
     Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts
     until it is sure of something arbitrary.
     """
-    return (advantages - advantages.mean()) / max(float(advantages.std()), floor, 1e-8)
+    return (advantages - advantages.mean()) / max(
+        float(advantages.std()),
+        floor,
+        1e-8,
+    )
 
 
-def clipped_surrogate(log_prob: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Tensor:
+def clipped_surrogate(
+    log_prob: Tensor,
+    old: Tensor,
+    advantages: Tensor,
+    clip: float,
+) -> Tensor:
     """PPO's loss: minus the mean of min(r A, clip(r, 1 - c, 1 + c) A), r the ratio of probabilities.
 
     Source: Schulman et al. 2017, Eq. (7).

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Columns
 from hypogoal.core.seeding import rng_for
 from hypogoal.options.parts import Flags, Ids, Part, load_part
 
@@ -29,7 +30,7 @@ FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Outcome(Columns):
     """Finished option executions, arrays of length n."""
 
     environments: Ids  # in which they ran

@@ -13,7 +13,8 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.nearness import Near, nearness
 from hypogoal.learners.world import write_layout
-from hypogoal.meta.training import Setup, train
+from hypogoal.meta.setup import Setup
+from hypogoal.meta.training import train
 from hypogoal.options.choosers import FILE
 from hypogoal.options.loop import OptionLoop
 from hypogoal.stages import Call, Training

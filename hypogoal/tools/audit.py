@@ -44,7 +44,8 @@ def audit(
     from hypogoal.evaluation import audit as played
     from hypogoal.evaluation.numbers import plain
     from hypogoal.learners.world import columns_of
-    from hypogoal.meta.training import Setup, assemble
+    from hypogoal.meta.setup import Setup
+    from hypogoal.meta.training import assemble
     from hypogoal.stages import agents
 
     device = prepare(call.device)

@@ -18,7 +18,7 @@ from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.networks import LightMetaNetwork
-from hypogoal.meta.training import frames_kept
+from hypogoal.meta.setup import frames_kept
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.light import LightLearner

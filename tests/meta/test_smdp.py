@@ -1,14 +1,17 @@
 """SMDP returns and the meta-policy's loss (Spec E1-E3)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from corridor import Corridor
 
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork
-from hypogoal.meta.ppo import Decisions, MetaPolicy, certainty_of, clipped_surrogate, scaled_advantages
+from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, best
+from hypogoal.meta.ppo import Draws, MetaPolicy, certainty_of, clipped_surrogate, scaled_advantages
 from hypogoal.meta.smdp import smdp_advantages
+from hypogoal.options.choosers import Outcome
 
 
 def test_advantages_by_hand() -> None:
@@ -86,7 +89,7 @@ def test_masked_options_are_never_drawn() -> None:
         log_prob, entropy = head.log_prob(scores, offered, drawn)
         assert torch.isfinite(log_prob).all() and torch.isfinite(entropy).all()
         assert log_prob.shape == entropy.shape == (500,)
-        assert int(head.best(scores, offered)[0]) == 3
+        assert int(best(scores, offered)[0]) == 3
     log_prob, entropy = CategoricalHead(4).log_prob(scores[:1], offered[:1], torch.tensor([[3.0]]))
     assert float(log_prob.detach()) == pytest.approx(1 - np.log(np.exp(1) + 1))
     p = np.exp(1) / (1 + np.exp(1))
@@ -141,10 +144,19 @@ def test_the_value_that_is_learned_is_what_decisions_return() -> None:
     """Spec E1, E2: where each decision returns .5 and ends its episode, every state is worth .5."""
     policy = MetaPolicy(Corridor(4), 2, MetaConfig(decisions=32, meta_batch=16), 0)
     states, over = np.arange(32) % 5, np.ones(32, dtype=np.bool_)
-    decisions = Decisions(
-        state=states, offered=np.ones((32, 2), dtype=np.bool_), drawn=(states[:, None] % 2).astype(np.float32),
-        log_prob=np.full(32, np.log(0.5), dtype=np.float32), environment=np.repeat(np.arange(4), 8),
-        returned=np.full(32, 0.5), discount=np.full(32, 0.9), next_state=states, terminated=over, ended=over,
-    )  # fmt: skip
-    values = [policy._update(decisions)["value"] for _ in range(20)]
+    draws = Draws(
+        states,
+        offered=np.ones((32, 2), dtype=np.bool_),
+        drawn=(states[:, None] % 2).astype(np.float32),
+        log_prob=np.full(32, np.log(0.5), dtype=np.float32),
+    )
+    outcomes = replace(
+        Outcome.zeros(32),
+        environments=np.repeat(np.arange(4), 8),
+        returns=np.full(32, 0.5),
+        discounts=np.full(32, 0.9),
+        next_ids=states,
+        terminated=over,
+    )
+    values = [policy.update(draws, outcomes)["value"] for _ in range(20)]
     assert abs(values[0]) < 0.1 and values[-1] == pytest.approx(0.5, abs=0.1)

@@ -9,6 +9,7 @@ import torch
 
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.networks import best
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Outcome, RandomChooser
 from hypogoal.options.config import OptionConfig
@@ -235,7 +236,7 @@ def test_the_meta_policy_learns_which_option_pays() -> None:
         for chooser in (policy, restored):
             with torch.no_grad():
                 scores = apply_to_states(chooser.network, engine, np.array([2]))[:, :-1]
-            assert int(chooser.head.best(scores, torch.ones(1, 2, dtype=torch.bool))) == 1, head
+            assert int(best(scores, torch.ones(1, 2, dtype=torch.bool))) == 1, head
 
 
 class Perfect(Scripted):

@@ -19,7 +19,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import play
 from hypogoal.evaluation.zero_shot import alone, shortest_ways
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds
-from hypogoal.meta.training import Setup, make_engine
+from hypogoal.meta.setup import Setup, make_engine
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.loop import OptionLoop

@@ -19,7 +19,8 @@ from hypogoal.domains.doorkey.env import SUB_GOALS
 from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 from hypogoal.evaluation.selection import practised
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.meta.training import Setup, assemble
+from hypogoal.meta.setup import Setup
+from hypogoal.meta.training import assemble
 
 FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
 

@@ -1,0 +1,110 @@
+"""Whose options are played, in which environments, and where these options end."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Domain, Engine, Layouts
+from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.learners import world
+from hypogoal.meta.config import MetaConfig, PracticeConfig, TrainMetaConfig, layout_seeds
+from hypogoal.observations import PICTURE, standard_of
+from hypogoal.options import termination as ends
+from hypogoal.options.config import STACK
+from hypogoal.options.learner import load_learner
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Whose options are played, where, and how they are learned and chosen.
+
+    Attributes:
+        domain: where.
+        source: the configuration of the ensemble; of another classifier what it has in common with one.
+        folder: of the ensemble.
+        config: of the options' policies, of the one over them, of the world.
+        seed: of weights, exploration, choices and, where there are several, layouts and start states.
+        device: of the networks.
+    """
+
+    domain: Domain
+    source: Mapping[str, Any]
+    folder: Path
+    config: PracticeConfig | TrainMetaConfig
+    seed: int
+    device: str = "cpu"
+
+    @property
+    def members(self) -> int:
+        """Options of each sub-goal: one for each member, or for the truth."""
+        members: int = self.source["members"]
+        return 1 if self.config.termination == ends.ORACLE else members
+
+    @property
+    def options(self) -> int:
+        """Options of all sub-goals."""
+        return len(self.source["sub_goals"]) * self.members
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """The domain's settings with which they play."""
+        return world.played_world(
+            self.domain,
+            self.source["domain_config"],
+            self.config,
+        )
+
+
+def make_engine(setup: Setup, layouts: Layouts | None = None) -> Engine:
+    """Spec D4, H6: environments that begin episodes where the settings say, or in these ``layouts``."""
+    domain, config = setup.domain, setup.config
+    if layouts is None and config.layouts.strip():
+        seeds = layout_seeds(config.layouts, config.layout_seed)
+        layouts = Layouts(seeds, rng_for(setup.seed, "layouts") if len(seeds) > 1 else None)
+    if layouts and not domain.many_layouts:
+        raise UserError("an engine of this domain plays one layout", domain.name, "Leave layouts out.")
+    begins: dict[str, Any] = {"layouts": layouts} if layouts else {}
+    if domain.starts:
+        world.check_start(domain, config.start)  # an agent with options begins where the user says
+        begins |= {"memory": frames_kept(config, setup.options), "seed": setup.seed}
+    return world.make_engine(domain, setup.world, config, config.environments, **begins)
+
+
+def frames_kept(config: PracticeConfig | TrainMetaConfig, options: int) -> int:
+    """How many states back an engine must remember: those in replays and in the meta-policy's decisions."""
+    reach = load_learner(config.network).reach(config, options)
+    if not isinstance(config, MetaConfig):
+        return reach
+    return max(reach, (config.decisions + config.environments) * config.option_timeout + STACK * config.environments)
+
+
+def of_ensemble(setup: Setup, engine: Engine) -> ends.Terminations:
+    """Terminations of an ensemble's members, or of its sub-goals where they truly hold (``termination=oracle``).
+
+    Agents see numbers by the standard that the members have.
+    """
+    config, sub_goals = setup.config, setup.source["sub_goals"]
+    oracle, numbers = config.termination == ends.ORACLE, engine.observation_dtype != PICTURE
+    if oracle:
+        columns = world.columns_of(setup.domain, sub_goals)
+    else:
+        rule, _ = ends.rule_of(config.termination)
+        rule.refuse(config, engine)
+    ensembles = []
+    for sub_goal in sub_goals if numbers or not oracle else ():
+        ensemble = read_ensemble(setup.folder, setup.source, sub_goal)
+        ensembles.append(ensemble.to(setup.device))
+    if numbers:
+        engine.standard = ensembles[0].view.standard or standard_of(engine.observation_shape)
+    if oracle:
+        return ends.oracle_terminations(engine, columns)
+    running_only = config.experience == "own" and not config.mask_reached
+    terminations = ends.learned_terminations(engine, ensembles, running_only=running_only, rule=config.termination)
+    many = engine.layouts is not None and engine.layouts.many
+    reachable = None if many else engine.reachable()
+    if reachable is not None:
+        terminations.of(reachable)  # faster than state by state
+    return terminations
