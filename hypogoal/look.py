@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from hypogoal.cells import read_plan, status_lines
-from hypogoal.core.artefacts import AGAIN, LOG, MANIFEST, Artefact, Draft, open_artefact
+from hypogoal.core.artefacts import LOG, MANIFEST, Artefact, Draft
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_log, visible
+from hypogoal.core.files import read_log, visible
 from hypogoal.core.terminal import drawn
 from hypogoal.data import SPLITS, open_dataset
 from hypogoal.observations import type_text
 
 WIDTH = 80  # columns
-METRICS = "metrics.json"
 EVALUATION = "evaluation"
 # Of a training's log, in the order in which they are shown, with their titles.
 LOGGED = {"labelled": "labelled loss"}
@@ -73,10 +72,7 @@ def describe(path: Path) -> Details:
 
 
 def numbers_of(path: Path) -> Details:
-    """The numbers of an evaluation or a comparison; of a training the last in its log, means over sub-goals."""
-    if (path / METRICS).is_file():
-        open_artefact(path)
-        return dict(read_json(path / METRICS, "the numbers are", AGAIN))
+    """The last numbers in a training's log, means over sub-goals."""
     last = {row.get("sub_goal"): row for row in read_log(path / LOG)}
     numbers = {}
     for name, title in LOGGED.items():
@@ -95,14 +91,18 @@ def outcome(details: Details) -> list[str]:
     if kind == "data":
         return count_lines(numbers)
     if kind == EVALUATION:
-        from hypogoal.evaluation.questions import summary_table
+        from hypogoal.evaluation.questions import summary
+        from hypogoal.evaluation.run import fitting, read_results
 
-        table = drawn(summary_table(numbers), WIDTH)
+        path = Path(details["path"])
+        results = read_results(Artefact(path))
+        with fitting(path):
+            table = drawn(summary(results), WIDTH)
         return [line.rstrip() for line in table.splitlines()]
     if kind == "comparison":
-        from hypogoal.evaluation.compare import winners
+        from hypogoal.evaluation.compare import read_pairs, winners
 
-        return winners(numbers["comparisons"])
+        return winners(read_pairs(Path(details["path"])))
     return []
 
 

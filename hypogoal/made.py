@@ -19,8 +19,13 @@ class Made:
         return str(self.path)
 
     @property
-    def metrics(self) -> dict[str, Any]:
-        """Its numbers: counts of states, a training's last log entry, or all of an evaluation or a comparison."""
+    def metrics(self) -> Any:
+        """Its numbers: counts of states or a training's last log entry, a dict; of an evaluation the DataFrame."""
+        table = self.path / "numbers.csv"
+        if table.is_file():
+            from hypogoal.evaluation.house import read_numbers
+
+            return read_numbers(table)
         return dict(describe(self.path).get("numbers", {}))
 
     def __repr__(self) -> str:

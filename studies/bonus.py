@@ -19,7 +19,6 @@ from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.processes import prepare
 from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.doorkey.domain import DOMAIN
-from hypogoal.evaluation.curves import Run
 from hypogoal.learners.baselines.agents import train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
@@ -28,7 +27,7 @@ from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, of_ensemble
 from hypogoal.options.tables import Episodes
 from hypogoal.options.termination import Terminations
-from studies.figure6 import read_agents, rows_of, training_numbers, write_agents
+from studies.figure6 import Run, read_agents, rows_of, training_numbers, write_agents
 
 BONUS = 0.2  # the best of .02, .05, .1 and .2 on three other layouts
 METHOD = "ppo-bonus"
@@ -81,7 +80,7 @@ def paid(ensemble: Artefact, layout: int, steps: int) -> Run:
     env = PaidEnv(engine, of_ensemble(setup, engine))
     train(env, chosen, steps, ensemble.seed)
     place = {"layout_seed": layout, "shortest_path": engine.shortest_path()}
-    return Run("baseline", METHOD, ensemble.seed, {"steps": steps}, Episodes.of_rows(env.episodes), place)
+    return Run(ensemble.seed, {"steps": steps}, Episodes.of_rows(env.episodes), place)
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
 from hypogoal.domains.base import Domain
-from hypogoal.evaluation.numbers import BOOTSTRAP_FROM, RESAMPLES, student_interval
+from hypogoal.evaluation.house import BOOTSTRAP_FROM, RESAMPLES, student_interval
 from hypogoal.stages.collect import collect
 
 Row = dict[str, Any]

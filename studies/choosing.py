@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
-from hypogoal.evaluation.curves import LEARNED
+from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, play_agent
+from hypogoal.evaluation.names import LEARNED, UNIFORM
 from hypogoal.evaluation.run import find_artefacts
 from studies.cells import difference, interval, table
 
@@ -96,9 +96,10 @@ def _played(artefact: Artefact) -> list[dict[str, str]]:
     config, seed = artefact.config, artefact.seed
     policy = PLANNED if config["network"] == PLANNED else "learned"
     agent = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
-    played, rows = play_agent(artefact, seed), []
+    played, rows = play_agent(artefact), []
     assert played is not None
-    for method, numbers in ((LEARNED, played), (UNIFORM, played["uniform"])):
+    agent_numbers, uniform, _ = played
+    for method, numbers in ((LEARNED, agent_numbers), (UNIFORM, uniform)):
         defined = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
         rows += [agent | {"method": method, "quantity": name, "value": str(numbers[name])} for name in defined]
     if "options_ended_at" in config:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.evaluation.choosing import UNIFORM
-from hypogoal.evaluation.curves import Run, read_run, run_numbers
+from hypogoal.evaluation.curves import budget_of, run_numbers
 from hypogoal.evaluation.frozen import ENVIRONMENTS, play
-from hypogoal.evaluation.run import find_artefacts
+from hypogoal.evaluation.run import find_artefacts, read_layout
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
+from hypogoal.options.tables import Episodes
 from studies.cells import interval, parser_of, read_rows, table, write_rows
 
 METHODS = {
@@ -58,12 +59,31 @@ LINES = {  # colour, dashes
 }
 
 
+UNIFORM = "uniform among its own options"  # in the CSV
+
+
+@dataclass(frozen=True)
+class Run:
+    """One trained agent."""
+
+    seed: int
+    config: Mapping[str, Any]
+    episodes: Episodes  # of its training
+    layout: Mapping[str, Any]  # layout_seed, shortest_path
+
+
+def read_run(artefact: Artefact) -> Run:
+    """The episodes and the layout of one trained agent."""
+    episodes = Episodes.read(artefact.path / "episodes.csv")
+    return Run(artefact.seed, artefact.config, episodes, read_layout(artefact.path / "layout.json"))
+
+
 def collect(run: Path, path: Path) -> None:
     """A row for every number of every finished agent, those that are there first."""
     agents = read_agents(path)
     for kind in ("meta", "baseline"):
         for artefact in find_artefacts(run, kind):
-            read = read_run(artefact, artefact.path.name)
+            read = read_run(artefact)
             method = method_of(read.config, artefact.path.name)
             agent = (method, str(read.layout["layout_seed"]))
             if agent in agents:
@@ -110,13 +130,13 @@ def training_numbers(run: Run) -> Iterator[tuple[str, str, float]]:
     shortest = run.layout["shortest_path"]
     numbers = run_numbers(run.episodes, shortest)
     reached = numbers["steps_to_95"]
-    yield "agent", "steps", float(run.budget)
+    yield "agent", "steps", float(budget_of(run.config))
     yield "agent", "shortest_path", float(shortest)
     yield "agent", "steps_to_95", math.inf if reached is None else float(reached)
     for name in ("success", "length_over_shortest", "near"):
         yield "agent", name, float(numbers[name] or 0.0)
     yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
-    for step in (1_000 * point for point in POINTS if 1_000 * point <= run.budget):
+    for step in (1_000 * point for point in POINTS if 1_000 * point <= budget_of(run.config)):
         seen = run.episodes.at(run.episodes.step <= step).last()
         yield "agent", f"success_at_{step}", float(seen.succeeded.mean())
         yield "agent", f"length_at_{step}", float(seen.length.mean()) / shortest

@@ -26,7 +26,7 @@ from hypogoal.data import Collected
 from hypogoal.domains.montezuma.collect import SEEN_NOWHERE, MontezumaConfig
 from hypogoal.domains.montezuma.domain import DOMAIN
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
-from hypogoal.evaluation.numbers import above
+from hypogoal.evaluation.house import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking

@@ -42,12 +42,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def short_evaluations() -> Iterator[None]:
-    """Evaluations explain 10 states instead of 120, show 60 instead of 300, and let agents play a fifth as long."""
-    from hypogoal.evaluation import explorer, frozen
+    """Evaluations explain 5 states of the gallery instead of 20, and let agents play a fifth as long."""
+    from hypogoal.evaluation import frozen, saliency
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(explorer, "MOST_STATES", 60)
-        patch.setattr(explorer, "MOST_EXPLAINED", 10)
+        patch.setattr(saliency, "EXPLAINED", 5)
         patch.setattr(frozen, "STEPS", 200)
         yield
 

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import t as student
@@ -22,7 +23,7 @@ COMPARED = re.compile(
     rf"({'|'.join(WORDS)}) (on this (?:layout|seed)|over (\d+) (?:layout|seed)s): .*? (\d+) % .*? (\d+) %"
     r"(?: in \w+)?(?: \(([+-]\d+) points \[(-?\d+), (-?\d+)\]\))?\."
 )
-UNIFORM = "uniform among its own options"
+UNIFORM = "uniform-random choice among its own options"
 
 
 def agrees(run: Path, task: str, *kinds: str) -> None:
@@ -67,14 +68,17 @@ def pairs(run: Path, cells: Sequence[CELL], subject: str) -> list[tuple[str, flo
         kept = [cell for cell in cells if (cell["quantity"], cell["scope"]) == ("success", scope)]
         return [cell for cell in kept if not (cell["step"] or cell["sub_goal"])]
 
-    def members(cell: CELL) -> int:
+    def config(cell: CELL) -> dict[str, Any]:
         manifest = json.loads((run / cell["artefact"] / "manifest.json").read_text(encoding="utf-8"))
-        return int(manifest["config"].get("members", 0))
+        return dict(manifest["config"])
+
+    def members(cell: CELL) -> int:
+        return int(config(cell).get("members", 0))
 
     trained = of("")
     frozen = of("frozen") or of("zero-shot")  # play on layouts that were asked for
     played = [cell for cell in frozen if cell["method"] != UNIFORM]
-    agents = played or [cell for cell in trained if cell["method"].startswith("options (learned")]
+    agents = played or [cell for cell in trained if config(cell).get("chooser") == "ppo"]
     several = [cell for cell in agents if members(cell) > 1]
     keys = ("layout", "seed")
     others = [cell for cell in agents if members(cell) == 1]

@@ -26,7 +26,7 @@ READERS = {
     "meta/choices.csv": "evaluate {run} --out {out}",
     "meta/layout.json": "evaluate {run} --out {out}",
     "options-more/visited.h5": "train-ensemble {run}/data.h5 --unlabelled {run}/options-more --out {out}",
-    "evaluation/metrics.json": "report {run} --force",
+    "evaluation/run.json": "report {run} --force",
     "evaluation/arrays.h5": "report {run} --force",
     "own/preset.toml": "train-ensemble {run}/data.h5 --preset {run}/own/preset.toml --out {out}",
     "own/experiment.toml": "run {run}/own/experiment.toml --out {out} --dry-run",

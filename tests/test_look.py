@@ -18,7 +18,8 @@ from hypogoal.evaluation.run import find_artefacts
 from hypogoal.look import describe, faults, lines, outcome, stale
 
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
-MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")  # what settings do not say
+COMPARED = {"differences.csv", "agents.csv", "hypotheses.csv", "rooms.csv", "distance.csv"}
+MAY = {"executions.csv", "exploits.csv", *COMPARED}, ("figures/", "videos/", "tables/", "before-", "mended-")
 
 
 @pytest.fixture

@@ -42,9 +42,9 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
     return {
         "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
         "baseline": {LOG, "episodes.csv", "layout.json", "policy.safetensors"},
-        "evaluation": {"metrics.json", "numbers.csv", "arrays.h5"},
+        "evaluation": {"run.json", "numbers.csv", "arrays.h5"},
         "report": {"index.html"},
-        "comparison": {"index.html", "metrics.json"},
+        "comparison": {"index.html", "pairs.csv"},
     }[kind]
 
 

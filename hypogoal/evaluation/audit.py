@@ -19,7 +19,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import COLUMNS, TABLE, option_numbers
-from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.pictures import episode_gif
 from hypogoal.evaluation.selection import states_met
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
@@ -148,8 +147,11 @@ def findings(
         cell = engine.positions(end)[0] // CELL if engine.position_names else np.zeros(0, dtype=np.int64)
         return tuple(np.array(sub_goals)[engine.labels(end)[0]].tolist()), tuple(cell.tolist())
 
+    of_kind: dict[Any, list[Execution]] = {}
+    for row in fooled:
+        of_kind.setdefault(kind_of(row), []).append(row)
     kinds: list[dict[str, Any]] = []
-    for (holds, _), alike in sorted(grouped(fooled, kind_of).items(), key=lambda item: -len(item[1])):
+    for (holds, _), alike in sorted(of_kind.items(), key=lambda item: -len(item[1])):
         row = min(alike, key=lambda row: row.duration)
         path = np.array([row.began, *row.states])
         at = engine.positions(path[-1:])[0].tolist() if engine.position_names else []

@@ -9,25 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
-from rich.table import Table as Printed
-from scipy.stats import rankdata
+from scipy.stats import spearmanr
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, NEARLY, titled
+from hypogoal.evaluation.curves import NEAR
+from hypogoal.evaluation.house import DIGITS, above, at_least, mean_of, over, per_run, tidy
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import DIGITS, Metrics, above, at_least, mean_of
-from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.names import UNIFORM
+from hypogoal.evaluation.page import Results, displayed, spread
 from hypogoal.evaluation.run import takes
-from hypogoal.evaluation.table import Number, Row, Table, by_run, rows_of, select, tabulate
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
@@ -38,6 +36,8 @@ DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to 
 MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
+FROZEN = "frozen"  # the scope of what is played after training
+SEVERAL = 5  # runs from which on a rank correlation of a few members is shown
 TITLE = "What choosing is worth"
 
 
@@ -80,13 +80,6 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
     return qualities
 
 
-def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Spearman's rank correlation of (n,) and (n,), ties sharing their mean rank; NaN where a side is constant."""
-    ranked, other = (ranks - ranks.mean() for ranks in (rankdata(first), rankdata(second)))
-    spread = np.sqrt((ranked**2).sum() * (other**2).sum())
-    return float((ranked * other).sum() / spread) if spread > 0 else math.nan
-
-
 def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
@@ -103,149 +96,143 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
     expected = (among / among.sum(axis=1, keepdims=True)).sum(axis=0).round(DIGITS)  # in any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
     preference = np.where(at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
-    rhos, better, worse = [], 0, 0
-    for alike in options.reshape(-1, members):  # of one sub-goal
-        comparable = alike[~np.isnan(quality[alike]) & ~np.isnan(preference[alike])]
-        if len(comparable) > 1 and at_least(np.ptp(quality[comparable]), DIFFERENCE):
-            rhos.append(rank_correlation(quality[comparable], preference[comparable]))
-        for option, other in combinations(alike.tolist(), 2):
-            if at_least(abs(quality[option] - quality[other]), DIFFERENCE):
-                good, bad = (option, other) if quality[option] > quality[other] else (other, option)
-                both = among[:, option] & among[:, other]
-                better, worse = better + int((taken[both] == good).sum()), worse + int((taken[both] == bad).sum())
-    values = np.where(among & ~np.isnan(quality), quality, np.nan)
-    rows = (~np.isnan(values)).sum(axis=1) > 1
-    rows[rows] = ~np.isnan(quality[taken[rows]])
-    values, got = values[rows], quality[taken[rows]]
-    mean, best = (np.nanmean(values, axis=1), np.nanmax(values, axis=1)) if rows.any() else (got, got)
-    gain = float((best - mean).sum())
     return {
         "preference": preference,
-        "within_rho": mean_of([rho for rho in rhos if not math.isnan(rho)]),
-        "pair": better / (better + worse) if better + worse else math.nan,
-        "score": float((got - mean).sum()) / gain if above(gain, 0.0) else math.nan,
+        "within_rho": _within_rho(quality, preference, members),
+        "pair": _better_of_two(quality, taken, among, members),
+        "score": _score(quality, taken, among),
     }
 
 
-def rows(work: Work) -> Iterator[Row]:
+def _within_rho(quality: NDArray[np.float64], preference: NDArray[np.float64], members: int) -> float:
+    rhos = []
+    for start in range(0, len(quality), members):  # of each sub-goal
+        alike = slice(start, start + members)
+        is_known = ~np.isnan(quality[alike]) & ~np.isnan(preference[alike])
+        good, preferred = quality[alike][is_known], preference[alike][is_known]
+        if len(good) > 1 and at_least(np.ptp(good), DIFFERENCE) and np.ptp(preferred) > 0:
+            rhos.append(spearmanr(good, preferred).statistic)
+    return mean_of(rhos)
+
+
+def _better_of_two(
+    quality: NDArray[np.float64], taken: NDArray[np.int64], among: NDArray[np.bool_], members: int
+) -> float:
+    better, worse = 0, 0
+    for start in range(0, len(quality), members):
+        for option, other in combinations(range(start, start + members), 2):
+            if not at_least(abs(quality[option] - quality[other]), DIFFERENCE):
+                continue
+            good, bad = (option, other) if quality[option] > quality[other] else (other, option)
+            both = among[:, option] & among[:, other]
+            better += int((taken[both] == good).sum())
+            worse += int((taken[both] == bad).sum())
+    return better / (better + worse) if better + worse else math.nan
+
+
+def _score(quality: NDArray[np.float64], taken: NDArray[np.int64], among: NDArray[np.bool_]) -> float:
+    values = np.where(among & ~np.isnan(quality), quality, np.nan)
+    is_compared = (~np.isnan(values)).sum(axis=1) > 1
+    is_compared[is_compared] = ~np.isnan(quality[taken[is_compared]])
+    if not is_compared.any():
+        return math.nan
+    average = np.nanmean(values[is_compared], axis=1)
+    gain = float((np.nanmax(values[is_compared], axis=1) - average).sum())
+    gained = float((quality[taken[is_compared]] - average).sum())
+    return gained / gain if above(gain, 0.0) else math.nan
+
+
+def rows(work: Work) -> Iterator[pd.DataFrame]:
     """Every run of an agent that learned to choose among members' options, in a domain that knows what follows.
 
     The agent's numbers, those of uniform-random choice, and every member's.
     """
-    for name, run in ((name, run) for name, runs in work.agents.items() for run in runs):
-        artefact = work.artefact(run.path)
-        config = artefact.config
-        learned = artefact.kind == "meta" and takes(artefact) and config["chooser"] != "random"
-        playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest.files
-        # Of many layouts the states are too many to say what follows in each.
-        if not learned or not playable or config.get("layouts") or (played := play_agent(artefact, run.seed)) is None:
+    for artefact in work.contents.agents:
+        played = play_agent(artefact) if _is_playable(artefact) else None
+        if played is None:
             continue
-        place = {"scope": FROZEN, "layout": run.layout["layout_seed"], "seed": run.seed, "artefact": run.path}
-        for method, numbers in ((name, played), (UNIFORM, played["uniform"])):
-            yield from rows_of({key: numbers[key] for key in (*OF_PLAY, *OF_CHOICE)}, method=method, **place)
-        for member in played["members"]:
-            where = {"sub_goal": member.pop("sub_goal"), "member": member.pop("member")}
-            yield from rows_of(member, method=name, **where, **place)
+        place = {**work.place(artefact), "scope": FROZEN}
+        agent, uniform, members = played
+        yield tidy(agent, **place)
+        yield tidy(uniform, **{**place, "method": UNIFORM})
+        for sub_goal, of_goal in members.groupby("sub_goal", sort=False):
+            columns = of_goal[["member", "quality", "conditional_preference"]]
+            yield columns.melt("member", var_name="quantity").assign(**place, sub_goal=sub_goal)
 
 
-def view(work: Work) -> dict[str, Any]:
-    """Over runs each agent, and ``uniform``: uniform-random choice among its own options."""
-    rows = select(work.rows, scope=FROZEN)
-    agents = [row for row in rows if row.method != UNIFORM]
-    by_agent = replace(TABLE, by={"name": lambda row: work.agent_of[row.artefact]}, cell=lambda key: (*key, "uniform"))
-    uniform = {entry["name"]: entry for entry in tabulate(select(rows, method=UNIFORM), by_agent)}
-    table = tabulate(agents, TABLE)
-    for entry in table:
-        entry["uniform"] = uniform[entry["name"]]
-        entry["runs"] = by_run(select(agents, method=entry["name"]))
-    return {"choosing": table}
+def _is_playable(artefact: Artefact) -> bool:
+    config = artefact.config
+    learned = artefact.kind == "meta" and takes(artefact) and config["chooser"] != "random"
+    playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest.files
+    # Of many layouts the states are too many to say what follows in each.
+    return learned and playable and not config.get("layouts")
 
 
-def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
-    """``OF_PLAY`` and ``OF_CHOICE`` of a trained agent played on, frozen; ``uniform``: those of uniform-random choice
-    among its own options; ``members``: each one's quality and conditional preference.
+def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], pd.DataFrame] | None:
+    """A trained agent played on, frozen, and uniform-random choice among its own options.
 
-    None where the engine does not know what each action leads to, or the sub-goals are not the domain's.
+    Returns ``OF_PLAY`` and ``OF_CHOICE`` of both, and a row per member: sub_goal, member, quality and
+    conditional_preference. None where the engine does not know what each action leads to, or the sub-goals are not the
+    domain's.
     """
     from hypogoal.evaluation.frozen import ENVIRONMENTS, play  # with PyTorch, which a report does not need
     from hypogoal.meta.episodes import agent_of
     from hypogoal.options.choosers import RandomChooser
 
-    config, sub_goals = artefact.config, load_domain(artefact.config["domain"]).sub_goals
+    config, seed = artefact.config, artefact.seed
+    sub_goals = load_domain(config["domain"]).sub_goals
     if not set(config["sub_goals"]) <= set(sub_goals):
         return None
     if agent_of(artefact, seed).engine.plan() is None:  # one game, since many take long to begin
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
-    members, shortest = config["members"], loop.engine.shortest_path()
+    members = config["members"]
     goals = np.repeat([sub_goals.index(goal) for goal in config["sub_goals"]], members)
-    of_both = [play(loop, chooser) for chooser in (loop.chooser, RandomChooser(rng_for(seed, "uniform-choice")))]
-    quality, numbers = qualities(loop, goals, of_both[0].choices.states), []  # where the agent itself decides
+    uniform = RandomChooser(rng_for(seed, "uniform-choice"))
+    of_both = [play(loop, chooser) for chooser in (loop.chooser, uniform)]
+    quality = qualities(loop, goals, of_both[0].choices.states)  # where the agent itself decides
+    numbers = []
     for episodes in of_both:
-        scores = episodes.scores(shortest) | {"length": episodes.length}
+        scores = episodes.scores(loop.engine.shortest_path()) | {"length": episodes.length}
         played = {name: mean_of(scores[name].ravel()) for name in OF_PLAY}
         numbers.append(played | judge(episodes.choices, quality, members))
     preference = numbers[0].pop("preference")
     del numbers[1]["preference"]
-    by_member = [
+    of_members = pd.DataFrame(
         {
-            "sub_goal": config["sub_goals"][option // members],
-            "member": option % members,
-            "quality": float(quality[option]),
-            "conditional_preference": float(preference[option]),
+            "sub_goal": np.repeat(config["sub_goals"], members),
+            "member": np.tile(np.arange(members), len(config["sub_goals"])),
+            "quality": quality,
+            "conditional_preference": preference,
         }
-        for option in range(len(quality))
-    ]
-    return {**numbers[0], "members": by_member, "uniform": numbers[1]}
-
-
-UNITS = {"length": "steps", "within_rho": "Spearman's rho", "score": "ratio"}
-FROZEN = "frozen"  # in numbers.csv: played after training
-UNIFORM = "uniform among its own options"  # in numbers.csv
-UNIFORM_CHOICE = "uniform-random choice among its own options"  # for people
-TABLE = Table(
-    {"name": "method"}, {name: Number(name, FROZEN, UNITS.get(name, "fraction")) for name in (*OF_PLAY, *OF_CHOICE)}
-)
-COLUMNS = (
-    page.label("chooser", lambda entry: titled(entry["chooser"])),
-    page.number("solved", "success", page.spread, 2),
-    page.number(*NEARLY, page.spread, 2),
-    page.number("steps", "length", page.spread, 1),
-    page.number("preference follows quality (within-rho)", "within_rho", page.spread, 2),
-    page.number("better of two taken", "pair", page.spread, 2),
-    page.number("quality gained, of the most possible (score)", "score", page.spread, 2),
-    page.number("runs", "success.n"),
-)
-
-
-def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
-    """Each agent, and below it uniform-random choice among its own options."""
-    both = ((agent | {"chooser": agent["name"]}, agent["uniform"] | {"chooser": UNIFORM_CHOICE}) for agent in agents)
-    return [chooser for pair in both for chooser in pair]
-
-
-def summary(metrics: Metrics) -> list[Printed]:
-    """For a terminal, where there is anything to choose."""
-    agents = metrics["choosing"]
-    return [page.terminal(TITLE, (*COLUMNS[:2], COLUMNS[-1]), _choosers(agents))] if agents else []
-
-
-def sections(material: Material) -> list[Block]:
-    """One table; each member's quality and preference are in ``numbers.csv``."""
-    agents = material.metrics["choosing"]
-    if not agents:
-        return []
-    text = (
-        "The trained agent plays without learning: the first episodes of each of many environments, as many in each. "
-        "For comparison, uniform-random choice plays with the agent's own final options. An "
-        "option's quality is the share of its executions that reach the true sub-goal, begun where agents decide. "
-        "Choice is judged among the members of the sub-goal that was chosen. Within-rho: the rank correlation of "
-        "preference with quality (1: the better, the more often chosen; 0 at random). Better of two taken: how often, "
-        "of two whose qualities differ by .2 (.5 at random). Score: how much of the way from the mean to the best "
-        "quality the choices go (1: always the best; 0 at random)."
     )
-    table = page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED)
-    return [page.section("choosing", TITLE, [text], [table])]
+    return numbers[0], numbers[1], of_members
 
 
-QUESTION = Question(rows=rows, view=view, summary=summary, sections=sections)
+def tables(results: Results) -> dict[str, pd.DataFrame]:
+    """Over runs each agent (``chooser`` its own), and uniform-random choice among its own options."""
+    numbers = results.of(scope=FROZEN, sub_goal="")
+    agents = numbers[numbers["method"] != UNIFORM].drop_duplicates("artefact").set_index("artefact")["method"]
+    runs = pd.concat([per_run(numbers, name, FROZEN) for name in (*OF_PLAY, *OF_CHOICE)])
+    chooser = runs["method"].where(runs["method"] == UNIFORM, "the agent's")
+    runs = runs.assign(chooser=chooser, method=runs["artefact"].map(agents))
+    return {"choosing": over(runs, ["method", "chooser"])}
+
+
+def context(results: Results) -> dict[str, Any] | None:
+    """For the template: each agent, and below it uniform-random choice among its own options."""
+    if results.of(scope=FROZEN).empty:
+        return None
+    table = tables(results)["choosing"]
+    columns = {
+        "solved": ("success", spread(2)),
+        f"within {NEAR} shortest paths": ("near", spread(2)),
+        "steps": ("length", spread(1)),
+        "better of two taken": ("pair", spread(2)),
+        "quality gained": ("score", spread(2)),
+        "runs": ("success", lambda row: str(row["n"])),
+    }
+    if table["n"].max() >= SEVERAL:
+        columns["within-rho"] = ("within_rho", spread(2))
+    shown = displayed(table, {"method": "agent", "chooser": "choice"}, columns)
+    return {"table": shown, "printed": shown[["solved", "runs"]], "has_rho": "within-rho" in shown}

@@ -1,78 +1,57 @@
 """Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders (Spec F3, F4)."""
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain, count, product
-from operator import itemgetter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from rich.table import Table as Printed
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.domains.base import Domain, installed_domain
-from hypogoal.evaluation import page
+from hypogoal.evaluation.house import over, pairs, per_run, tidy
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import (
-    ORACLE,
-    Metrics,
-    by_groups,
-    by_method,
-    ensemble_name,
-    grouped,
-    groups_of,
-    mean_of,
-    method_rank,
-    methods_lacking,
-    name_apart,
-    over,
+from hypogoal.evaluation.names import ORACLE, rank
+from hypogoal.evaluation.page import (
+    Drawn,
+    Results,
+    deviation,
+    displayed,
+    mean,
+    pairs_displayed,
+    spans,
 )
-from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import STATES, overlay
-from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
-from hypogoal.evaluation.rooms import VALIDATION, group_name
+from hypogoal.evaluation.plots import GREY, INK, ORANGE, PALETTE, PURPLE, SKY, WIDTH, legend_below, plot, styled
+from hypogoal.evaluation.rooms import VALIDATED, lacking
 from hypogoal.evaluation.run import read_terminations, takes, thresholds_of, within
-from hypogoal.evaluation.table import (
-    BEST,
-    VALIDATED,
-    WORST,
-    Number,
-    Pairs,
-    Row,
-    by_fields,
-    per_run,
-    rows_of,
-    select,
-    with_members,
-)
 from hypogoal.hypotheses.scores import most_and_least
-from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Executions
 
+TITLE = "Options on ladders"
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
+BEST, WORST = "best_member", "worst_member"  # quantities: which member it is
 SHARES = {"reached_base": "at sub-goal", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
 PICKED = {"best": BEST, "validated": VALIDATED, "mean": "mean", "worst": WORST}
-NUMBERS = {which: Number("distance", "", "units of position", member) for which, member in PICKED.items()}
-NUMBERS["executions_deviation"] = Number("executions_deviation", "", "units of position", BEST)
-NUMBERS |= {share: Number(share, "", "share of executions", BEST) for share in SHARES}
-OF_OPTIONS = ("executions", "distance", "executions_deviation", "duration", *SHARES, "threshold")
-QUANTITIES = (*OF_OPTIONS, BEST, WORST, VALIDATED)
-NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
-NO_PICTURES = "The domain has no pictures of its rooms."
+BY = {"N": "N", "method": "method"}
+COLUMNS = {which: (which, deviation(1)) for which in PICKED} | {"± exec.": ("executions_deviation", mean(1))}
+COLUMNS |= {f"{title}, %": (share, mean(0, 100)) for share, title in SHARES.items()}
+COLUMNS["seeds"] = ("best", lambda row: str(row["n"]))
 ROOMS_SHOWN = 3
-GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
-HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
 MARK: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5}
 STOPS: dict[int, tuple[str, dict[str, Any]]] = {
     HIT: ("at the true sub-goal", MARK | {"marker": "o", "color": SKY, "markeredgewidth": 0.6, "markeredgecolor": INK}),
     MISS: ("elsewhere", MARK | {"marker": "x", "color": ORANGE}),
     BEGAN_INSIDE: ("began inside: counts 300", MARK | {"marker": "s", "color": PURPLE, "fillstyle": "none"}),
+}
+NEEDED = {
+    "figure4": "options with executions.csv: train-options --set start=LADDER",
+    "figure5": "the same, of a domain that draws its rooms",
 }
 
 
@@ -91,392 +70,278 @@ def fates(executions: Executions) -> NDArray[np.int64]:
     return np.select([executions.inside_at_start, at_base(executions)], [BEGAN_INSIDE, HIT], MISS)
 
 
-def option_numbers(executions: Executions, *, never_offered: bool = False) -> dict[str, float | int]:
+def option_numbers(executions: Executions, *, never_offered: bool = False) -> dict[str, float]:
     """Spec F3: the numbers of one option's last executions; NaN without executions, the deviation also of one.
 
     An option ``never_offered`` has none because it would always have begun inside its own termination set: it counts
     300. Units: the domain's; duration in steps; shares of executions. Timed out: neither classifier nor death ended it.
     """
-    distance, executed = counted(executions), len(executions.step)
-    shares = {
-        "reached_base": at_base(executions),
-        "inside_at_start": executions.inside_at_start,
-        "timed_out": ~executions.reached & ~executions.terminated,
-        "died": executions.terminated,
-    }
-    return {
-        "executions": executed,
-        "distance": float(INSIDE) if never_offered and not executed else mean_of(distance),
-        "executions_deviation": float(distance.std(ddof=1)) if executed > 1 else math.nan,
-        "duration": mean_of(executions.duration),
-        **{name: mean_of(values) for name, values in shares.items()},
-    }
+    values = pd.DataFrame(
+        {
+            "distance": counted(executions),
+            "duration": executions.duration,
+            "reached_base": at_base(executions),
+            "inside_at_start": executions.inside_at_start,
+            "timed_out": ~executions.reached & ~executions.terminated,
+            "died": executions.terminated,
+        }
+    ).astype(np.float64)
+    numbers: dict[str, float] = dict(zip(values.columns, values.mean(), strict=True))
+    numbers["executions"] = len(values)
+    numbers["executions_deviation"] = values["distance"].std()
+    if never_offered and values.empty:
+        numbers["distance"] = INSIDE
+    return numbers
+
+
+def rows(work: Work) -> Iterator[pd.DataFrame]:
+    """Spec F3: every member's option on every ladder: where its executions stopped; overlays go to the arrays."""
+    for artefact in sorted(work.contents.ladders, key=lambda artefact: rank(work.place(artefact)["method"])):
+        path, config = work.contents.name(artefact), artefact.config
+        executions = Executions.read(artefact.path / "executions.csv")
+        source = within(work.contents, Artefact(artefact.input("ensemble"))) if takes(artefact) else None
+        validated = {goal: work.validated.get((source or "", goal)) for goal in config["sub_goals"]}
+        thresholds = thresholds_of(artefact)
+        yield from rows_of_ladder(executions, config, validated, thresholds, work.place(artefact))
+        if "terminations.h5" in artefact.manifest.files:
+            _write_overlays(work.arrays, artefact, path)
+        work.progress.advance()
 
 
 def rows_of_ladder(
     executions: Executions,
-    sub_goals: Sequence[str],
-    members: int,
-    validated: Mapping[str, int],
-    *,
-    masked: bool,
-    thresholds: NDArray[np.float64] | None = None,
-    **place: Any,
-) -> Iterator[Row]:
+    config: Mapping[str, Any],
+    validated: Mapping[str, int | None],
+    thresholds: NDArray[np.float64],
+    place: Mapping[str, Any],
+) -> Iterator[pd.DataFrame]:
     """Spec F3: one options artefact, trained from one start (a ladder) on G sub-goals with K members each.
 
     Per sub-goal each member's numbers, with its threshold (of (G*K,)); the best member (the least mean distance), the
-    worst, and the validated one. ``masked``: options that would begin inside were not offered (Spec D6).
+    worst, and the validated one. Where ``mask_reached``, options that would begin inside were not offered (Spec D6).
     """
-    masked = masked and len(executions.step) > 0
-    for index, sub_goal in enumerate(sub_goals):
+    members = config["members"]
+    masked = config["mask_reached"] and len(executions.step) > 0
+    for index, sub_goal in enumerate(config["sub_goals"]):
         distances = []
-        for member, option in enumerate(range(index * members, (index + 1) * members)):
+        for member in range(members):
+            option = index * members + member
             numbers = option_numbers(executions.of(option), never_offered=masked)
-            numbers |= {} if thresholds is None else {"threshold": thresholds[option].item()}
-            yield from rows_of(numbers, **place, sub_goal=sub_goal, member=member)
             distances.append(numbers["distance"])
+            numbers["threshold"] = thresholds[option]
+            yield tidy(numbers, **place, sub_goal=sub_goal, member=member)
         worst, best = most_and_least(np.array(distances))
         picked = {BEST: best, WORST: worst, VALIDATED: validated.get(sub_goal)}
-        yield from rows_of(picked, **place, sub_goal=sub_goal)
+        yield tidy(picked, **place, sub_goal=sub_goal)
 
 
-def _of_options(rows: Iterable[Row]) -> list[Row]:
-    return [row for row in select(rows, scope="", quantity=QUANTITIES) if row.ladder]
+def _write_overlays(arrays: Any, artefact: Artefact, path: str) -> None:
+    ends = read_terminations(artefact.path / "terminations.h5")
+    for option, states in ends.items():
+        arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
+    options = range(len(artefact.config["sub_goals"]) * artefact.config["members"])
+    arrays[f"{STATES}/{path}/counts"] = np.array([len(ends.get(option, ())) for option in options], np.int64)
 
 
-def options_of(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """Of each options artefact and sub-goal its ``options``, and which member is ``best``, ``worst``, ``validated``."""
-    names = {"method": "method", "groups": "N", "ladder": "ladder", "seed": "seed", "sub_goal": "sub_goal"}
-    entries = with_members(_of_options(rows), path="artefact", **names)
-    numbers: dict[str, Iterator[int]] = defaultdict(count)  # of each artefact's options
-    for entry in entries:
-        entry["options"] = entry.pop("members")
-        for option in entry["options"]:
-            option["option"] = next(numbers[entry["path"]])
-        for name, quantity in {"best": BEST, "worst": WORST, "validated": VALIDATED}.items():
-            member = entry.pop(quantity)
-            entry[name] = None if math.isnan(member) else int(member)
-    return entries
+def facts(work: Work) -> dict[str, Any]:
+    """The ladders from the top down, and what Figure 5 shows, whose stops and pictures go to the arrays.
 
-
-def distance_table(rows: Sequence[Row], ladders: Sequence[str]) -> list[dict[str, Any]]:
-    """Spec F3, Figure 4: per method and N distances over seeds, each seed's mean over the run's ladders first.
-
-    Entries have the distance of the best, validated, mean and worst member and the best member's shares. A seed that
-    lacks a ladder is left out: unlike ladders are not averaged. Artefacts with one seed and ladder all count.
+    Of each ladder and N the best members of the first seed; nothing where the domain has no pictures.
     """
-    table = []
-    cells = by_fields(_of_options(rows), "method", "N", "sub_goal")
-    for key in sorted(cells, key=by_method):
-        by_seed: dict[tuple[int, int], dict[str, list[Row]]] = {}
-        artefacts: Counter[tuple[Any, ...]] = Counter()
-        for (seed, ladder, _), of_artefact in by_fields(cells[key], "seed", "ladder", "artefact").items():
-            by_seed.setdefault((seed, artefacts[seed, ladder]), {})[ladder] = of_artefact
-            artefacts[seed, ladder] += 1
-        seeds = [seed for seed in sorted(by_seed) if by_seed[seed].keys() >= set(ladders)]
-        incomplete = [seed for seed, number in sorted(by_seed) if (seed, number) not in seeds]
-        entry: dict[str, Any] = dict(zip(("method", "groups", "sub_goal"), key, strict=True))
-        entry |= {"ladders": list(ladders), "seeds": len(seeds), "incomplete_seeds": incomplete}
-        for name, number in NUMBERS.items():
-            means = [float(np.mean([per_run(by_seed[seed][on], number)[0][1] for on in ladders])) for seed in seeds]
-            entry |= {"each_seed": means} if name == "best" else {}
-            entry[name] = over(means, number.unit, "distance", *map(str, key), name, deviation=True)
-        table.append(entry)
-    return table
+    artefacts = work.contents.ladders
+    domains = {artefact.config["domain"] for artefact in artefacts}
+    domain = installed_domain(domains.pop()) if len(domains) == 1 else None
+    used = {artefact.config["start"] for artefact in artefacts}
+    ordered = [start for start in (domain.starts if domain else ()) if start in used]
+    ladders = [*ordered, *sorted(used.difference(ordered))]
+    shown = []
+    if domain is not None and domain.pictures:
+        for ladder in ladders:
+            shown += _stops_of(work, domain, ladder)
+        for room in sorted({room for figure in shown for room in figure["rooms"]}):
+            work.arrays[f"pictures/{room}"] = domain.picture(room)
+    return {"ladders": ladders, "stops": shown}
 
 
-def ladder_names(
-    methods: Sequence[str], groups: Sequence[int | None], configs: Sequence[Mapping[str, Any]]
-) -> list[str]:
-    """Names of n options artefacts by their ensemble's method; where their own settings differ at one N, with those."""
-    settings = [{key: value for key, value in config.items() if key not in NOT_A_METHOD} for config in configs]
-    return name_apart(methods, settings, groups)
+def _stops_of(work: Work, domain: Domain, ladder: str) -> list[dict[str, Any]]:
+    """Figure 5 of one ladder, for each N: each method's best option; oracle terminations stand beside every N."""
+    artefacts = [artefact for artefact in work.contents.ladders if artefact.config["start"] == ladder]
+    first = min(artefact.seed for artefact in work.contents.ladders)
+    options: list[dict[str, Any]] = []
+    for artefact in artefacts:
+        if artefact.seed == first:
+            options += _best_options(work, domain, artefact)
+    options.sort(key=lambda option: rank(option["method"]))
+    groups = sorted({option["N"] for option in options if option["N"] is not None}) or [None]
+    shown = []
+    for number in groups:
+        beside = [dict(option) for option in options if option["N"] in (number, None)]
+        where = [work.arrays[f"{option['stops']}/positions"][:, 0] for option in beside]
+        rooms = rooms_shown(where, [room for name in ladder.split(",") for room in domain.rooms_of(name)])
+        for option, rooms_of_stops in zip(beside, where, strict=True):
+            option["elsewhere"] = int((~np.isin(rooms_of_stops, rooms)).sum())
+        if beside:
+            shown.append({"ladder": ladder, "N": number, "seed": first, "rooms": rooms, "options": beside})
+    return shown
+
+
+def _best_options(work: Work, domain: Domain, artefact: Artefact) -> Iterator[dict[str, Any]]:
+    """Of each sub-goal the option that stops nearest; its stops are written into the arrays."""
+    place = work.place(artefact)
+    executions = Executions.read(artefact.path / "executions.csv")
+    members = artefact.config["members"]
+    for index, sub_goal in enumerate(artefact.config["sub_goals"]):
+        of_members = [executions.of(index * members + member) for member in range(members)]
+        masked = artefact.config["mask_reached"] and len(executions.step) > 0
+        distances = [option_numbers(stops, never_offered=masked)["distance"] for stops in of_members]
+        _, best = most_and_least(np.array(distances))
+        if best is None:
+            continue
+        stops = of_members[best]
+        folder = f"stops/{place['artefact']}/{index * members + best}"
+        work.arrays[f"{folder}/positions"] = stops.positions()
+        pixels = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
+        work.arrays[f"{folder}/pixels"] = pixels
+        work.arrays[f"{folder}/fates"] = fates(stops)
+        yield {
+            "method": place["method"],
+            "N": place["N"],
+            "sub_goal": sub_goal,
+            "member": best,
+            "distance": distances[best],
+            "executions": len(stops.step),
+            "hits": int((fates(stops) == HIT).sum()),
+            "inside": int(stops.inside_at_start.sum()),
+            "stops": folder,
+        }
 
 
 def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = ()) -> list[int]:
     """Figure 5: the rooms that are drawn: the ladder's own, from the top down, then those in which the most executions
     stopped; ``where`` are per option the rooms of its stops, (n,).
     """
+    first = list(dict.fromkeys(of_ladder))
     rooms, counts = np.unique(np.concatenate([np.zeros(0, np.int64), *where]), return_counts=True)
     often = rooms[np.argsort(-counts, kind="stable")]
-    return [*of_ladder, *(int(room) for room in often if room not in of_ladder)][: max(ROOMS_SHOWN, len(of_ladder))]
+    others = [int(room) for room in often if room not in first]
+    return [*first, *others][: max(ROOMS_SHOWN, len(first))]
 
 
-def rows(work: Work) -> Iterator[Row]:
-    """Spec F3: every member's option on every ladder: where its executions stopped; overlays go to the arrays."""
-    picked = by_fields(select(work.rows, quantity=VALIDATED, scope=VALIDATION), "artefact")
-    for artefact, source, place in _named(work):
-        path, config = work.contents.name(artefact), artefact.config
-        choices = picked.get((source,), []) if takes(artefact) else []
-        validated = {row.sub_goal: int(row.value) for row in choices if not math.isnan(row.value)}
-        executions = Executions.read(artefact.path / "executions.csv")
-        if "terminations.h5" in artefact.manifest.files:
-            ends = read_terminations(artefact.path / "terminations.h5")
-            for option, states in ends.items():
-                work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
-            every = range(len(config["sub_goals"]) * config["members"])
-            work.arrays[f"{STATES}/{path}/counts"] = np.array([len(ends.get(option, ())) for option in every], np.int64)
-        more: dict[str, Any] = {"masked": config["mask_reached"], "thresholds": thresholds_of(artefact)}
-        more |= {**place, "ladder": config["start"], "seed": artefact.seed, "artefact": path}
-        yield from rows_of_ladder(executions, config["sub_goals"], config["members"], validated, **more)
-        work.progress.advance()
+def tables(results: Results) -> dict[str, pd.DataFrame]:
+    """Spec F3, Figure 4: distances per method and N over seeds, each seed's mean over the run's ladders first.
 
-
-def view(work: Work) -> dict[str, Any]:
-    """Spec F3, F4: ``options`` of each artefact and sub-goal; ``over_ladders``, over seeds; ``shown`` in Figure 5."""
-    contents = work.contents
-    artefacts = {contents.name(artefact): artefact for artefact in contents.ladders}
-    options = options_of(work.rows)
-    for entry in options:
-        artefact = artefacts[entry["path"]]
-        source = Artefact(artefact.input("ensemble")) if takes(artefact) else None
-        entry["ensemble"] = source and within(contents, source)
-    names = {artefact.config["domain"] for artefact in contents.ladders}
-    domain = installed_domain(names.pop()) if len(names) == 1 else None
-    used = {entry["ladder"] for entry in options}
-    starts = [start for start in (domain.starts if domain else ()) if start in used]
-    ladders = [*starts, *sorted(used - set(starts))]
-    executions = {path: Executions.read(artefact.path / "executions.csv") for path, artefact in artefacts.items()}
-    stops = show_stops(options, ladders, executions, domain, work.arrays)
-    return {"distance": {"options": options, "over_ladders": distance_table(work.rows, ladders), "shown": stops}}
-
-
-def _named(work: Work) -> Iterator[tuple[Artefact, str, dict[str, Any]]]:
-    """Each ladder's options, the path of their ensemble, empty where it is not the run's, and its method and N."""
-    methods_of = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
-    paths, methods, groups = [], [], []
-    for artefact in work.contents.ladders:
-        source = Artefact(artefact.input("ensemble"))
-        paths.append(within(work.contents, source) or "")
-        methods.append(methods_of.get(paths[-1], ensemble_name(source.config)) if takes(artefact) else ORACLE)
-        groups.append(groups_of(source.config) if takes(artefact) else None)
-    names = ladder_names(methods, groups, [artefact.config for artefact in work.contents.ladders])
-    for artefact, path, name, number in zip(work.contents.ladders, paths, names, groups, strict=True):
-        yield artefact, path, {"method": name, "N": number}
-
-
-def show_stops(
-    rows: Sequence[Mapping[str, Any]],
-    ladders: Sequence[str],
-    executions: Mapping[str, Executions],
-    domain: Domain | None,
-    arrays: Any,
-) -> list[dict[str, Any]]:
-    """Figure 5's material: for each ladder and N the best members' stops of the first seed, and pictures of the rooms.
-
-    Rows are those of :func:`options_of`, ``executions`` by their paths. ``stops/<path>/<option>/{positions,pixels,
-    fates}`` and ``pictures/<room>`` are written into ``arrays``. None where the domain has no pictures.
+    Of the best, validated, mean and worst member, and the best member's shares. A seed that lacks a ladder is left out:
+    unlike ladders are not averaged. Artefacts with one seed and ladder all count.
     """
-    if domain is None or not domain.pictures:
-        return []
-    first = min((row["seed"] for row in rows), default=0)
-    numbers: list[int | None] = [groups for groups in by_groups(rows) if groups is not None] or [None]
-    shown = []
-    for ladder, groups in product(ladders, numbers):
-        at_start = [row for row in rows if (row["ladder"], row["seed"]) == (ladder, first) and row["best"] is not None]
-        beside = [row for row in at_start if row["groups"] == groups or row["method"].startswith(ORACLE)]
-        columns, where = [], []
-        for row in sorted(beside, key=lambda row: method_rank(row["method"])):
-            best = row["options"][row["best"]]
-            stops = executions[row["path"]].of(best["option"])
-            group = arrays.require_group(f"stops/{row['path']}/{best['option']}")
-            if not len(group):  # the oracle's stand beside every N
-                group["positions"] = stops.positions()
-                group["pixels"] = np.asarray(domain.pixel(stops.positions()), np.float64).reshape(-1, 2)
-                group["fates"] = fates(stops)
-            columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
-            where.append(stops.room)
-        if columns:
-            place: dict[str, Any] = {"ladder": ladder, "groups": groups, "seed": first}
-            shown.append({**place, "rooms": rooms_shown(where, _rooms_of(domain, ladder)), "columns": columns})
-    for room in sorted({room for figure in shown for room in figure["rooms"]}):
-        arrays[f"pictures/{room}"] = domain.picture(room)
-    return shown
+    numbers = results.numbers[results.numbers["ladder"] != ""]
+    runs = [per_run(numbers, "distance", member=member, name=which) for which, member in PICKED.items()]
+    runs += [per_run(numbers, name, member=BEST) for name in ("executions_deviation", *SHARES)]
+    every = pd.concat(runs)
+    return {
+        "distance": over(_over_ladders(every, len(results.facts["ladders"])), ["method", "N", "sub_goal"]),
+        "distance-pairs": pairs(compared(results)),
+        "distance-seeds": _each_seed(results),
+    }
 
 
-def _rooms_of(domain: Domain, ladder: str) -> list[int]:
-    rooms = chain.from_iterable(domain.rooms_of(name) for name in ladder.split(","))
-    return list(dict.fromkeys(rooms))
+def compared(results: Results) -> pd.DataFrame:
+    """The numbers of runs by which options are compared; oracle terminations have no members to choose among."""
+    numbers = results.numbers[(results.numbers["ladder"] != "") & ~results.numbers["method"].str.startswith(ORACLE)]
+    parts = []
+    for which in ("best", "validated", "mean"):
+        parts.append(per_run(numbers, "distance", member=PICKED[which], name=f"distance, {which} member"))
+    return pd.concat(parts).sort_values("N", kind="stable")
 
 
-def missing(work: Work) -> list[str]:
-    """Spec F3, F4: the options that are not there, of a run with ladders."""
-    tells = "its domain tells no distance"
-    lines = [f"no executions.csv in {work.contents.name(artefact)}: {tells}" for artefact in work.contents.silent]
-    options = work.metrics["distance"]["options"]
-    if not options:
-        return [*lines, "no options artefact of a ladder (Figures 4 and 5)"] if work.metrics["rooms"] else lines
-    lines += methods_lacking(options, "options", "Figures 4 and 5")
-    oracle = any(row["method"].startswith(ORACLE) for row in options)
-    return lines if oracle else [*lines, "no options artefact with oracle terminations beside them"]
+def _over_ladders(runs: pd.DataFrame, ladders: int) -> pd.DataFrame:
+    """The mean over ladders of each seed that has all of them, as runs."""
+    cell = ["method", "N", "sub_goal", "quantity", "of"]
+    copies = runs.groupby([*cell, "seed", "ladder"], dropna=False).cumcount()
+    seeds = runs.assign(copy=copies).groupby([*cell, "seed", "copy"], dropna=False, sort=False)
+    means = seeds.agg(value=("value", "mean"), ladders=("ladder", "nunique")).reset_index()
+    return means[means["ladders"] == ladders].assign(layout=None)
 
 
-PAIRS = Pairs(
-    "distance",
-    {
-        # The best member is the best on the executions that are compared, of more members the better.
-        f"distance, {which} member": Number("distance", member=member, higher=False)
-        for which, member in (("best", BEST), ("validated", VALIDATED), ("mean", "mean"))
-    },
-    # Oracle terminations have no N and no members to choose among.
-    lambda rows: [row for row in rows if not row.method.startswith(ORACLE)],
-    ranked=True,
-)
+def context(results: Results) -> dict[str, Any] | None:
+    """For the template: the table over ladders, pairs, and which seeds are left out."""
+    if not results.facts["ladders"]:
+        return None
+    computed = tables(results)
+    table = computed["distance"].sort_values("N", kind="stable", na_position="last")
+    by = dict(BY)
+    if table["sub_goal"].nunique() > 1:
+        by["sub_goal"] = "sub-goal"
+    shown = displayed(table, by, COLUMNS)
+    printed = {which: (which, mean(1)) for which in PICKED} | {"at sub-goal, %": ("reached_base", mean(0, 100))}
+    return {
+        "table": shown,
+        "printed": displayed(table, by, printed),
+        "pairs": pairs_displayed(computed["distance-pairs"], {"distance, best member": 1}),
+        "ladders": results.facts["ladders"],
+        "stops": results.facts["stops"],
+        "seeds": spans(results.numbers[results.numbers["ladder"] != ""]["seed"]),
+    }
 
 
-def _group(entry: Entry) -> str:
-    return "true sub-goal" if entry["groups"] is None else f"N={entry['groups']}"
-
-
-STOPPED = tuple(page.number(which, which, page.deviation, 1) for which in PICKED)
-SHARED = tuple(page.number(title, f"{share}.mean", page.percent) for share, title in SHARES.items())
-SEEDS = page.number("seeds", "seeds")
-OVER_LADDERS = (
-    page.label("labels", _group, once=True),
-    page.label("method", "method"),
-    *STOPPED,
-    page.number("± exec.", "executions_deviation.mean", page.fixed, 1),
-    *SHARED,
-    SEEDS,
-)
-
-
-def summary(metrics: Metrics) -> list[Printed]:
-    """Figure 4 by method and N."""
-    rows = metrics["distance"]["over_ladders"] if metrics["distance"]["options"] else []
-    title = "Distance from the true sub-goal where options stop, mean over ladders"
-    columns = (page.label("method", page.method_of(rows)), page.number("N", group_name), *STOPPED, SHARED[0])
-    return [page.terminal(title, columns, rows)] if rows else []
-
-
-def sections(material: Material) -> list[Block]:
-    """Figures 4 and 5, of a run with ladders."""
-    distance = material.metrics["distance"]
-    if not distance["options"]:
-        return []
-    bars, *stops = (page.shown(material, figure) for figure in figures(material))
-    text = (
-        "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
-        "rooms, it stops from the nearest place where the sub-goal holds, such as a ladder's base, over its last "
-        f"{LAST} executions; one that begins inside the option's own termination set counts {INSIDE}. Per ladder "
-        "the best member, as in the paper, with mean, worst and validated member beside it; then the mean over "
-        "ladders. Oracle termination ends options at the true sub-goal: what is left to it is how well "
-        "policies were learned."
-    )
-    rows = _ordered(distance["over_ladders"])
-    short = [f"{entry['method']}, {_group(entry)}" for entry in distance["over_ladders"] if entry["incomplete_seeds"]]
-    left = f" Seeds that lack a ladder are left out: {'; '.join(short)}." if short else ""
-    caption = (
-        "Distance of the best, the validated, the mean and the worst member, mean over ladders; mean over seeds ± "
-        "standard deviation over seeds. ± exec.: the best member's standard deviation over its last "
-        f"{LAST} executions, mean over ladders and seeds. Shares of the best member's executions: at sub-goal, "
-        f"within {NEAR} of the true one and not begun inside; inside, begun in its own termination set; timed out; "
-        f"died. A death or a time-out there counts as both.{left}"
-    )
-    pairs = page.comparison_tables(material.comparisons("distance"), "ladder, N and seed")
-    table = page.table(OVER_LADDERS, rows, tight=True, caption=caption)
-    where = (
-        f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "
-        "not drawn none or few did. Circles: at the true sub-goal. Crosses: anywhere else, by the member's own "
-        "prediction, out of time, or dead. Squares: executions that began inside the option's own termination set."
-    )
-    return [
-        page.section("distance", "Options on ladders", [text], [bars, table, *pairs]),
-        page.section("stops", "Where options stop on the ladders", [where] if distance["shown"] else [], stops),
-    ]
-
-
-def _ordered(rows: Sequence[Entry]) -> list[Entry]:
-    """By N, then as they come; those without N last."""
-    return sorted(rows, key=lambda entry: (entry["groups"] is None, entry["groups"] or 0))
-
-
-def figures(material: Material) -> list[Drawn]:
+def figures(results: Results) -> Iterator[Drawn]:
     """Figures 4 and 5."""
-    distance, title = material.metrics["distance"], "Figure 5: where executions stopped"
-    if not distance["options"]:
-        return []
-    stops = [_scatter(material, figure, index) for index, figure in enumerate(distance["shown"])]
-    return [_bars(material), *(stops or [Drawn("figure5", title, None, missing=NO_PICTURES)])]
+    if not results.facts["ladders"]:
+        return
+    table = tables(results)["distance"]
+    best = table[table["quantity"] == "best"].sort_values("N", kind="stable", na_position="last")
+    if len(best):
+        yield Drawn("figure4", "Figure 4: distance to the true sub-goal", distance_bars(best, _each_seed(results)))
+    for figure in results.facts["stops"]:
+        suffix = "" if figure["N"] is None else f"-N{figure['N']}"
+        pictures = [(room, results.arrays[f"pictures/{room}"]) for room in figure["rooms"]]
+        options = []
+        for option in figure["options"]:
+            of_option = results.within(option["stops"])
+            rooms = of_option["positions"][:, 0]
+            options.append((option["method"], rooms, of_option["pixels"], of_option["fates"]))
+        drawn = stops_over_rooms(pictures, options)
+        yield Drawn(f"figure5-{figure['ladder']}{suffix}", "Figure 5: where executions stopped", drawn, figure)
 
 
-def _bars(material: Material) -> Drawn:
-    distance, name = material.metrics["distance"], "Figure 4: distance to the true sub-goal"
-    rows = [entry for entry in _ordered(distance["over_ladders"]) if entry["best"]["mean"] is not None]
-    name_of, bars = page.method_of(distance["options"]), []
-    for entry in rows:
-        mean, deviation = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
-        each = [seed for seed in entry["each_seed"] if seed is not None]
-        bars.append((name_of(entry), _group(entry), mean, deviation, each))
-    names = list(dict.fromkeys(name for name, *_ in bars if not name.startswith(ORACLE)))
-    drawn = distance_bars(bars, names, INSIDE) if bars else None
-    seeds = page.spans({row["seed"] for row in distance["options"]})
-    runs = f"Ladders: {page.listed(distance['over_ladders'][0]['ladders'])}; seeds: {seeds}."
-    caption = (
-        "Figure 4 of the paper: distance of the best member of each ladder, mean over ladders; bars: mean over seeds, "
-        "whiskers: ± one standard deviation over seeds, dots: each seed. Lower is better. The paper's error bars are "
-        "the deviation over the last 100 executions instead: in the table."
-    )
-    return Drawn("figure4", name, drawn, caption, runs, "No seed has executions on all ladders of the run.")
+def _each_seed(results: Results) -> pd.DataFrame:
+    """The best member's distance of each seed, mean over ladders."""
+    numbers = results.numbers[results.numbers["ladder"] != ""]
+    runs = per_run(numbers, "distance", member=BEST, name="best")
+    return _over_ladders(runs, len(results.facts["ladders"]))
 
 
-def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
-    columns, notes = [], []
-    for column in figure["columns"]:
-        place = f"stops/{column['path']}/{column['option']}"
-        positions, ends = material.arrays[f"{place}/positions"], material.arrays[f"{place}/fates"]
-        columns.append((column["method"], positions[:, 0], material.arrays[f"{place}/pixels"], ends))
-        elsewhere = int((~np.isin(positions[:, 0], figure["rooms"])).sum())
-        hits, inside = int((ends == HIT).sum()), int((ends == BEGAN_INSIDE).sum())
-        more = f", {inside} began inside" if inside else ""
-        more += f", {elsewhere} in rooms not drawn" if elsewhere else ""
-        notes.append(
-            f"{column['method']}: member {column['member']}, {hits} of {len(ends)} at the sub-goal{more}, "
-            f"distance {page.fixed(column['distance'], 1)}"
-        )
-    pictures = [(room, material.arrays[f"pictures/{room}"]) for room in figure["rooms"]]
-    groups = "" if figure["groups"] is None else f", {_group(figure)}"
-    caption = f"Figure 5 of the paper: ladder {figure['ladder']}{groups}, seed {figure['seed']}. {'. '.join(notes)}."
-    return Drawn(
-        f"figure5-{figure['ladder']}" + ("" if figure["groups"] is None else f"-N{figure['groups']}"),
-        f"Where executions stopped, ladder {figure['ladder']}{groups}",
-        stops_over_rooms(pictures, columns),
-        caption,
-        folded=f"Ladder {figure['ladder']}{groups}" if index else "",
-    )
+def distance_bars(best: pd.DataFrame, seeds: pd.DataFrame) -> Figure:
+    """Figure 4: the best member's distance; lower is better. A line marks ``INSIDE`` if it is near.
 
-
-def distance_bars(
-    bars: Sequence[tuple[str, str, float, float, Sequence[float]]], names: Sequence[str], inside: float
-) -> Figure:
-    """Figure 4: the best member's distance; lower is better. A line marks ``inside`` if it is near.
-
-    A bar is method, group, mean, standard deviation (NaN for one seed) and the seeds' own values; groups stand side by
-    side. Methods are coloured in the order of ``names``, others grey.
+    ``best`` is of :func:`tables`, methods side by side for each N; ``seeds`` their values, drawn as dots.
     """
-    with drawing(3.1, 2, handlelength=2.6) as (figure, axes):
-        groups = grouped(bars, itemgetter(1))
-        highest = max((mean + np.nan_to_num(deviation) for _, _, mean, deviation, _ in bars), default=1.0)
-        for place, group in enumerate(groups.values()):
-            width = min(0.26, 0.84 / len(group))
-            for index, (name, _, mean, deviation, seeds) in enumerate(group):
-                x = place + (index - (len(group) - 1) / 2) * width
-                turn, method = divmod(names.index(name), len(METHOD_COLOURS)) if name in names else (0, -1)
-                colour = METHOD_COLOURS[method] if method >= 0 else GREY
-                hatch = HATCHES[turn % len(HATCHES)]
-                look: dict[str, Any] = {"color": colour, "edgecolor": INK, "linewidth": 0, "alpha": 0.8, "hatch": hatch}
-                axes.bar(x, mean, width * 0.92, label=name, **look)
-                if np.isfinite(deviation):
-                    axes.errorbar(x, mean, deviation, color=INK, capsize=3, linewidth=1.2)
-                axes.plot(np.full(len(seeds), x), seeds, ".", color=INK, markersize=5, alpha=0.7)
-        if highest > inside / 2:
-            axes.axhline(inside, color=GREY, linewidth=1.2, linestyle=":", label="began inside its own termination set")
-        axes.set_xticks(range(len(groups)), list(groups))
+    methods = [name for name in best["method"].unique() if not name.startswith(ORACLE)]
+    groups = list(best["N"].unique())
+    with styled():
+        figure, axes = plot(3.1)
+        for place, number in enumerate(groups):
+            alike = best[best["N"].isna() if pd.isna(number) else best["N"] == number]
+            width = min(0.26, 0.84 / len(alike))
+            for index, (_, row) in enumerate(alike.iterrows()):
+                x = place + (index - (len(alike) - 1) / 2) * width
+                is_method = row["method"] in methods
+                colour = PALETTE[methods.index(row["method"]) % len(PALETTE)] if is_method else GREY
+                axes.bar(x, row["mean"], width * 0.92, color=colour, alpha=0.8, label=row["method"])
+                if pd.notna(row["standard_deviation"]):
+                    axes.errorbar(x, row["mean"], row["standard_deviation"], color=INK, capsize=3, linewidth=1.2)
+                same_n = seeds["N"].isna() if pd.isna(number) else seeds["N"] == number
+                same = (seeds["method"] == row["method"]) & same_n & (seeds["sub_goal"] == row["sub_goal"])
+                axes.plot(np.full(same.sum(), x), seeds["value"][same], ".", color=INK, markersize=5, alpha=0.7)
+        highest = (best["mean"] + best["standard_deviation"].fillna(0)).max()
+        if highest > INSIDE / 2:
+            axes.axhline(INSIDE, color=GREY, linewidth=1.2, linestyle=":", label="began inside its own termination set")
+        names = ["true sub-goal" if pd.isna(number) else f"N={number}" for number in groups]
+        axes.set_xticks(range(len(groups)), names)
         axes.set_xlim(-0.6, len(groups) - 0.4)
         axes.grid(visible=False, axis="x")
         axes.set_ylim(0, None)
         axes.set_ylabel("distance to the true sub-goal\n(units of position)")
+        legend_below(figure, [axes], 2)
     return figure
 
 
@@ -489,42 +354,39 @@ def stops_over_rooms(
     What became of an execution is told by shape and by colour. A picture is (room, uint8 (H, W, 3)), an option its
     title and of the stops their rooms (n,), pixels (n, 2) in the pictures and :func:`fates` (n,).
     """
+    panels = [(option, picture) for option in options for picture in pictures]
+    columns = max(2, len(pictures))
+    rows = math.ceil(len(panels) / columns)
+    height, width = pictures[0][1].shape[:2]
     with styled():
-        columns = max(2, len(pictures))
-        panels = list(product(options, pictures))
-        rows = -(-len(panels) // columns)
-        height, width = pictures[0][1].shape[:2]
-        wide = (WIDTH - (columns - 1) * GAP) / columns  # inches
-        high = wide * height / width
-        size = (WIDTH, rows * (high + TITLE) + TITLE)
-        figure = Figure(figsize=size)
-        for index, ((title, rooms, pixels, ends), (room, picture)) in enumerate(panels):
-            row, column = divmod(index, columns)
-            left, bottom = column * (wide + GAP), size[1] - (row + 1) * (high + TITLE)
-            place = figure.add_axes((left / size[0], bottom / size[1], wide / size[0], high / size[1]))
+        high = WIDTH / columns * height / width
+        figure = Figure(figsize=(WIDTH, rows * (high + 0.24) + 0.24))
+        places = figure.subplots(rows, columns, squeeze=False)
+        for place in places.flat:
             place.set_axis_off()
+        for place, ((title, rooms, pixels, ends), (room, picture)) in zip(places.flat, panels, strict=False):
             place.imshow(picture, interpolation="none", aspect="auto")
             for fate, (_, mark) in STOPS.items():
                 x, y = pixels[(rooms == room) & (ends == fate)].T
                 place.plot(x, y, alpha=0.75, **mark)
-            first = room == pictures[0][0]
-            name = f"{title}, room {room}" if first else f"room {room}"
+            name = f"{title}, room {room}" if room == pictures[0][0] else f"room {room}"
             place.set_title(name, pad=3, fontsize=9.5 if columns == 2 else 8)
-        handles, labels = [Line2D([], [], **mark) for _, mark in STOPS.values()], [name for name, _ in STOPS.values()]
-        figure.legend(handles, labels, loc="lower left", ncols=3, handletextpad=0.2, columnspacing=1.2, borderpad=0)
-        return figure
+        handles = [Line2D([], [], **mark) for _, mark in STOPS.values()]
+        labels = [name for name, _ in STOPS.values()]
+        figure.legend(handles, labels, loc="outside lower left", ncols=3, handletextpad=0.2, columnspacing=1.2)
+    return figure
 
 
-QUESTION = Question(
-    rows=rows,
-    view=view,
-    missing=missing,
-    pairs=PAIRS,
-    summary=summary,
-    sections=sections,
-    figures=figures,
-    needed={
-        "figure4": "options artefacts with executions.csv: train-options with --set start=LADDER",
-        "figure5": "options artefacts with executions.csv, of a domain that draws its rooms",
-    },
-)
+def missing(work: Work) -> list[str]:
+    """Spec F3, F4: the options that are not there, of a run with ladders."""
+    contents = work.contents
+    lines = [
+        f"no executions.csv in {contents.name(artefact)}: its domain tells no distance" for artefact in contents.silent
+    ]
+    if not contents.ladders:
+        return [*lines, "no options of a ladder (Figures 4 and 5)"] if work.validated else lines
+    methods = [work.place(artefact)["method"] for artefact in contents.ladders]
+    lines += lacking(methods, "options", "Figures 4 and 5")
+    if any(method.startswith(ORACLE) for method in methods):
+        return lines
+    return [*lines, "no options with oracle terminations beside them"]

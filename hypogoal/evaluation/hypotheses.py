@@ -1,176 +1,198 @@
-"""How good hypotheses are on layouts that no data came from, and how much members differ (Spec F1, F2)."""
+"""How good hypotheses are on layouts that no data came from, and how much members differ (Spec F1, F2, H1).
+
+Also whatever their thresholds, and without the luck of picking the best; and which planted features they have found.
+"""
 
 import math
-from collections.abc import Iterator, Sequence
-from operator import itemgetter
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
-from rich.table import Table as Printed
+from numpy.typing import NDArray
 
-from hypogoal.evaluation import page
-from hypogoal.evaluation.judging import Judgement, Work
-from hypogoal.evaluation.numbers import Metrics, ensemble_title, grouped
-from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, drawing
-from hypogoal.evaluation.table import (
-    Number,
-    Pairs,
-    Row,
-    Table,
-    by_fields,
-    rows_by_member,
-    rows_of,
-    select,
-    tabulate,
-    with_members,
-)
-from hypogoal.hypotheses.scores import mean_disagreement, member_scores
+from hypogoal.evaluation.house import at_least, over, pairs, per_run, tidy, tidy_members
+from hypogoal.evaluation.judging import Judged, Judgement, Work
+from hypogoal.evaluation.page import Drawn, Results, displayed, mean, pairs_displayed, spans, spread
+from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, legend_below, plot, styled
+from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, mean_disagreement, member_scores, ranking
 
+TITLE = "Hypotheses"
 WHICH = ("best", "mean", "worst")
-STATES = ("unlabelled", "heldout")
-TABLE = Table(
-    {"name": "method", "sub_goal": "sub_goal"},
-    {
-        **{which: Number("balanced_accuracy", "heldout", "balanced accuracy", which) for which in WHICH},
-        **{f"disagreement_{on}": Number("disagreement", on, "share of states", cell=(on,)) for on in STATES},
-    },
-    "ensembles",
-)
+HELDOUT = "heldout"
+PLANTED = "planted_"  # begins the names of origins that say whether a state has a planted feature
+OWNED_FROM, IGNORED_TO = 0.95, 0.6  # areas under the ROC curve
+BY = {"method": "ensemble", "sub_goal": "sub-goal"}
+COLUMNS = {which: (which, spread(3)) for which in WHICH} | {"disagree": ("disagreement_heldout", spread(3))}
+KNOWN = ("ranking", "cross_fitted_ranking", "cross_fitted_accuracy", "at_best_threshold", "calibration_gap")
 
 
-def look(work: Work, judgement: Judgement) -> Iterator[Row]:
+def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     """Spec F1, F2: each member on held-out states, pooled over layouts, and how much members disagree."""
-    split, judged, place = judgement.split, judgement.judged, work.place(judgement)
-    layouts = split.origins.get("layout_seed", np.zeros(0))
-    calls = judged.unlabelled.mean(0) if len(judged.unlabelled) else np.full(judged.unlabelled.shape[1], math.nan)
-    more = {"positive_unlabelled": calls, "threshold": judged.thresholds.astype(np.float64)}
-    yield from rows_by_member(member_scores(judged.predictions, split.labels) | more, **place, scope="heldout")
-    counts = {"states": len(split.labels), "positives": int(split.labels.sum()), "layouts": len(np.unique(layouts))}
-    yield from rows_of(counts | {"disagreement": mean_disagreement(judged.predictions)}, **place, scope="heldout")
-    yield from rows_of({"disagreement": mean_disagreement(judged.unlabelled)}, **place, scope="unlabelled")
+    split, judged = judgement.split, judgement.judged
+    place = work.place_of(judgement)
+    unlabelled = judged.unlabelled
+    if len(unlabelled):
+        positive = unlabelled.mean(axis=0)
+    else:
+        positive = np.full(unlabelled.shape[1], math.nan)
+    columns = {"positive_unlabelled": positive, "threshold": judged.thresholds.astype(np.float64)}
+    columns |= member_scores(judged.predictions, split.labels)
+    yield tidy_members(columns, **place, scope=HELDOUT)
+    counts = {
+        "states": len(split.labels),
+        "positives": int(split.labels.sum()),
+        "layouts": len(np.unique(split.origins.get("layout_seed", []))),
+        "disagreement": mean_disagreement(judged.predictions),
+    }
+    yield tidy(counts, **place, scope=HELDOUT)
+    yield tidy({"disagreement": mean_disagreement(unlabelled)}, **place, scope="unlabelled")
+    yield from _knowledge_of(judgement, place)
+    planted = {name.removeprefix(PLANTED): values for name, values in split.origins.items() if name.startswith(PLANTED)}
+    if planted:
+        yield tidy({"coverage": coverage(judged.probabilities, planted)}, **place, scope=HELDOUT)
 
 
-def of_layouts(rows: Sequence[Row]) -> list[Row]:
-    """The rows of ensembles but those judged room by room, which ``rooms`` has."""
-    by_room = {row.artefact for row in rows if row.scope == "unseen"}
-    return [row for row in select(rows, scope=STATES) if row.artefact not in by_room]
+def _knowledge_of(judgement: Judgement, place: Mapping[str, Any]) -> Iterator[pd.DataFrame]:
+    """What members know of contexts that training did not see."""
+    origins = judgement.split.origins
+    by_room = "seen" in origins
+    unseen = origins["seen"] == 0 if by_room else np.ones(len(judgement.split.labels), dtype=np.bool_)
+    contexts = next((origins[name][unseen] for name in ("layout_seed", "room") if name in origins), None)
+    columns, crossed = knowledge(judgement.judged, unseen, judgement.split.labels, contexts)
+    if by_room:  # ``rooms`` has their ranking
+        del columns["ranking"]
+    scope = "unseen" if by_room else HELDOUT
+    yield tidy_members(columns, **place, scope=scope)
+    yield tidy(crossed, **place, scope=scope)
 
 
-PAIRS = Pairs(
-    "hypotheses",
-    {f"balanced accuracy, {which} member": TABLE.numbers[which] for which in ("best", "mean")},
-    of_layouts,
-    ranked=True,
-)
+def knowledge(
+    judged: Judged, inside: NDArray[np.bool_], labels: NDArray[np.bool_], contexts: NDArray[np.int64] | None
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
+    """What K members know of the states ``inside`` (N,), n of them; ``contexts`` (n,): layouts or rooms.
+
+    Returns of each member (K,) ``ranking``, ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much
+    of that its own threshold loses); and of the best member, picked on half of the contexts and scored on the other,
+    ``cross_fitted_ranking`` and ``cross_fitted_accuracy``, NaN for fewer than two contexts.
+    """
+    probabilities, predictions = judged.probabilities[inside], judged.predictions[inside]
+    labels = labels[inside]
+    accuracy = member_scores(predictions, labels)["balanced_accuracy"]
+    best = best_threshold(probabilities, labels)[1]
+    columns = {
+        "ranking": ranking(probabilities, labels),
+        "at_best_threshold": best,
+        "calibration_gap": best - accuracy,
+    }
+    first = None if contexts is None else halves(contexts)
+    if first is None:
+        return columns, {"cross_fitted_ranking": math.nan, "cross_fitted_accuracy": math.nan}
+    ranked, accuracies = [], []
+    for half in (first, ~first):
+        ranked.append(ranking(probabilities[half], labels[half]))
+        accuracies.append(member_scores(predictions[half], labels[half])["balanced_accuracy"])
+    crossed = {"cross_fitted_ranking": cross_fitted(*ranked), "cross_fitted_accuracy": cross_fitted(*accuracies)}
+    return columns, crossed
 
 
-def view(work: Work) -> dict[str, Any]:
-    """Over seeds; and of every ensemble and sub-goal its members and other numbers, by scope."""
-    by_path = {work.contents.name(artefact): artefact for artefact in work.contents.ensembles}
-    judged = [row for row in work.rows if row.artefact in by_path]
-    names, ensembles = dict(zip(by_path, work.ensemble_names[0], strict=True)), []
-    for (path, method, groups, seed), rows in by_fields(judged, "artefact", "method", "N", "seed").items():
-        goals = [
-            {"sub_goal": sub_goal, **{entry.pop("scope"): entry for entry in with_members(of_goal, scope="scope")}}
-            for (sub_goal,), of_goal in by_fields(rows, "sub_goal").items()
-        ]
-        entry = {"path": path, "name": names[path], "seed": seed, "members": by_path[path].config["members"]}
-        ensembles.append(entry | {"method": method, "groups": groups, "sub_goals": goals})
-    return {"hypotheses": tabulate(of_layouts(work.rows), TABLE), "ensembles": ensembles}
+def coverage(probabilities: NDArray[np.float32], planted: Mapping[str, NDArray[np.int64]]) -> float:
+    """Spec H1: the share of planted features (N,) that some member (N, K) has found: it ranks by it, and by no other.
+
+    Every combination of features is equally frequent, so an area under the ROC curve of .5 is blindness to a feature.
+    """
+    areas = np.stack([ranking(probabilities, values > 0) for values in planted.values()], axis=1)
+    ranks = at_least(areas, OWNED_FROM)
+    ignored = at_least(IGNORED_TO - 0.5, np.abs(areas - 0.5))
+    owned = ranks & (ignored.sum(axis=1, keepdims=True) == areas.shape[1] - 1)
+    return float(owned.any(axis=0).mean())
 
 
-CAPTION = (
-    "Balanced accuracy on held-out states of the best, mean and worst member, and the share of states on which two "
-    "members disagree (mean over pairs); mean over ensemble seeds ± standard error."
-)
-ENSEMBLE = page.label("ensemble", lambda entry: ensemble_title(str(entry["name"])), once=True)
-SCORES = tuple(page.number(which, which, page.spread, 3) for which in WHICH)
-SEEDS = page.number("seeds", "ensembles")
-DISAGREE = page.number("disagree", "disagreement_heldout", page.spread, 3)
-HYPOTHESES = (
-    *(ENSEMBLE, page.label("sub-goal", "sub_goal"), *SCORES),
-    page.number("disagree, unlabelled", "disagreement_unlabelled", page.spread, 3),
-    DISAGREE._replace(title="disagree, held-out"),
-    SEEDS,
-)
+def of_layouts(results: Results) -> pd.DataFrame:
+    """The numbers of ensembles but those judged room by room, which ``rooms`` has."""
+    numbers = results.of(scope=[HELDOUT, "unlabelled"])
+    return numbers[~numbers["artefact"].isin(results.of(scope="unseen")["artefact"])]
 
 
-def summary(metrics: Metrics) -> list[Printed]:
-    """Balanced accuracy of the best, mean and worst member on held-out states."""
-    columns = (ENSEMBLE._replace(title="method"), page.label("sub-goal", "sub_goal"), *SCORES, DISAGREE)
-    title = "Balanced accuracy on held-out states: best, mean and worst member"
-    return [page.terminal(title, columns, metrics["hypotheses"])] if metrics["hypotheses"] else []
+def tables(results: Results) -> dict[str, pd.DataFrame]:
+    """Per kind of ensemble and sub-goal, over seeds; the first against the others."""
+    numbers = of_layouts(results)
+    accuracies = [per_run(numbers, "balanced_accuracy", HELDOUT, which, which) for which in WHICH]
+    others = [per_run(numbers, name, HELDOUT) for name in (*KNOWN, "coverage")]
+    others.append(per_run(numbers, "disagreement", HELDOUT, name="disagreement_heldout"))
+    others.append(per_run(numbers, "disagreement", "unlabelled", name="disagreement_unlabelled"))
+    runs = pd.concat([*accuracies, *others])
+    return {"hypotheses": over(runs, ["method", "sub_goal"]), "hypotheses-pairs": pairs(compared(results))}
 
 
-def sections(material: Material) -> list[Block]:
-    """Figure 3's question on held-out layouts: best, mean and worst member, and how much members disagree."""
-    metrics = material.metrics
-    if not metrics["hypotheses"]:
-        return []
-    judged = (
-        "Members are judged on layouts whose states were in no training set."
-        if _has_layouts(metrics)
-        else "Members are judged on the held-out states of the data, which say nothing of other contexts where they "
-        "are a share of the labelled ones."
-    )
-    text = (
-        f"{judged} The best member shows whether a hypothesis that holds there is in the ensemble at all; mean and "
-        "worst show what the agent has to choose among. A member that always gives the same answer has 0.5."
-    )
-    blocks = [page.shown(material, figure) for figure in figures(material)]
-    blocks.append(page.table(HYPOTHESES, metrics["hypotheses"], caption=CAPTION))
-    blocks += page.comparison_tables(material.comparisons("hypotheses"), "ensemble seed and sub-goal")
-    return [page.section("hypotheses", "Hypotheses", [text], blocks)]
+def compared(results: Results) -> pd.DataFrame:
+    """The numbers of runs by which ensembles are compared."""
+    numbers = of_layouts(results)
+    parts = []
+    for which in ("best", "mean"):
+        name = f"balanced accuracy, {which} member"
+        parts.append(per_run(numbers, "balanced_accuracy", HELDOUT, which, name))
+    return pd.concat(parts)
 
 
-def _has_layouts(metrics: Entry) -> bool:
-    """Whether held-out states are of layouts, as collected ones are, and not only states, as imported ones."""
-    return any(goal["heldout"]["layouts"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
-
-
-def figures(material: Material) -> list[Drawn]:
-    """Figure 3's quantity for one labelled context."""
-    entries = material.metrics["hypotheses"]
-    drawn = best_mean_worst_members(entries)
-    seeds = {ensemble["seed"] for ensemble in material.metrics["ensembles"]}
-    where = "layouts, pooled over them" if _has_layouts(material.metrics) else "states"
-    caption = (
-        f"The quantity of the paper's Figure 3, for one labelled context: balanced accuracy on held-out {where}. "
-        "Filled: best member; bar: mean of members; hollow: worst member; each a mean over ensemble seeds. "
-        "Dotted: always the same answer."
-    )
-    title, nothing = "Members' balanced accuracy on held-out states", "No held-out states have both classes."
-    return [Drawn("members", title, drawn, caption, f"Ensemble seeds {page.spans(seeds)}.", nothing)]
-
-
-def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
-    """Balanced accuracy on held-out layouts by kind of ensemble, from entries of ``TABLE``; None if undefined."""
-    means = [entry[which]["mean"] for entry in entries for which in WHICH]
-    lowest = min((mean for mean in means if mean is not None), default=None)
-    if lowest is None:
+def context(results: Results) -> dict[str, Any] | None:
+    """For the template: the members' table, pairs, and whether held-out states are of layouts."""
+    if of_layouts(results).empty:
         return None
-    kinds, sub_goals = grouped(entries, itemgetter("name")), list(dict.fromkeys(map(itemgetter("sub_goal"), entries)))
-    step = 0.8 / len(kinds)
-    with drawing(1.2 + len(sub_goals) * max(0.42, 0.2 * len(kinds)), 3) as (figure, axes):
-        for index, (name, alike) in enumerate(kinds.items()):
-            values = np.full((len(sub_goals), len(WHICH)), math.nan)
-            for entry in alike:
-                values[sub_goals.index(entry["sub_goal"])] = np.array([entry[which]["mean"] for which in WHICH], float)
-            y = np.arange(len(sub_goals), dtype=np.float64) + (index - (len(kinds) - 1) / 2) * step
+    computed = tables(results)
+    more = {
+        "disagree, unlabelled": ("disagreement_unlabelled", spread(3)),
+        "ranking": ("ranking", spread(3)),
+        "ranking, cross-fitted best": ("cross_fitted_ranking", spread(3)),
+        "cross-fitted best": ("cross_fitted_accuracy", spread(3)),
+        "at best threshold": ("at_best_threshold", spread(3)),
+    }
+    has_coverage = (computed["hypotheses"]["quantity"] == "coverage").any()
+    first = COLUMNS | ({"coverage": ("coverage", spread(2))} if has_coverage else {})
+    printed = {title: (quantity, mean(3)) for title, (quantity, _) in COLUMNS.items()}
+    return {
+        "table": displayed(computed["hypotheses"], BY, first),
+        "more": displayed(computed["hypotheses"], BY, more),
+        "printed": displayed(computed["hypotheses"], BY, printed),
+        "pairs": pairs_displayed(computed["hypotheses-pairs"], {}),
+        "has_layouts": bool(results.of(quantity="layouts")["value"].max() > 0),
+        "seeds": spans(of_layouts(results)["seed"]),
+    }
+
+
+def figures(results: Results) -> Iterator[Drawn]:
+    """Figure 3's quantity for one labelled context."""
+    if of_layouts(results).empty:
+        return
+    table = tables(results)["hypotheses"]
+    if table["quantity"].isin(WHICH).any():
+        yield Drawn("members", "Members' balanced accuracy on held-out states", members_figure(table))
+
+
+def members_figure(table: pd.DataFrame) -> Figure:
+    """Balanced accuracy by sub-goal and kind of ensemble: the best member filled, a bar the mean, hollow the worst."""
+    means = table[table["quantity"].isin(WHICH)].pivot_table(
+        index=["method", "sub_goal"], columns="quantity", values="mean", sort=False
+    )
+    sub_goals = list(means.index.unique("sub_goal"))
+    methods = list(means.index.unique("method"))
+    step = 0.8 / len(methods)
+    with styled():
+        figure, axes = plot(1.2 + len(sub_goals) * max(0.42, 0.2 * len(methods)))
+        for index, method in enumerate(methods):
+            values = means.loc[method].reindex(sub_goals)
+            y = np.arange(len(sub_goals)) + (index - (len(methods) - 1) / 2) * step
             colour, marker = PALETTE[index % len(PALETTE)], MARKERS[index % len(MARKERS)]
-            axes.hlines(y, values[:, 2], values[:, 0], color=colour, linewidth=1.6, alpha=0.6)
-            axes.plot(values[:, 0], y, marker, color=colour, markersize=7, label=name)
-            axes.plot(values[:, 1], y, "|", color=colour, markersize=10, markeredgewidth=1.8)
-            axes.plot(values[:, 2], y, marker, color=colour, markersize=5, fillstyle="none")
+            axes.hlines(y, values["worst"], values["best"], color=colour, linewidth=1.6, alpha=0.6)
+            axes.plot(values["best"], y, marker, color=colour, markersize=7, label=method)
+            axes.plot(values["mean"], y, "|", color=colour, markersize=10, markeredgewidth=1.8)
+            axes.plot(values["worst"], y, marker, color=colour, markersize=5, fillstyle="none")
         axes.axvline(0.5, color=GREY, linewidth=1.2, linestyle=":")
         axes.set_yticks(range(len(sub_goals)), sub_goals)
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        axes.set_xlim(min(0.45, lowest - 0.03), 1.02)
-        axes.set_xlabel("balanced accuracy on held-out states (0.5: uniform-random)")
+        axes.set_xlim(min(0.45, means["worst"].min() - 0.03), 1.02)
+        axes.set_xlabel("balanced accuracy on held-out states")
+        legend_below(figure, [axes], 3)
     return figure
-
-
-QUESTION = Question(look=look, view=view, pairs=PAIRS, summary=summary, sections=sections, figures=figures)

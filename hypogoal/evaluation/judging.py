@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,20 +14,17 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.processes import in_processes, prepare
 from hypogoal.core.progress import Progress
-from hypogoal.data import States, fixed, open_dataset
+from hypogoal.data import States, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
-from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
-from hypogoal.evaluation.run import Contents
-from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.names import places_of
+from hypogoal.evaluation.run import Contents, most_used
 from hypogoal.observations import Observations, fields_of
 
 if TYPE_CHECKING:
-    from hypogoal.evaluation.curves import Run
     from hypogoal.hypotheses.ensemble import Ensemble
 
 # Bytes of states times members from which on more processes pay for their start (3 s): about 100 s of Montezuma's.
 SPREAD_FROM = 4e9
-BASELINE = "the mean of what members see of the unlabelled states"  # that attributions are against
 WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"}  # values of the origin ``seen``
 
 
@@ -76,23 +71,17 @@ class Judgement:
         seen = ensemble.see(self.split.observations[states])
         return ensemble, seen, mean_state(ensemble.see(self.unlabelled))
 
-    def write_states(self, group: Any, picked: Sequence[tuple[int, str]]) -> None:
-        """Held-out states, what members say of them, and where they are from.
+    def write_states(self, group: Any, states: NDArray[np.int64]) -> list[str]:
+        """Put held-out states (n,) and what members predict of them into ``group``; returns where they are from.
 
-        ``picked`` is n times (index in the split, kind). ``group`` gets ``observations``, ``labels`` and
-        ``layout_seeds`` (-1: none) (n,), ``probabilities`` and ``verdicts`` (n, K), and as JSON lists of n texts
-        ``kinds`` and ``places``.
+        ``observations`` and ``labels`` (n,), ``probabilities`` and ``predictions`` (n, K).
         """
-        split, index = self.split, np.array([index for index, _ in picked], dtype=np.int64)
-        for name, part in parts_of(split.observations[index], "observations"):
+        for name, part in parts_of(self.split.observations[states], "observations"):
             group[name] = part
-        group["probabilities"] = self.judged.probabilities[index]
-        group["verdicts"] = self.judged.predictions[index]
-        group["labels"] = split.labels[index]
-        seeds = split.origins.get("layout_seed")
-        group["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
-        group["kinds"] = fixed(json.dumps([kind for _, kind in picked]))
-        group["places"] = fixed(json.dumps([place_of(split.origins, state) for state in index]))
+        group["probabilities"] = self.judged.probabilities[states]
+        group["predictions"] = self.judged.predictions[states]
+        group["labels"] = self.split.labels[states]
+        return [place_of(self.split.origins, state) for state in states]
 
 
 def parts_of(observations: Observations, name: str) -> Iterator[tuple[str, Observations]]:
@@ -119,43 +108,21 @@ class Work:
     arrays: Any  # ``arrays.h5``, to be written into
     progress: Progress  # is told of each sub-goal judged and looked at, each run, and each layout that one plays
     layouts: tuple[int, ...] = ()  # on which trained agents are to play
-    shown: int | None = None  # the ensemble whose states are shown; None where there is none
-    browsed: int | None = None  # the ensemble whose states are browsed; None where there is none
-    # What questions keep of the states that they were shown, by their own names.
-    looked: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
-    agents: Mapping[str, Sequence[Run]] = field(default_factory=dict)  # trained ones, by name
-    rows: list[Row] = field(default_factory=list)  # the numbers so far
-    metrics: dict[str, Any] = field(default_factory=dict)  # their view so far, see ``Question.view``
+    facts: dict[str, Any] = field(default_factory=dict)  # what is not a number, for ``run.json``
+    # The member that labelled rooms pick, by the ensemble's path and the sub-goal.
+    validated: dict[tuple[str, str], int] = field(default_factory=dict)
 
-    def place(self, judgement: Judgement) -> dict[str, Any]:
-        """Where the numbers of a sub-goal's members stand in the table; all N are one method."""
-        artefact, by_room = self.contents.ensembles[judgement.number], "seen" in judgement.split.origins
-        names, groups = self.ensemble_names[by_room], groups_of(artefact.config) if by_room else None
-        place = {"method": names[judgement.number], "N": groups, "seed": artefact.seed}
-        return {**place, "artefact": self.contents.name(artefact), "sub_goal": judgement.case.sub_goal}
+    def __post_init__(self) -> None:
+        self.places = places_of(self.contents)
+        self.browsed = most_used(self.contents)
 
-    @cached_property
-    def ensemble_names(self) -> tuple[list[str], list[str]]:
-        """Names of the run's ensembles: as they are, and as methods."""
-        configs = [artefact.config for artefact in self.contents.ensembles]
-        return ensemble_names(configs), method_names(configs)
+    def place(self, artefact: Artefact) -> dict[str, Any]:
+        """Where the numbers of an artefact of the run stand in the table: its method, N, ladder, layout, seed, path."""
+        return self.places[self.contents.name(artefact)]
 
-    @cached_property
-    def agent_of(self) -> dict[str, str]:
-        """The names of agents by their artefacts' paths."""
-        return {run.path: name for name, runs in self.agents.items() for run in runs}
-
-    def artefact(self, path: str) -> Artefact:
-        """The agent's artefact of this path in the run."""
-        return next(artefact for artefact in self.contents.agents if self.contents.name(artefact) == path)
-
-    def kept(self, question: str, ensemble: int | None) -> dict[str, Any] | None:
-        """What a question keeps of the one ensemble whose states it looked at; None where it looked at none."""
-        if ensemble is None or not self.looked[question]:
-            return None
-        source = self.contents.ensembles[ensemble]
-        source_facts = {"ensemble": self.contents.name(source), "seed": source.seed, "baseline": BASELINE}
-        return {**source_facts, "sub_goals": self.looked[question]}
+    def place_of(self, judgement: Judgement) -> dict[str, Any]:
+        """Where the numbers of a sub-goal's members stand."""
+        return {**self.place(self.contents.ensembles[judgement.number]), "sub_goal": judgement.case.sub_goal}
 
 
 def cases_of(ensembles: Sequence[Artefact]) -> list[tuple[int, Case]]:

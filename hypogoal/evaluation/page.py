@@ -1,432 +1,263 @@
-"""The kit of pages: sections made of blocks, plain dictionaries that a template draws (Spec F7).
+"""What a page and a terminal's tables are made from: results, how numbers are written, templates, pictures (Spec F7).
 
-A table is said once, as columns, and drawn here for the page and for the terminal.
+Every sentence is in ``templates/``; a question gives its template what it computed.
 """
 
 import base64
-import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
-from importlib import resources
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
+import jinja2
 import numpy as np
+import pandas as pd
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from hypogoal.core.errors import UserError
-from hypogoal.evaluation.judging import Judgement, Work
-from hypogoal.evaluation.numbers import STUDENT
-from hypogoal.evaluation.pictures import STATES, image_png, reduced
-from hypogoal.evaluation.plots import COLOURS, slug, to_svg
-from hypogoal.evaluation.table import EVALUATE_AGAIN, Pairs, Row
+from hypogoal.core.artefacts import versions
+from hypogoal.evaluation.house import STUDENT
+from hypogoal.evaluation.pictures import image_png, reduced
+from hypogoal.evaluation.plots import to_file
 
-Block = dict[str, Any]
-WIDTH = 79  # of tables in a terminal
-Entry = Mapping[str, Any]
-# What a browser may do with the page. Attributes of style are matplotlib's; they run and fetch nothing.
+WIDTH = 80  # of tables in a terminal
+DASH = "–"
+TEMPLATES = Path(__file__).with_name("templates")
+# What a browser may do with the page: run our own script, show pictures that are in it.
 POLICY = (
-    "default-src 'none'; script-src {script}; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
-    "img-src data:; base-uri 'none'; form-action 'none'"
+    "default-src 'none'; script-src {script}; style-src {style}; img-src data:; base-uri 'none'; form-action 'none'"
 )
-CAPTION = (
-    "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
-    "better, a tie counting half, with its 95 % interval (Student's t, cut at 0 and 1); 0.5: neither is. An interval "
-    "without width means that every pair came out alike, not certainty: see the sign test (two-sided, ties left out). "
-    "n: how many {units} everything is over, each of which counts once, by its mean. Difference: mean of first − "
-    "second, with its 95 % interval (Student's t)."
-)
-DIGITS = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}  # decimals of a difference; else 3
-INTERVALS = (
-    "95 % intervals: of 2 to 7 {units} the mean and Student's t; of more the interquartile mean and a bootstrap (2,000 "
-    "resamples); of one there is none."
-)
+Show = Callable[[Any], str]  # of a row of ``house.over``
 
 
 @dataclass(frozen=True)
-class Material:
-    """What a page is made from."""
+class Drawn:
+    """A figure; ``name`` is its file's, and the id on the page."""
 
-    metrics: Mapping[str, Any]  # what ``metrics.json`` holds
-    arrays: Mapping[str, NDArray[Any]]  # what ``arrays.h5`` holds, by name
-    # Filled while the page is made, to be written as files too.
-    figures: dict[str, Figure] = field(default_factory=dict)
-    drawings: dict[str, str] = field(default_factory=dict)  # the figures' SVG
-    films: Sequence[Block] = ()  # of episodes, see :func:`film`
+    name: str
+    label: str  # what it shows
+    figure: Figure
+    about: Mapping[str, Any] = field(default_factory=dict)  # for its caption
 
-    def comparisons(self, name: str) -> list[Entry]:
-        """One method against the others."""
-        return list(self.metrics["comparisons"][name])
+
+@dataclass(frozen=True)
+class Results:
+    """An evaluated run: what ``numbers.csv``, ``run.json`` and ``arrays.h5`` hold."""
+
+    numbers: pd.DataFrame
+    facts: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def of(self, **fields: Any) -> pd.DataFrame:
+        """The numbers whose columns have these values; a list: any of them."""
+        rows = self.numbers
+        for name, value in fields.items():
+            rows = rows[rows[name].isin(value if isinstance(value, list) else [value])]
+        return rows
 
     def within(self, folder: str) -> dict[str, NDArray[Any]]:
         """The arrays of a folder, by their names in it."""
         start = f"{folder}/"
         return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
-    def termination_states(self, path: str, option: int) -> tuple[NDArray[np.uint8] | None, str]:
-        """The states in which an option of an artefact ends, as an overlay, and how many; None and "" if unknown."""
-        image, counts = self.arrays.get(f"terminations/{path}/{option}"), self.arrays.get(f"{STATES}/{path}/counts")
-        if image is None or counts is None:
-            return image, ""
-        return image, f"{counts[option]:,} state{'' if counts[option] == 1 else 's'}"
 
-    def of_numbers(self) -> bool:
-        """Whether observations are no pictures."""
-        return any(name.startswith("saliency/") and name.endswith("/features") for name in self.arrays)
-
-    def of_ladders(self) -> bool:
-        """Whether the run has anything of labelled ladders."""
-        return bool(self.metrics["rooms"] or self.metrics["distance"]["options"])
-
-    def of_agents(self) -> bool:
-        """Whether it has agents; one with neither, an ensemble alone, say, is taken for one whose are still to come."""
-        return bool(self.metrics["agents"]) or not self.of_ladders()
+def fixed(value: Any, digits: int = 2, scale: float = 1.0) -> str:
+    """A number with a fixed number of decimals; a dash where there is none."""
+    return DASH if pd.isna(value) else f"{scale * value:.{digits}f}"
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A figure, or what it would have needed."""
-
-    name: str  # the file's name in a report, and the id on the page
-    label: str  # what it shows
-    figure: Figure | None  # None where it cannot be drawn
-    caption: str = ""  # with intervals
-    runs: str = ""  # and seeds that it is of, a list that may be long
-    missing: str = ""  # which artefact would be needed
-    folded: str = ""  # what is shown of it on the page until asked for
-    file: str = ""  # the file's name among the paper's figures, where that is another
-    heading: str = ""  # above it on the page
-
-    @property
-    def stem(self) -> str:
-        """The file's name among the paper's figures, without its ending."""
-        return self.file or self.name
+def percent(value: Any) -> str:
+    """0.953 -> '95 %'; a dash where there is none."""
+    return DASH if pd.isna(value) else f"{100 * value:.0f} %"
 
 
-class Column(NamedTuple):
-    """A column of tables: its title, a row's cell, whether it is a number, and of what it is shown once only."""
-
-    title: str
-    of: Callable[[Any], Any]
-    number: bool = False
-    once: Callable[[Any], Any] | None = None
+def between(low: Any, high: Any, digits: int, scale: float = 1.0) -> str:
+    """An interval; nothing where there is none."""
+    return "" if pd.isna(low) else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
 
 
-def label(title: str, key: Any, *, once: Any = None) -> Column:
-    """A column of text; ``key`` is the entry's key, several with dots between, or a function of the entry.
+def mean(digits: int = 2, scale: float = 1.0) -> Show:
+    """Writes the mean."""
+    return lambda row: fixed(row["mean"], digits, scale)
 
-    A cell is left empty where ``once`` of the entry, or with True the cell itself, is what it was in the row above.
+
+def spread(digits: int = 2, scale: float = 1.0, error: str = "standard_error") -> Show:
+    """Writes the mean and, where there are several values, beside it their standard error."""
+
+    def show(row: Any) -> str:
+        wide = row[error]
+        around = "" if pd.isna(wide) else f" ± {scale * wide:.{digits}f}"
+        return fixed(row["mean"], digits, scale) + around
+
+    return show
+
+
+deviation = partial(spread, error="standard_deviation")  # beside the mean the standard deviation over seeds
+
+
+def bounded(digits: int = 2, scale: float = 1.0) -> Show:
+    """Writes the mean or the interquartile mean, whichever the 95 % interval beside it is of."""
+
+    def show(row: Any) -> str:
+        value = row["mean"] if STUDENT in row["interval_over"] else row["iqm"]
+        return fixed(value, digits, scale) + between(row["low"], row["high"], digits, scale)
+
+    return show
+
+
+def displayed(
+    table: pd.DataFrame,
+    by: Mapping[str, str],
+    columns: Mapping[str, tuple[str, Show]],
+    keys: pd.DataFrame | None = None,
+) -> pd.DataFrame:
+    """A table of :func:`house.over` as people read it: a row for each combination of ``by``, whose titles it gives.
+
+    ``columns`` are by title a quantity and how its statistics are written; ``keys`` the combinations, by default those
+    of the table.
     """
-    content = key if callable(key) else partial(at, key=key)
-    return Column(title, content, once=content if once is True else once)
+    names = [*by]
+    keys = table[names].drop_duplicates() if keys is None else keys
+    shown = keys.copy()
+    for title, (quantity, show) in columns.items():
+        rows = table[table["quantity"] == quantity]
+        texts = rows[names].assign(text=[show(row) for _, row in rows.iterrows()])
+        shown[title] = keys.merge(texts, on=names, how="left")["text"].astype(object).fillna(DASH).to_numpy()
+    shown[names] = shown[names].astype(object).where(shown[names].notna(), DASH)
+    return shown.rename(columns=dict(by)).set_index(list(by.values()))
 
 
-def number(title: str, key: Any, show: Callable[..., Any] = str, *more: Any) -> Column:
-    """A column of numbers: ``show(what the entry has there, *more)``; key as of :func:`label`."""
-    content = label(title, key).of
-    return Column(title, lambda entry: show(content(entry), *more), True)
-
-
-def at(entry: Any, key: str) -> Any:
-    """``entry["a"]["b"]`` for ``a.b``; None where the entry is None."""
-    for part in key.split("."):
-        entry = None if entry is None else entry[part]
-    return entry
-
-
-def table(
-    columns: Sequence[Column],
-    entries: Iterable[Any],
-    *,
-    caption: str = "",
-    heading: str = "",
-    folded: str = "",
-    wrap: bool = False,
-    tight: bool = False,
-    main: Callable[[Any], bool] = lambda entry: False,
-) -> Block:
-    """A table for the page: a row per entry.
-
-    Long texts are broken where ``wrap``; columns are nearer to each other where ``tight``; ``main`` rows stand out.
-    """
-    rows: list[dict[str, Any]] = []
-    before: list[Any] = [rows] * len(columns)  # which no entry has
-    for entry in entries:
-        now = [column.once and column.once(entry) for column in columns]
-        fresh = [column.once is None or mark != old for column, mark, old in zip(columns, now, before, strict=True)]
-        cells = [column.of(entry) if new else "" for column, new in zip(columns, fresh, strict=True)]
-        first = any(new and column.once for column, new in zip(columns, fresh, strict=True))
-        rows.append({"cells": cells, "mark": "main" if main(entry) else "first" if first else ""})
-        before = now
-    return {
-        "kind": "table",
-        "columns": [{"name": column.title, "number": column.number} for column in columns],
-        "rows": rows,
-        "caption": caption,
-        "heading": heading,
-        "folded": folded,
-        "class": "wrap" if wrap else "tight" if tight else "",
-    }
-
-
-def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
-    """The same table for a terminal, 79 columns wide; a line between groups of rows."""
-    printed = Table(title=title, title_justify="left", width=WIDTH)
-    for column in columns:
-        how: dict[str, Any] = (
-            {"justify": "right", "no_wrap": True} if column.number else {"ratio": 1, "overflow": "fold"}
+def pairs_displayed(pairs: pd.DataFrame, digits: Mapping[str, int]) -> pd.DataFrame:
+    """Pairs of :func:`house.pairs` as people read them; ``digits`` are a quantity's decimals, else 3."""
+    if pairs.empty:
+        return pd.DataFrame()
+    rows = []
+    for _, pair in pairs.iterrows():
+        places = digits.get(pair["quantity"], 3)
+        difference = DASH if pd.isna(pair["difference"]) else f"{round(pair['difference'], places) + 0.0:+.{places}f}"
+        rows.append(
+            {
+                "quantity": pair["quantity"].replace("_", " ") + ("" if pair["higher"] else " (lower is better)"),
+                "N": DASH if pd.isna(pair["N"]) else str(pair["N"]),
+                "first": pair["first"],
+                "second": pair["second"],
+                "P(first better)": fixed(pair["probability"])
+                + between(pair["probability_low"], pair["probability_high"], 2),
+                "won–lost–tied": f"{pair['wins']}–{pair['n'] - pair['wins'] - pair['ties']}–{pair['ties']}",
+                "sign test p": fixed(pair["sign_test"], 3),
+                "n": str(pair["units"]),
+                "difference": difference + between(pair["difference_low"], pair["difference_high"], places),
+            }
         )
-        printed.add_column(column.title, **how)
-    for index, row in enumerate(table(columns, entries)["rows"]):
-        if index and row["mark"]:
-            printed.add_section()
-        printed.add_row(*(str(cell["text"] if isinstance(cell, dict) else cell) for cell in row["cells"]))
+    shown = pd.DataFrame(rows)
+    if pairs["N"].isna().all():
+        del shown["N"]
+    return shown.set_index([name for name in ("quantity", "N", "first", "second") if name in shown])
+
+
+def rows_of(frame: pd.DataFrame) -> Iterable[list[str]]:
+    """The rows of a displayed table: labels, left out where they are as in the row above, then numbers."""
+    before: tuple[Any, ...] = ()
+    for key, numbers in zip(frame.index, frame.to_numpy(), strict=True):
+        labels = key if isinstance(key, tuple) else (key,)
+        same = 0
+        while before and same < len(labels) - 1 and labels[same] == before[same]:
+            same += 1
+        before = labels
+        yield [*[""] * same, *map(str, labels[same:]), *map(str, numbers)]
+
+
+def terminal(title: str, frame: pd.DataFrame) -> Table:
+    """A displayed table for a terminal, 80 columns wide."""
+    printed = Table(title=title, title_justify="left", width=WIDTH)
+    for name in frame.index.names:
+        printed.add_column(str(name), overflow="fold")
+    for name in frame.columns:
+        printed.add_column(str(name), justify="right", no_wrap=True)
+    for row in rows_of(frame):
+        printed.add_row(*row)
     return printed
 
 
-def section(
-    identity: str,
-    title: str,
-    paragraphs: Iterable[str],
-    blocks: Iterable[Block],
-    missing: Iterable[str] = (),
-    *,
-    folded: bool = False,
-) -> Block:
-    """A section of the page; until asked for only its title where ``folded``."""
-    return {
-        "id": identity,
-        "title": title,
-        "paragraphs": [text for text in paragraphs if text],
-        "blocks": list(blocks),
-        "missing": list(missing),
-        "folded": folded,
-    }
-
-
-def shown(material: Material, drawn: Drawn) -> Block:
-    """A figure on the page; it is added to the material's ``figures`` by the :func:`slug` of its name."""
-    name, svg = slug(drawn.name), ""
-    if drawn.figure is not None:
-        material.figures[name] = drawn.figure
-        svg = material.drawings[name] = to_svg(drawn.figure, name)
-        svg = re.sub(r"<style.*?</style>", "", svg, flags=re.S)  # the page allows its own alone, which says the same
-        for colour, variable in COLOURS.items():
-            svg = svg.replace(colour, f"var(--{variable})")
-    texts = {key: getattr(drawn, key) for key in ("label", "caption", "runs", "missing", "folded", "heading")}
-    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, **texts}
-
-
-def pick(rows: Iterable[Entry], key: str, value: Any) -> Entry:
-    """The first of the rows with this value; a ``LookupError`` where none has it."""
-    for row in rows:
-        if row[key] == value:
-            return row
-    raise LookupError(f"nothing whose {key!r} is {value!r}")
-
-
-def picture(image: NDArray[np.uint8]) -> str:
-    """An observation as base64 PNG, see :func:`reduced`; of a stack (H, W, C) with C other than 3 the last frame."""
-    if image.ndim == 3 and image.shape[2] != 3:
-        image = image[..., -1]
-    return encoded(image_png(reduced(image)))
-
-
-def film(gif: bytes, caption: str) -> Block:
-    """A moving picture."""
-    return {"kind": "film", "gif": encoded(gif), "caption": caption}
-
-
-def encoded(png: bytes) -> str:
-    """A picture's file as base64."""
-    return base64.b64encode(png).decode("ascii")
-
-
-def texts(packed: Any) -> list[str]:
-    """A JSON list of texts out of the arrays."""
-    raw = packed.item() if isinstance(packed, np.ndarray) else packed
-    try:
-        return list(json.loads(raw))
-    except (ValueError, TypeError) as error:
-        raise UserError(f"a list of texts is damaged ({error})", None, EVALUATE_AGAIN) from None
-
-
-def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:
-    """An entry's method, with its sub-goal where the entries are of several."""
-    several = len({entry["sub_goal"] for entry in entries}) > 1
-    return lambda entry: f"{entry['method']} ({entry['sub_goal']})" if several else str(entry["method"])
-
-
-def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "") -> Block:
-    """A list of names and texts, folded until asked for."""
-    return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading}
-
-
-def cell(text: str, small: str = "") -> dict[str, str]:
-    """A cell with a small remark beside its text."""
-    return {"text": text, "small": small, "class": ""}
-
-
-def listed(items: Sequence[Any]) -> str:
+def listed(items: Iterable[Any]) -> str:
     """1, 2 and 3."""
     texts = [str(item) for item in items]
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}" if texts else "none"
+    if len(texts) < 2:
+        return texts[0] if texts else "none"
+    return f"{', '.join(texts[:-1])} and {texts[-1]}"
 
 
 def spans(numbers: Iterable[int]) -> str:
     """Seeds in order, three and more in a row as '970 to 972'."""
     rows: list[list[int]] = []
-    for seed in sorted(numbers):
-        if rows and seed == rows[-1][-1] + 1:
-            rows[-1].append(seed)
+    for number in sorted(set(numbers)):
+        if rows and number == rows[-1][-1] + 1:
+            rows[-1].append(number)
         else:
-            rows.append([seed])
-    return listed([text for row in rows for text in (row if len(row) < 3 else [f"{row[0]} to {row[-1]}"])])
+            rows.append([number])
+    texts: list[Any] = []
+    for row in rows:
+        texts += [f"{row[0]} to {row[-1]}"] if len(row) > 2 else row
+    return listed(texts)
 
 
-def fixed(value: float | None, digits: int) -> str:
-    """A number with a fixed number of decimals; a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}f}"
+def picture(image: NDArray[np.uint8]) -> str:
+    """An observation as the source of an ``img``, see :func:`reduced`; of a stack of grey frames the last."""
+    if image.ndim == 3 and image.shape[2] != 3:
+        image = image[..., -1]
+    return source(image_png(reduced(image)), "png")
 
 
-def percent(value: float | None) -> str:
-    """0.953 -> '95 %'; a dash for None."""
-    return "–" if value is None else f"{100 * value:.0f} %"
+def source(data: bytes, kind: str) -> str:
+    """A picture's file as the source of an ``img``."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def thousands(value: float | None) -> str:
-    """123456 -> '123 k'; a dash for None."""
-    return "–" if value is None else f"{value / 1000:.0f} k"
-
-
-def spread(aggregated: Entry | None, digits: int, scale: float = 1.0, error: str = "standard_error") -> dict[str, str]:
-    """Mean, and beside it the standard error where there are several runs; a dash where there is none."""
-    if aggregated is None or aggregated["mean"] is None:
-        return cell("–")
-    mean, wide = aggregated["mean"], aggregated.get(error)
-    return cell(fixed(scale * mean, digits), "" if wide is None else f"± {scale * wide:.{digits}f}")
-
-
-deviation = partial(spread, error="standard_deviation")  # mean, and beside it the standard deviation over seeds
-
-
-def interval(aggregated: Entry | None, digits: int, scale: float = 1.0) -> str:
-    """The mean or the interquartile mean, whichever the 95 % interval beside it is of."""
-    if aggregated is None or aggregated["iqm"] is None:
-        return "–"
-    value = aggregated["mean" if STUDENT in aggregated["interval_over"] else "iqm"]
-    low, high = aggregated["interval"]
-    around = "" if low is None else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
-    return f"{scale * value:.{digits}f}{around}"
-
-
-def verdict(probability: float, says: bool, truth: bool) -> dict[str, str]:
-    """A member's prediction on a card: marked where it is wrong."""
-    prediction = label_of(says)
-    return {"class": prediction if says == truth else "wrong", "text": f"{prediction} {probability:.2f}"}
-
-
-def label_of(positive: bool) -> str:
-    """A label or a prediction in words."""
-    return "positive" if positive else "negative"
-
-
-def comparison_tables(
-    rows: Sequence[Entry], shared: str, units: str = "seeds", digits: Mapping[str, int] = DIGITS
-) -> list[Block]:
-    """The table of one method against the others, pair by pair, where there are pairs (Spec F5).
-
-    Rows are of ``numbers.pairs``. ``shared``: what pairs share; ``units``: what is independent; ``digits``: decimals.
-    """
-    compared = [entry for entry in rows if entry["n"]]
-    if not compared:
-        return []
-    firsts = {entry["first"] for entry in compared}
-    names = ["quantity"]
-    names += ["where"] if any(entry["where"] for entry in compared) else []
-    names += ["first"] if len(firsts) > 1 else []
-
-    def quantity(entry: Entry) -> str:
-        return str(entry["quantity"]).replace("_", " ") + ("" if entry["higher"] else " (lower is better)")
-
-    def difference(entry: Entry) -> dict[str, str]:
-        places = max(digits.get(entry["quantity"], 3), 1)  # may be small where the numbers are not
-        value = entry["difference"]
-        signed = "–" if value is None else f"{round(value, places) + 0.0:+.{places}f}"  # + 0.0: no "-0"
-        return cell(signed, _between(entry["difference_interval"], places))
-
-    titles = {"quantity": ("quantity", quantity), "where": ("of", "where"), "first": ("first", "first")}
-    columns = [
-        *(label(*titles[name], once=lambda entry: [entry[key] for key in names]) for name in names),
-        label("second", "second"),
-        number("P(first better)", lambda e: cell(fixed(e["probability"], 2), _between(e["interval"], 2)), dict),
-        number("won–lost–tied", lambda e: f"{e['wins']}–{e['n'] - e['wins'] - e['ties']}–{e['ties']}"),
-        number("sign test p", lambda e: cell(fixed(e["sign_test"], 3), f"n = {e['units']}"), dict),
-        number("difference", difference, dict),
-    ]
-    caption = CAPTION.format(shared=shared, units=units)
-    title = f"Seed by seed: {firsts.pop()} against the others" if len(firsts) == 1 else "Seed by seed"
-    return [table(columns, compared, tight=True, heading=title, caption=caption)]
-
-
-def _between(bounds: Sequence[float | None], digits: int) -> str:
-    low, high = bounds
-    return "" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def draw_page(
-    title: str, subtitle: str, sections: Sequence[Block], version: str, lead: Mapping[str, Any] | None = None
-) -> str:
-    """Sections as one HTML file that needs nothing else; ``lead``: task, verdict, baselines and films above.
-
-    Every text is escaped but our own style and script and matplotlib's drawings; the page's policy lets nothing else
-    run or be fetched.
-    """
-    import jinja2
-
-    loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    css, script = packaged("templates/report.css"), packaged("templates/explorer.js")
-    return environment.get_template("report.html").render(
-        title=title,
-        subtitle=subtitle,
-        version=version,
-        policy=POLICY.format(script=_digest(script), style=_digest(css)),
-        css=css,
-        script=script,
-        sections=sections,
-        lead=lead or {},
-        footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
-    )
+def svg(drawn: Drawn) -> str:
+    """A figure as the source of an ``img``."""
+    return source(to_file(drawn.figure, "svg"), "svg+xml")
 
 
 def packaged(name: str) -> str:
-    """The text of a file that comes with the evaluation."""
-    return resources.files("hypogoal.evaluation").joinpath(name).read_text(encoding="utf-8")
+    """The text of a file beside the templates."""
+    return (TEMPLATES / name).read_text(encoding="utf-8")
+
+
+def templates() -> jinja2.Environment:
+    """All templates. Every text is escaped but our own style and script."""
+    loader = jinja2.FileSystemLoader(TEMPLATES)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    tools = {function.__name__: function for function in (rows_of, listed, spans, picture, svg, fixed, percent)}
+    environment.globals |= tools
+    return environment
+
+
+def section(name: str, context: Mapping[str, Any]) -> Markup:
+    """A question's part of a page, from its template."""
+    return Markup(templates().get_template(f"{name}.html").render(context))
+
+
+def caption(name: str, context: Mapping[str, Any], drawn: Drawn) -> str:
+    """A figure's caption, which is a macro in its question's template."""
+    module: Any = templates().get_template(f"{name}.html").make_module(dict(context))
+    return " ".join(Markup(module.caption(drawn)).unescape().split())
+
+
+def draw_page(title: str, sections: Sequence[tuple[str, str, Markup, bool]], template: str, **lead: Any) -> str:
+    """Sections (id, title, part, folded) as one HTML file that needs nothing else; ``lead``: what stands above them."""
+    css, script = packaged("report.css"), packaged("gallery.js")
+    policy = POLICY.format(script=_digest(script), style=_digest(css))
+    context = {"title": title, "sections": sections, "policy": policy, "css": css, "script": script}
+    version = versions().get("hypogoal", "unknown")
+    return templates().get_template(template).render(context | lead, version=version)
 
 
 def _digest(text: str) -> str:
     """A script or a style of the page, as a policy names it."""
     return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
-
-
-@dataclass(frozen=True)
-class Question:
-    """One question of the paper, whole: its rows, and all that derives from them. Unused fields keep these defaults."""
-
-    # The rows of one sub-goal's members, as each ensemble is judged.
-    look: Callable[[Work, Judgement], Iterable[Row]] = lambda work, judgement: ()
-    rows: Callable[[Work], Iterable[Row]] = lambda work: ()  # all others; earlier ones are in ``work.rows``
-    view: Callable[[Work], dict[str, Any]] = lambda work: {}  # its parts of ``metrics.json``, made from ``work.rows``
-    pairs: Pairs | None = None  # which methods are compared with each other
-    missing: Callable[[Work], list[str]] = lambda work: []  # a line for everything that the run has no artefacts for
-    # Unit and meaning of its quantities, if they are not in ``quantities.toml``.
-    meanings: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    summary: Callable[[Entry], list[Table]] = lambda metrics: []  # tables for a terminal
-    sections: Callable[[Material], list[Block]] = lambda material: []  # those that the run has anything for
-    figures: Callable[[Material], Iterable[Drawn]] = lambda material: ()  # for a paper
-    needed: Mapping[str, str] = field(default_factory=dict)  # what each figure needs, by its name

@@ -87,19 +87,25 @@ def attribution_image(values: NDArray[np.floating], grey: NDArray[np.floating]) 
     return np.asarray((255 * image).round().astype(np.uint8))
 
 
-def flat(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Attributions (..., C) to be drawn, (...): of colours their sum, of a stack of frames the last."""
-    return values.sum(-1) if values.shape[-1] == 3 else values[..., -1]
+def last_frame(values: NDArray[Any], colours: int | None = None) -> NDArray[Any]:
+    """Of pictures (..., C) the last frame's channels, so many ``colours``: by default 3 where C is 3, else 1."""
+    return values[..., -(colours or (3 if values.shape[-1] == 3 else 1)) :]
 
 
-def brightness(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Observations (..., C) in grey, (...): of a stack of frames the last."""
-    return observations.mean(-1).astype(np.uint8) if observations.shape[-1] == 3 else observations[..., -1]
+def flat(values: NDArray[np.floating], colours: int | None = None) -> NDArray[np.floating]:
+    """Attributions (..., C) to be drawn, (...): of the last frame the sum over its colours."""
+    return last_frame(values, colours).sum(-1)
 
 
-def coloured(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Observations (..., C) as they are shown, (..., 3): of a stack of frames the last, in grey."""
-    return observations if observations.shape[-1] == 3 else observations[..., -1:].repeat(3, axis=-1)
+def brightness(observations: NDArray[np.uint8], colours: int | None = None) -> NDArray[np.uint8]:
+    """Observations (..., C) in grey, (...): of the last frame."""
+    return last_frame(observations, colours).mean(-1).astype(np.uint8)
+
+
+def coloured(observations: NDArray[np.uint8], colours: int | None = None) -> NDArray[np.uint8]:
+    """Observations (..., C) as they are shown, (..., 3): of the last frame."""
+    shown = last_frame(observations, colours)
+    return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
 
 
 def to_bytes(values: NDArray[np.floating]) -> NDArray[np.int8]:

@@ -1,20 +1,22 @@
 """What members do on recorded data, as numbers and as sections of a page (Spec I6)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import TO_FILL_IN, Artefact, versions
+from hypogoal.core.artefacts import TO_FILL_IN, Artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.data import States, joined, open_dataset
-from hypogoal.evaluation import page, recorded
-from hypogoal.evaluation.page import Block
+from hypogoal.evaluation import recorded
+from hypogoal.evaluation.page import draw_page, fixed, percent, section, source, templates
 from hypogoal.evaluation.pictures import image_png
+from hypogoal.evaluation.plots import slug
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.observations import Observations, digest, spread_rows
 
@@ -59,13 +61,13 @@ class Findings:
     """What is found of one sub-goal's ensemble."""
 
     numbers: dict[str, Any]
-    section: Block
+    cards: list[dict[str, Any]]  # headings, each with its states
     rows: NDArray[np.int64]  # of the unlabelled states to label next, best first
     disputed: NDArray[np.float64]  # how much members disagree on them
 
 
 def findings_of(look: Look) -> Findings:
-    """A sub-goal's numbers, its section of the page, and the states to label next."""
+    """A sub-goal's numbers, its states for the page, and the states to label next."""
     rows = spread_rows(len(look.unlabelled), COMPARED)  # the states that are compared
     scores = look.scores[rows]
     sketches = recorded.sketches_of(look.unlabelled[rows])
@@ -81,8 +83,18 @@ def findings_of(look: Look) -> Findings:
         "members": recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist()),
         "next": [int(rows[row]) for row in proposed[:CARDS]],
     }
-    section = _section(look, numbers, rows, sketches, proposed, disputed)
-    return Findings(numbers, section, rows[proposed], disputed[proposed])
+    measure = "disagreement" if len(look.ensemble) > 1 else "prediction"
+    shown = []
+    for row in proposed[:CARDS]:
+        title = f"state {rows[row]}, {measure} {disputed[row]:.2f}"
+        shown.append(_card(look, title, look.unlabelled[rows[row]], look.scores[rows[row]]))
+    cards = [{"heading": "To label next", "states": shown}]
+    for member in range(len(look.ensemble)):
+        drawn = [*_drawn_to(look, member)]
+        cards.append({"heading": f"Member {member}: failures that a policy would be drawn to", "states": drawn})
+        pairs = [*_pairs(look, member, rows, sketches)]
+        cards.append({"heading": f"Member {member}: nearest states with opposite predictions", "states": pairs})
+    return Findings(numbers, cards, rows[proposed], disputed[proposed])
 
 
 def write_next(
@@ -107,118 +119,81 @@ def write_next(
     write_table(folder / TO_FILL_IN, columns, lines)
 
 
-def draw(name: str, sections: list[Block], lines: Sequence[str]) -> str:
-    """The page of an audit of the artefact called ``name``; ``lines`` come first."""
-    lead = {"task": "", "verdict": lines, "baselines": "", "films": [], "question": ""}
-    version = versions().get("hypogoal", "unknown")
-    subtitle = f"recorded data; hypogoal {version}"
-    return page.draw_page(f"hypogoal: audit of {name}", subtitle, sections, version, lead)
+def _card(
+    look: Look, title: str, state: Any, scores: NDArray[np.float32], turned: recorded.Turned | None = None
+) -> dict[str, Any] | None:
+    """A state and its scores (K,); None of states without pictures."""
+    picture = recorded.picture_of(state, turned)
+    if picture is None:
+        return None
+    lines = []
+    for member, (score, threshold) in enumerate(zip(scores, look.thresholds, strict=True)):
+        lines.append({"positive": bool(score > threshold), "text": f"member {member}: {score:.2f}"})
+    return {"source": source(image_png(picture), "png"), "title": title, "lines": lines}
+
+
+def _drawn_to(look: Look, member: int) -> Iterator[dict[str, Any] | None]:
+    """The known failures that a member scores highest, with the patch that says most of it."""
+    threshold = look.thresholds[member]
+    rejected = np.flatnonzero(look.scores[:, member] <= threshold)
+    for row in recorded.tempting(look.known, look.known_scores[:, member], SHOWN):
+        state, scores = look.known.observations[row], look.known_scores[row]
+        turned, title = None, "a failure"
+        if scores[member] > threshold and len(rejected):
+            some = rejected[spread_rows(len(rejected), REJECTED)]
+            sketches = recorded.sketches_of(np.concatenate([state[None], look.unlabelled[some]]))
+            nearest = some[np.linalg.norm(sketches[1:] - sketches[0], axis=1).argmin()]
+            turned = recorded.turning_patch(state, look.unlabelled[nearest], member, look.ensemble.predict)
+        if turned is not None:
+            title = f"a false positive; {turned.after:.2f} with the framed patch exchanged"
+        yield _card(look, title, state, scores, turned)
+
+
+def _pairs(
+    look: Look, member: int, rows: NDArray[np.int64], sketches: NDArray[np.float64]
+) -> Iterator[dict[str, Any] | None]:
+    """The nearest unlabelled states with opposite predictions of a member, side by side."""
+    positive = look.scores[rows, member] > look.thresholds[member]
+    pairs = recorded.opposite_pairs(sketches, positive, SHOWN)
+    for number, (first, second, _) in enumerate(pairs, 1):
+        for row in rows[[first, second]]:
+            yield _card(look, f"pair {number}, state {row}", look.unlabelled[row], look.scores[row])
+
+
+def draw(name: str, findings: Iterable[Findings]) -> str:
+    """The page of an audit of the artefact called ``name``."""
+    sections = []
+    for of_goal in findings:
+        cards = [{**group, "states": [card for card in group["states"] if card]} for group in of_goal.cards]
+        context = {"numbers": of_goal.numbers, "table": _table(of_goal.numbers), "cards": cards}
+        sub_goal = of_goal.numbers["sub_goal"]
+        sections.append((slug(sub_goal), sub_goal, section("audited", context), False))
+    lines = lines_of([of_goal.numbers for of_goal in findings])
+    return draw_page(f"hypogoal: audit of {name}", sections, "audit.html", lines=lines)
+
+
+def _table(numbers: dict[str, Any]) -> pd.DataFrame:
+    rows = []
+    for row in numbers["members"]:
+        rows.append(
+            {
+                "member": row["member"],
+                "threshold": fixed(row["threshold"]),
+                "false positives": f"{row['false_positives']} of {row['negatives']}",
+                "highest negative": fixed(row["highest_negative"]),
+                "positive, unlabelled": percent(row["positive_unlabelled"]),
+                "alone": percent(row["positive_alone"]),
+            }
+        )
+    return pd.DataFrame(rows).set_index("member")
 
 
 def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:
     """The findings in a few lines, for the page and the terminal."""
+    template = templates().get_template("audited.txt")
     lines = []
     for part in parts:
         worst = max(part["members"], key=lambda row: row["false_positives"])
-        lines.append(
-            f"{part['sub_goal']}: {_describe_unlabelled(part)}; of {worst['negatives']} known failures member "
-            f"{worst['member']} predicts {worst['false_positives']} positive (highest probability "
-            f"{worst['highest_negative']:.2f})"
-        )
+        alike = [row["member"] for row in part["members"] if row["positive_unlabelled"] in (0.0, 1.0)]
+        lines.append(" ".join(template.render(part=part, worst=worst, alike=alike).split()))
     return lines
-
-
-def _describe_unlabelled(part: dict[str, Any]) -> str:
-    """How members differ on unlabelled states, and which of them hold all of these for the same."""
-    shares = [row["positive_unlabelled"] for row in part["members"]]
-    states = f"{part['unlabelled']:,} unlabelled states"
-    if len(shares) == 1:
-        return f"the classifier predicts {shares[0]:.1%} of {states} positive"
-    alike = [str(member) for member, share in enumerate(shares) if share in (0.0, 1.0)]
-    which = f" (the same prediction for all of them: member {', '.join(alike)})" if alike else ""
-    return f"members disagree in {part['disagreement']:.1%} of {states}{which}"
-
-
-def _section(
-    look: Look,
-    numbers: dict[str, Any],
-    rows: NDArray[np.int64],
-    sketches: NDArray[np.float64],
-    proposed: NDArray[np.int64],
-    disputed: NDArray[np.float64],
-) -> Block:
-    columns = [
-        page.label("member", lambda row: str(row["member"])),
-        page.number("threshold", "threshold", page.fixed, 2),
-        page.number("false positives", lambda row: f"{row['false_positives']} of {row['negatives']}"),
-        page.number("highest negative", "highest_negative", page.fixed, 2),
-        page.number("positive, unlabelled", "positive_unlabelled", page.percent),
-        page.number("alone", "positive_alone", page.percent),
-    ]
-    caption = (
-        "False positives among labelled and held-out states. Highest negative: the probability of the failure that a "
-        "policy would be drawn to first. Alone: unlabelled states that no other member predicts positive."
-    )
-    blocks: list[Block] = [page.table(columns, numbers["members"], caption=caption, heading="Members")]
-    measure = "disagreement" if len(look.ensemble) > 1 else "prediction"
-    titles = [f"state {rows[row]}, {measure} {disputed[row]:.2f}" for row in proposed[:CARDS]]
-    shown = [(look.unlabelled[rows[row]], look.scores[rows[row]]) for row in proposed[:CARDS]]
-    blocks += _cards(look, "To label next", zip(titles, *zip(*shown, strict=True), strict=True))
-    for member in range(len(look.ensemble)):
-        blocks += _drawn_to(look, member) + _pairs(look, member, rows, sketches)
-    paragraphs = [
-        f"{len(look.known.labels):,} labelled and held-out states. Beyond them {_describe_unlabelled(numbers)}."
-    ]
-    return page.section(page.slug(look.sub_goal), look.sub_goal, paragraphs, blocks)
-
-
-def _cards(look: Look, heading: str, states: Any) -> list[Block]:
-    """Cards of states, each a title, an observation and its scores (K,); none of states without pictures."""
-    cards = []
-    for title, state, scores, *turned in states:
-        picture = recorded.picture_of(state, *turned)
-        if picture is None:
-            return []
-        lines = [
-            {"class": "positive" if score > threshold else "negative", "text": f"member {member}: {score:.2f}"}
-            for member, (score, threshold) in enumerate(zip(scores.tolist(), look.thresholds.tolist(), strict=True))
-        ]
-        cards.append({"png": page.encoded(page.image_png(picture)), "alt": title, "title": title, "lines": lines})
-    return [{"kind": "cards", "heading": heading, "cards": cards, "small": True}] if cards else []
-
-
-def _drawn_to(look: Look, member: int) -> list[Block]:
-    """The known failures that a member scores highest, with the patch that says most of it."""
-    tempting = recorded.tempting(look.known, look.known_scores[:, member], SHOWN)
-    threshold = look.thresholds[member]
-    rejected = np.flatnonzero(look.scores[:, member] <= threshold)
-
-    def shown() -> Iterator[tuple[Any, ...]]:
-        for row in tempting:
-            state, scores = look.known.observations[row], look.known_scores[row]
-            turned = None
-            if scores[member] > threshold and len(rejected):
-                some = rejected[spread_rows(len(rejected), REJECTED)]
-                sketches = recorded.sketches_of(np.concatenate([state[None], look.unlabelled[some]]))
-                nearest = some[np.linalg.norm(sketches[1:] - sketches[0], axis=1).argmin()]
-                turned = recorded.turning_patch(state, look.unlabelled[nearest], member, look.ensemble.predict)
-            title = (
-                "a failure"
-                if turned is None
-                else f"a false positive; {turned.after:.2f} with the framed patch exchanged"
-            )
-            yield title, state, scores, turned
-
-    return _cards(look, f"Member {member}: failures that a policy would be drawn to", shown())
-
-
-def _pairs(look: Look, member: int, rows: NDArray[np.int64], sketches: NDArray[np.float64]) -> list[Block]:
-    """The nearest unlabelled states with opposite predictions of a member, side by side."""
-    positive = look.scores[rows, member] > look.thresholds[member]
-    pairs = recorded.opposite_pairs(sketches, positive, SHOWN)
-    states = [
-        (f"pair {number}, state {rows[row]}", look.unlabelled[rows[row]], look.scores[rows[row]])
-        for number, (first, second, _) in enumerate(pairs, 1)
-        for row in (first, second)
-    ]
-    return _cards(look, f"Member {member}: nearest states with opposite predictions", states)

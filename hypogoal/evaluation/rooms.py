@@ -6,73 +6,84 @@ rooms of the labelled groups, the only ones whose labels were to be had, would h
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import product
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.table import Table as Printed
 
-from hypogoal.evaluation import page
-from hypogoal.evaluation.hypotheses import STATES
-from hypogoal.evaluation.judging import Judgement, Work
-from hypogoal.evaluation.numbers import Metrics, by_method, grouped, methods_lacking
-from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
-from hypogoal.evaluation.table import VALIDATED, Number, Pairs, Row, Table, rows_by_member, rows_of, select, tabulate
+from hypogoal.evaluation.house import over, pairs, per_run, tidy, tidy_members
+from hypogoal.evaluation.hypotheses import KNOWN
+from hypogoal.evaluation.judging import Judged, Judgement, Work
+from hypogoal.evaluation.names import METHODS, rank
+from hypogoal.evaluation.page import Drawn, Results, deviation, displayed, mean, pairs_displayed, spans
+from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, STYLES, WIDTH, legend_below, styled
 from hypogoal.hypotheses.scores import member_scores, ranking
 
+TITLE = "Hypotheses in rooms without labels"
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or
 # among the labelled ones.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
+VALIDATED = "validated_member"  # the quantity that is its number
 TABLED = ("unseen", "all")  # scopes of the tables and of Figure 3
-SCORED = ("balanced_accuracy", "accuracy", "ranking")  # of which best, mean, ... are told
-WHICH = {"best": "best", "validated": VALIDATED, "mean": "mean", "worst": "worst"}  # the member of a ``Number``
-SHOWN = {"best": "best member", "validated": "validated member", "mean": "mean of members"}
-SHARE = "share of states"
-SPREAD = ("mean", "standard_deviation")  # of the figures
+SCORED = ("balanced_accuracy", "accuracy", "ranking")
+WHICH = {"best": "best", "validated": VALIDATED, "mean": "mean", "worst": "worst"}  # the ``member`` of ``per_run``
+PANELS = {  # of Figure 3
+    "accuracy, all rooms: best member": "accuracy, all, best",
+    "balanced, unseen: best member": "balanced_accuracy, unseen, best",
+    "balanced, unseen: validated member": "balanced_accuracy, unseen, validated",
+    "balanced, unseen: mean of members": "balanced_accuracy, unseen, mean",
+}
 PAPERS = "climb-down-ladder"  # the paper's sub-goal; its authors' repository has others
-PAPER = (
-    "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
-    "big step at N=2. Its test files include training rooms, as 'all rooms' does; it does not say how many of their "
-    "states are positive, so compare methods and N rather than levels."
-)
-BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
+NEEDED = {"figure3": "ensembles of data of 1 to 7 labelled groups"}
+BY = {"method": "method", "N": "N"}
+COLUMNS = {which: (f"balanced_accuracy, unseen, {which}", deviation(2)) for which in WHICH}
+COLUMNS["acc., all"] = ("accuracy, all, best", deviation(2))
+
+
+def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
+    """Members room by room, where held-out states say which rooms training saw."""
+    split = judgement.split
+    if "seen" not in split.origins:
+        return
+    place = work.place_of(judgement)
+    yield from rows_by_room(judgement.judged, split.labels, split.origins, place)
+    picked = choose(judgement.judged.predictions, split.labels, split.origins["seen"])
+    yield tidy(picked, **place, scope=VALIDATION)
+    validated = picked[VALIDATED]
+    if validated is not None:
+        work.validated[place["artefact"], place["sub_goal"]] = int(validated)
 
 
 def rows_by_room(
-    probabilities: NDArray[np.float32],
-    predictions: NDArray[np.bool_],
+    judged: Judged,
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
-    **place: Any,
-) -> Iterator[Row]:
-    """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
+    place: Mapping[str, Any],
+) -> Iterator[pd.DataFrame]:
+    """Spec F1: K members on N held-out states by whether training saw the room: in each scope counts and scores.
 
-    Probabilities and predictions are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
-    ``room``. In each scope counts and every member's scores; on labelled rooms, the member that they pick.
+    ``origins`` (N,) are ``seen`` (see ``SCOPES``) and, where there is one, ``room``.
     """
-    seen = origins["seen"]
-    for name, values in SCOPES.items():
-        inside = np.isin(seen, values)
-        scores = member_scores(predictions[inside], labels[inside])
-        scores["ranking"] = ranking(probabilities[inside], labels[inside])
-        yield from rows_by_member(scores, **place, scope=name)
+    for scope, values in SCOPES.items():
+        inside = np.isin(origins["seen"], values)
+        columns = member_scores(judged.predictions[inside], labels[inside])
+        columns["ranking"] = ranking(judged.probabilities[inside], labels[inside])
+        yield tidy_members(columns, **place, scope=scope)
         counts = {"states": int(inside.sum()), "positives": int(labels[inside].sum())}
         if "room" in origins:
             counts["rooms"] = len(np.unique(origins["room"][inside]))
-        yield from rows_of(counts, **place, scope=name)
-    yield from rows_of(choose(predictions, labels, seen), **place, scope=VALIDATION)
+        yield tidy(counts, **place, scope=scope)
 
 
 def choose(
     predictions: NDArray[np.bool_], labels: NDArray[np.bool_], seen: NDArray[np.int64]
-) -> dict[str, int | float | None]:
+) -> dict[str, float | None]:
     """Spec F1: the member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
 
     The first of equally good ones, since their order is random; None where those rooms lack a class.
@@ -84,241 +95,151 @@ def choose(
     return {VALIDATED: int(np.nanargmax(scores)), "validation": float(np.nanmax(scores))}
 
 
-def _columns() -> Iterator[tuple[str, Number]]:
+def tables(results: Results) -> dict[str, pd.DataFrame]:
+    """Spec F1, F2: per method, N and sub-goal members' scores and disagreement over seeds; the first and the others."""
+    by_room = results.of(scope="unseen")["artefact"]
+    numbers = results.of(artefact=[*by_room.unique()])
+    runs = []
     for scope, score, (which, member) in product(TABLED, SCORED, WHICH.items()):
-        yield f"scores.{scope}.{score}.{which}", Number(score, scope, score, member, cell=(score, scope, which))
-    for on in STATES:
-        yield f"disagreement_{on}", Number("disagreement", on, SHARE, cell=(SHARE, on))
-
-
-TABLE = Table(
-    {"method": "method", "groups": "N", "sub_goal": "sub_goal"},
-    dict(_columns()),
-    "ensembles",
-    order=by_method,
-    deviation=True,
-    cell=lambda key: (" ".join(map(str, key)),),
-)
-PAIRS = Pairs(
-    "rooms",
-    {
-        f"balanced accuracy on unseen rooms, {which} member": Number("balanced_accuracy", "unseen", "", WHICH[which])
-        for which in SHOWN
-    },
-    ranked=True,
-)
-
-
-def rooms_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
-
-    ``scores``: scope -> score -> best, validated, mean, worst (see ``numbers.over``); by scope ``positives``, and
-    ``all_negative``, the accuracy of negative predictions alone.
-    """
-    by_room = {row.artefact for row in rows if row.scope == "unseen"}
-    rows = [row for row in rows if row.artefact in by_room]
-    counts = {
-        (row.method, row.N, row.sub_goal, row.scope, row.quantity): row.value
-        for row in reversed(select(rows, quantity=("states", "positives")))  # the first ensemble's
+        runs.append(per_run(numbers, score, scope, member, f"{score}, {scope}, {which}"))
+    runs += [per_run(numbers, name, "unseen") for name in KNOWN]
+    for states in ("unlabelled", "heldout"):
+        runs.append(per_run(numbers, "disagreement", states, name=f"disagreement, {states}"))
+    table = over(pd.concat(runs), [*BY, "sub_goal"])
+    order = table["method"].map(rank)
+    table = table.assign(rank=order).sort_values(["sub_goal", "rank", "method", "N"], kind="stable")
+    return {
+        "rooms": table.drop(columns="rank"),
+        "rooms-pairs": pairs(compared(results)),
+        "rooms-never": _never(numbers),
     }
-    table = tabulate(rows, TABLE)
-    for entry in table:
-        cell = tuple(entry[name] for name in TABLE.by)
-        positives = {scope: counts[*cell, scope, "positives"] for scope in TABLED}
-        states = {scope: counts[*cell, scope, "states"] for scope in TABLED}
-        entry["positives"] = positives
-        entry["all_negative"] = {on: 1 - positives[on] / states[on] if states[on] else math.nan for on in TABLED}
-    return table
 
 
-def look(work: Work, judgement: Judgement) -> Iterator[Row]:
-    """Members room by room, where held-out states say which rooms training saw."""
-    split, judged = judgement.split, judgement.judged
-    if "seen" in split.origins:
-        place = work.place(judgement)
-        yield from rows_by_room(judged.probabilities, judged.predictions, split.labels, split.origins, **place)
+def compared(results: Results) -> pd.DataFrame:
+    """The numbers of runs by which ensembles are compared."""
+    parts = []
+    for which in ("best", "validated", "mean"):
+        name = f"balanced accuracy on unseen rooms, {which} member"
+        parts.append(per_run(results.numbers, "balanced_accuracy", "unseen", WHICH[which], name))
+    return pd.concat(parts).sort_values("N", kind="stable")
 
 
-def missing(work: Work) -> list[str]:
-    """Spec F1: the methods that are not there, of a run with ladders."""
-    rooms = work.metrics["rooms"]
-    return methods_lacking(rooms, "ensemble", "Figure 3") if rooms or work.contents.ladders else []
-
-
-def group_name(entry: Entry) -> str:
-    """N as a table shows it."""
-    return "–" if entry["groups"] is None else str(entry["groups"])
-
-
-N = page.label("N", group_name)
-UNSEEN = (
-    *(page.number(which, f"scores.unseen.balanced_accuracy.{which}", page.deviation, 2) for which in WHICH),
-    page.number("acc., all", "scores.all.accuracy.best", page.deviation, 2),
-    page.number("seeds", "ensembles"),
-)
-
-
-def summary(metrics: Metrics) -> list[Printed]:
-    """Figure 3 by method and N: on unseen rooms, and the paper's number."""
-    rows = metrics["rooms"]
-    method = page.label("method", page.method_of(rows))
-    title = "Balanced accuracy on unseen rooms; the best member's accuracy on all rooms"
-    return [page.terminal(title, (method, page.number("N", group_name), *UNSEEN), rows)] if rows else []
-
-
-def sections(material: Material) -> list[Block]:
-    """The question about ladders; Figure 3 and its table: what else is known of members is in ``metrics.json``."""
-    if not material.of_ladders():
-        return []
-    metrics = material.metrics
-    question = (
-        "A sub-goal, such as being at the base of a ladder, is known from a few rooms only. An ensemble of classifiers "
-        "holds several hypotheses about what the sub-goal is. Does one of them hold in rooms that training never saw, "
-        "can it be picked, and does an option that ends where it is positive end at the sub-goal?"
+def _never(numbers: pd.DataFrame) -> pd.DataFrame:
+    """Accuracy of a member that is never positive, by sub-goal, N and scope, and the ``positives`` there."""
+    counts = numbers[numbers["quantity"].isin(["states", "positives"]) & numbers["scope"].isin(TABLED)]
+    wide = counts.pivot_table(
+        index=["sub_goal", "N", "scope"], columns="quantity", values="value", aggfunc="first", sort=False
     )
-    alone = not metrics["agents"]
-    identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
-    summaries = [page.section(identity, title, [question], [], metrics["missing"] if alone else [])]
-    text = (
-        "N is the number of groups of rooms with labels. Members are judged on held-out states of rooms that no "
-        "training state came from (unseen), and of all rooms, training rooms included, as in the paper. The best "
-        "member is picked on the very states that it is scored on, so it rises with the number of members, whatever "
-        "they learned; the validated member is the one with the highest balanced accuracy on held-out states in the "
-        "rooms of labelled groups, which a user could pick too."
-    )
-    blocks = [*(page.shown(material, figure) for figure in figures(material)), _table(metrics["rooms"])]
-    blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
-    judged = page.section("rooms", "Hypotheses in rooms without labels", [text], blocks)
-    return [*summaries, judged] if metrics["rooms"] else summaries
+    accuracy = 1 - wide["positives"] / wide["states"].where(wide["states"] > 0)
+    return wide.assign(all_negative=accuracy).reset_index()
 
 
-def _table(rows: Sequence[Entry]) -> Block:
-    return page.table(
-        (
-            page.label("method", page.method_of(rows), once=True),
-            N,
-            *UNSEEN,
-            page.number("disagree, unlabelled", "disagreement_unlabelled", page.deviation, 3),
-            page.number("disagree, held-out", "disagreement_heldout", page.deviation, 3),
-        ),
-        rows,
-        tight=True,
-        caption="Balanced accuracy on held-out states of unseen rooms of the best, the validated, the mean and the "
-        "worst member; accuracy (acc.) of the best one on those of all rooms; the share of states on which two "
-        "members' predictions differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
-        f"{_never(rows)}{PAPER if any(row['sub_goal'] == PAPERS for row in rows) else ''}",
-    )
-
-
-def _never(rows: Sequence[Entry]) -> str:
-    """What accuracy on all rooms is worth here, and where balanced accuracy is not defined."""
-    several = len({entry["sub_goal"] for entry in rows}) > 1
-    accuracies = {
-        (entry["sub_goal"] if several else "", entry["groups"]): entry["all_negative"]["all"]
-        for entry in rows
-        if entry["all_negative"]["all"] is not None
-    }
-    texts = []
-    for (sub_goal, groups), accuracy in sorted(accuracies.items(), key=str):
-        scope = ", ".join([sub_goal] * several + [f"N={groups}"] * (groups is not None))
-        texts.append(f"{accuracy:.2f}{scope and f' ({scope})'}")
-    text = f"A member that is never positive has accuracy {page.listed(texts)}. " if texts else ""
-    bare = sorted({entry["groups"] for entry in rows if entry["positives"]["unseen"] == 0 and entry["groups"]})
-    if not bare:
-        return text
-    return (
-        f"{text}At N={page.listed(bare)} no unseen room has positives left: balanced accuracy on them is not "
-        "defined (–), and accuracy there is the share of negatives called negative. "
-    )
-
-
-def figures(material: Material) -> Iterator[Drawn]:
-    """Figure 3, and what it leaves out, of each sub-goal."""
-    by_sub_goal = list(grouped(material.metrics["rooms"], itemgetter("sub_goal")).values())
-    panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
-    panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
-    for rows in by_sub_goal:
-        methods = {entry["method"] for entry in rows}
-        seeds = {entry["seed"] for entry in material.metrics["ensembles"] if entry.get("method") in methods}
-        sub_goal = rows[0]["sub_goal"]
-        caption = (
-            "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
-            "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
-            "mean one; mean over ensemble seeds, bands (bars where a method has one N): ± one standard deviation over "
-            "seeds. Dotted: never positive."
-            if rows is by_sub_goal[0]
-            else f"The same, for {sub_goal}."
-        )
-        nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
-        title, drawn = "Figure 3: members against labelled groups", scores_over_groups(rows, panels)
-        suffix = f"-{sub_goal}" if len(by_sub_goal) > 1 else ""
-        heading, runs = sub_goal if suffix else "", f"Ensemble seeds {page.spans(seeds)}."
-        yield Drawn(f"figure3{suffix}", title, drawn, caption, runs, nothing, heading=heading)
-
-
-def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:
-    """Figure 3: scores against the number of labelled ladder groups, methods coloured in the order of the rows.
-
-    Rows are of :func:`rooms_table`; those without N are left out, and where all are there is no figure. A panel is a
-    title, and of which scope, score and member. Dotted is what it takes no seeing to score.
-    """
-    names, rows = list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
-    if not rows:
+def context(results: Results) -> dict[str, Any] | None:
+    """For the template: the table of methods and N, pairs, and what a member that is never positive scores."""
+    if results.of(scope="unseen").empty:
         return None
+    computed = tables(results)
+    more = {
+        "disagree, unlabelled": ("disagreement, unlabelled", deviation(3)),
+        "disagree, held-out": ("disagreement, heldout", deviation(3)),
+    }
+    by = dict(BY)
+    if computed["rooms"]["sub_goal"].nunique() > 1:
+        by["sub_goal"] = "sub-goal"
+    printed = {title: (quantity, mean(2)) for title, (quantity, _) in COLUMNS.items()}
+    never = computed["rooms-never"]
+    bare = never[(never["scope"] == "unseen") & (never["positives"] == 0)]
+    return {
+        "table": displayed(computed["rooms"], by, COLUMNS | more),
+        "printed": displayed(computed["rooms"], by, printed),
+        "pairs": pairs_displayed(computed["rooms-pairs"], {}),
+        "never": never[never["scope"] == "all"].to_dict("records"),
+        "bare": bare["N"].tolist(),
+        "is_papers": PAPERS in [*computed["rooms"]["sub_goal"]],
+        "seeds": spans(results.of(scope="unseen")["seed"]),
+    }
+
+
+def figures(results: Results) -> Iterator[Drawn]:
+    """Figure 3, and what it leaves out, of each sub-goal."""
+    if results.of(scope="unseen").empty:
+        return
+    computed = tables(results)
+    sub_goals = computed["rooms"]["sub_goal"].unique()
+    for sub_goal in sub_goals:
+        table = computed["rooms"][computed["rooms"]["sub_goal"] == sub_goal].dropna(subset="N")
+        never = computed["rooms-never"][computed["rooms-never"]["sub_goal"] == sub_goal]
+        if len(table):
+            suffix = f"-{sub_goal}" if len(sub_goals) > 1 else ""
+            figure = scores_over_groups(table, never)
+            yield Drawn(f"figure3{suffix}", "Figure 3: members against labelled groups", figure, {"sub_goal": sub_goal})
+
+
+def scores_over_groups(table: pd.DataFrame, never: pd.DataFrame) -> Figure:
+    """Figure 3: scores against the number of labelled ladder groups, a panel for each of ``PANELS``.
+
+    ``table`` is of :func:`tables`, all of one sub-goal; dotted is a member that is never positive.
+    """
+    methods = list(table["method"].unique())
+    ticks = sorted(table["N"].unique().tolist())
     with styled():
-        high = -(-len(panels) // 2)
-        figure = Figure(figsize=(WIDTH, 2.25 * high + 0.05), layout="constrained")
-        axes = figure.subplots(high, 2, sharex=True, sharey=True, squeeze=False)
-        ticks, lowest = sorted({row["groups"] for row in rows}), 0.5
-        for place, (title, scope, score, which) in zip(axes.flat, panels, strict=False):
-            for name, entries in grouped(rows, itemgetter("method")).items():
-                scores = [(entry["groups"], entry["scores"][scope][score][which]) for entry in entries]
-                points = np.array([(groups, *(over[key] for key in SPREAD)) for groups, over in scores], float).T
-                _draw_method(place, name, names, points)
-                lowest = float(np.nanmin([lowest, *(points[1] - np.nan_to_num(points[2]))]))
-            blind = {}
-            for row in sorted(rows, key=itemgetter("groups")):
-                never = row["all_negative"][scope] if score == "accuracy" else 0.5 if row["positives"][scope] else None
-                if never is not None:
-                    blind[row["groups"]] = never
-            if len(blind) == 1:  # of one N a line is a point, which a method's marker may hide
-                place.axhline(*blind.values(), color=GREY, linewidth=1.2, linestyle=":", zorder=0)
-            else:
-                place.plot(list(blind), list(blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
+        figure = Figure(figsize=(WIDTH, 4.55))
+        axes = figure.subplots(2, 2, sharex=True, sharey=True)
+        for place, (title, quantity) in zip(axes.flat, PANELS.items(), strict=True):
+            for index, method in enumerate(methods):
+                rows = table[(table["quantity"] == quantity) & (table["method"] == method)]
+                _draw_method(place, rows, index, len(methods))
+            _draw_never(place, never, quantity)
             place.set_title(title, fontsize=9.5)
-        for place in axes.flat:
-            place.set(ylim=(max(0.0, lowest - 0.03), 1.03), xticks=ticks, xlim=(ticks[0] - 0.4, ticks[-1] + 0.4))
+        lowest = min(0.5, (table["mean"] - table["standard_deviation"].fillna(0)).min())
+        axes[0, 0].set(ylim=(max(0.0, lowest - 0.03), 1.03), xticks=ticks, xlim=(ticks[0] - 0.4, ticks[-1] + 0.4))
         for place in axes[-1]:
             place.set_xlabel("labelled groups, N")
         for place in axes[:, 0]:
             place.set_ylabel("fraction")
-        legend_below(figure, list(axes.flat), 3, handlelength=2.6)
-        return figure
+        legend_below(figure, list(axes.flat), 3)
+    return figure
 
 
-def _draw_method(axes: Axes, name: str, names: Sequence[str], points: NDArray[np.float64]) -> None:
-    """One of the methods ``names``; ``points``, (3, n), are N, mean and standard deviation."""
-    index, count = names.index(name), len(names)  # of colours there are 6, of lines 5: both again after 30
-    colour, line, marker = (looks[index % len(looks)] for looks in (METHOD_COLOURS, STYLES, MARKERS))
-    if points.shape[1] == 1:  # the others with one N lie at the same place
-        points[0] += (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
-    axes.plot(*points[:2], marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=name)
-    groups, mean, deviation = points[:, ~np.isnan(points).any(0)]
-    if len(mean) == 1:  # a band would have no width
-        axes.errorbar(groups, mean, deviation, color=colour, capsize=3, linewidth=1.2)
+def _draw_method(axes: Axes, rows: pd.DataFrame, index: int, count: int) -> None:
+    """Mean and standard deviation of one of so many methods against N."""
+    colour, line = PALETTE[index % len(PALETTE)], STYLES[index % len(STYLES)]
+    groups = rows["N"].to_numpy(np.float64)
+    middle, wide = rows["mean"].to_numpy(), rows["standard_deviation"].to_numpy()
+    if len(rows) == 1:  # methods with one N would lie at the same place
+        groups = groups + (index - (count - 1) / 2) * 0.06
+        axes.errorbar(groups, middle, wide, color=colour, capsize=3, linewidth=1.2)
     else:
-        axes.fill_between(groups, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
+        axes.fill_between(groups, middle - wide, middle + wide, color=colour, alpha=0.15, linewidth=0)
+    marker = MARKERS[index % len(MARKERS)]
+    label = rows["method"].iloc[0] if len(rows) else ""
+    axes.plot(groups, middle, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=label)
 
 
-QUESTION = Question(
-    look=look,
-    view=lambda work: {"rooms": rooms_table(work.rows)},
-    missing=missing,
-    pairs=PAIRS,
-    summary=summary,
-    sections=sections,
-    figures=figures,
-    needed={
-        "figure3": "ensemble artefacts of data of 1 to 7 labelled ladder groups: run montezuma-ladders --preset figure3"
-    },
-)
+def _draw_never(axes: Axes, never: pd.DataFrame, quantity: str) -> None:
+    """What it takes no seeing to score, dotted."""
+    score, scope, _ = quantity.split(", ")
+    rows = never[never["scope"] == scope].sort_values("N")
+    if score == "accuracy":
+        blind = rows["all_negative"]
+    else:
+        blind = pd.Series(0.5, rows.index).where(rows["positives"] > 0)
+    if len(rows) == 1:  # a line of one N is a point, which a method's marker may hide
+        axes.axhline(blind.iloc[0], color=GREY, linewidth=1.2, linestyle=":", zorder=0)
+    else:
+        axes.plot(rows["N"].to_numpy(np.float64), blind, ".:", color=GREY, linewidth=1.2, markersize=3)
+
+
+def missing(work: Work) -> list[str]:
+    """Spec F1: the methods that are not there, of a run with ladders."""
+    of_ensembles = [work.place(artefact) for artefact in work.contents.ensembles]
+    if not work.validated and not work.contents.ladders:
+        return []
+    return lacking([place["method"] for place in of_ensembles], "ensemble", "Figure 3")
+
+
+def lacking(methods: list[str], artefact: str, figures_lacking: str) -> list[str]:
+    """A line for each of the paper's methods that none of ``methods`` is."""
+    papers = [name for name in METHODS if name != "DivDis"]
+    absent = [name for name in papers if not any(method.startswith(name) for method in methods)]
+    return [f"no {artefact} of {name} ({figures_lacking})" for name in absent]

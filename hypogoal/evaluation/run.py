@@ -4,8 +4,8 @@ A damaged file is refused in one line (Spec G2).
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import AGAIN, MANIFEST, Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, read_json, visible
+from hypogoal.core.files import read_json, visible
 from hypogoal.core.own_code import command
 from hypogoal.data import reading
-from hypogoal.evaluation.table import EVALUATE_AGAIN
+from hypogoal.evaluation.house import EVALUATE_AGAIN, read_numbers
+from hypogoal.evaluation.page import Results
 from hypogoal.options.tables import MAX_INTEGER
 
-FORMAT = 4  # of ``metrics.json``
+FORMAT = 5  # of ``run.json``
 DEPTH = 3  # levels of folders below a run that are searched for artefacts
 
 
@@ -126,15 +127,6 @@ def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
         return {int(name): states[()] for name, states in file.items()}
 
 
-@dataclass(frozen=True)
-class Evaluated:
-    """A run that was evaluated: ``metrics`` of ``metrics.json``, ``arrays`` of ``arrays.h5`` by name."""
-
-    source: Artefact
-    metrics: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]]
-
-
 @contextlib.contextmanager
 def fitting(where: object) -> Iterator[None]:
     """Drawing an evaluation, whose numbers are a file's: what does not fit is told in one line."""
@@ -152,43 +144,37 @@ def evaluation_of(run: Path) -> Artefact:
     return next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
 
 
-def read_evaluation(run: Path, start: str = "") -> Evaluated:
-    """The evaluation of a run, see :func:`evaluation_of`.
+def read_evaluation(run: Path) -> Results:
+    """What was found in a run, see :func:`evaluation_of`; its artefacts made since are among what is ``missing``.
 
-    Of the arrays only those whose names begin with ``start``. What was made since is among ``missing``. A run that was
-    not evaluated, or a damaged evaluation, is a ``UserError``.
+    A run that was not evaluated, or a damaged evaluation, is a ``UserError``.
     """
     source = evaluation_of(run)
-    metrics = read_numbers(source)
-    metrics["missing"] = [*metrics["missing"], *_since(run, source)]
+    results = with_missing(read_results(source), _since(run, source))
     with reading(source.path / "arrays.h5", "the evaluation's arrays", EVALUATE_AGAIN) as file:
         names: list[str] = []
         file.visit(names.append)
-        items = {name: file[name] for name in names if name.startswith(start)}
-        arrays = {name: np.asarray(item) for name, item in items.items() if hasattr(item, "shape")}
-    return Evaluated(source, metrics, arrays)
+        arrays = {name: file[name][()] for name in names if hasattr(file[name], "shape")}
+    return replace(results, arrays=arrays)
 
 
-def read_numbers(source: Artefact) -> dict[str, Any]:
-    """``metrics.json`` of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
-    path = open_artefact(source.path).path / "metrics.json"
-    metrics = read_json(path, "the evaluation is", EVALUATE_AGAIN)
-    if not isinstance(metrics, dict) or not isinstance(metrics.get("missing"), list):
+def with_missing(results: Results, lines: Sequence[str]) -> Results:
+    """The same, with more lines about what is missing."""
+    return replace(results, facts={**results.facts, "missing": [*results.facts["missing"], *lines]})
+
+
+def read_results(source: Artefact) -> Results:
+    """The numbers and facts of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
+    path = open_artefact(source.path).path / "run.json"
+    if not path.exists():
+        raise UserError("a version of hypogoal before 1.0 evaluated this", source.path, EVALUATE_AGAIN)
+    facts = read_json(path, "the evaluation is", EVALUATE_AGAIN)
+    if not isinstance(facts, dict) or not isinstance(facts.get("missing"), list):
         raise UserError("the evaluation is damaged", path, EVALUATE_AGAIN)
-    if (made_with := metrics.get("format", 1)) != FORMAT:
-        difference = f"another version of hypogoal evaluated this (format {made_with}, needed: {FORMAT})"
-        raise UserError(difference, path, "Evaluate the run again, with --force.")
-    for name in _sub_goals(metrics):
-        if not plain_name(name):
-            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, EVALUATE_AGAIN)
-    return metrics
-
-
-def _sub_goals(part: Any) -> Iterator[Any]:
-    if isinstance(part, dict):
-        yield from [part["sub_goal"]] if "sub_goal" in part else []
-    for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
-        yield from _sub_goals(inner)
+    if facts.get("format") != FORMAT:
+        problem = f"another version of hypogoal evaluated this (format {facts.get('format')}, needed: {FORMAT})"
+        raise UserError(problem, path, EVALUATE_AGAIN)
+    return Results(read_numbers(source.path / "numbers.csv"), facts)
 
 
 def _since(run: Path, source: Artefact) -> list[str]:
@@ -198,7 +184,9 @@ def _since(run: Path, source: Artefact) -> list[str]:
         contents = find(run)
     except UserError:  # evaluations may lie where nothing else does
         return []
-    names = [contents.name(artefact) for artefact in contents.everything() if sha256_of(artefact.path) not in evaluated]
-    elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
-    do = f"evaluate it again: {command('evaluate', run, *elsewhere, '--force')}" if names else ""
-    return [f"{name}: made since this evaluation ({do})" for name in names]
+    again = f"evaluate it again: {command('evaluate', run, '--force')}"
+    return [
+        f"{contents.name(artefact)}: made since this evaluation ({again})"
+        for artefact in contents.everything()
+        if sha256_of(artefact.path) not in evaluated
+    ]

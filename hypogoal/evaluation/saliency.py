@@ -1,81 +1,99 @@
-"""Figures 2 and 9: what each member goes by in a few held-out states (Spec F2)."""
+"""Figures 2 and 9, and a gallery: what each member looks at in held-out states (Spec F2, F6)."""
 
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.data import fixed, open_dataset
-from hypogoal.evaluation import page
+from hypogoal.core.seeding import rng_for
+from hypogoal.data import Dataset, open_dataset
+from hypogoal.evaluation.house import tidy_members
 from hypogoal.evaluation.judging import Judgement, Work, parts_of
-from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.pictures import attribution_image, brightness, flat, image_png
-from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
-from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.page import Drawn, Results, fixed, picture, source
+from hypogoal.evaluation.pictures import (
+    FULL,
+    attribution_image,
+    brightness,
+    coloured,
+    flat,
+    image_png,
+    last_frame,
+    reduced,
+    to_bytes,
+)
+from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, legend_below, pictures, plot, show_picture, styled
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
-SPREAD = "spread"  # a state as any other
-KINDS = {"true positive": "a true positive", "disagree": "members disagree", "false positive": "a false positive"}
-NEEDED = "an ensemble artefact on pictures with a member that calls a held-out state reached: train-ensemble"
-SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
-COLOURS = "Orange speaks for 'reached', blue against it; each picture has its own scale."
-EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
+TITLE = "What members look at"
+KINDS = ("true positive", "disagree", "false positive")  # of states whose attributions are drawn large
+GALLERY = 40  # states of all sub-goals
+EXPLAINED = 20  # of these with attributions: DeepLift takes .05 s for a state and member
+INTEGRATED = 5  # where they are integrated gradients: of a large network seconds
 AVERAGED = 64  # states over which attributions to features are averaged
 MOST_BARS = 15  # features
-KEY = 0.75  # inches below all pictures
+PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
+SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
+NEEDED_BY_BOTH = "an ensemble on pictures that has positive predictions"
+NEEDED = {"figure2": NEEDED_BY_BOTH, "figure9": NEEDED_BY_BOTH}
 
 
-def look(work: Work, judgement: Judgement) -> Iterable[Row]:
-    """Attributions of the ensemble that is shown; on states of unseen rooms where positives are in them.
+def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
+    """Attributions of the ensemble whose options were learned most often, on a few states of unseen contexts.
 
-    ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
-    what members saw, ``seen`` uint8 (n, h, w, C), against ``baseline``. Where they are no pictures, of states spread
-    over the held-out ones, with ``features``' names. Of mixed ones a picture's attributions are added up, and
-    ``maps/KEY`` has them pixel by pixel, float32 (K, H, W, C), of one state.
+    ``saliency/SUB_GOAL`` is written: the states and their ``attributions``, float32 (n, K, H, W, C), in log-odds, to
+    what members saw, ``seen``, against the mean of the unlabelled states. Where they are no pictures, of states spread
+    over the held-out ones. Of mixed ones a picture's attributions are added up, and ``maps/KEY`` has them pixel by
+    pixel, (K, H, W, C), of one state. ``gallery/SUB_GOAL``: states on which members disagree.
     """
-    if judgement.number != work.shown:
-        return ()
-    split, sub_goal, judged = judgement.split, judgement.case.sub_goal, judgement.judged
-    strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
-    among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
-    labels, probabilities, predictions = split.labels[among], judged.probabilities[among], judged.predictions[among]
-    pictures = split.observations.dtype == PICTURE
-    explained = pick_to_explain(probabilities, predictions, labels)
-    if not pictures:
-        first = explained[:1] if split.observations.dtype.names else []
-        explained = first + [(at, SPREAD) for at in spread_rows(len(among), AVERAGED).tolist()]
-    picked = [(int(among[index]), kind) for index, kind in explained]
-    judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
-    states: list[dict[str, Any]] = []
-    if explained:
-        from hypogoal.hypotheses.deep_lift import attributed, by_key, explanation
+    if judgement.number != work.browsed:
+        return
+    from hypogoal.hypotheses.deep_lift import attributed
 
-        ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
-        explanation_of_states = attributed(ensemble, seen, baseline)
-        group = work.arrays[f"saliency/{sub_goal}"]
-        values = explanation_of_states.values.astype(np.float32)
-        if not seen.dtype.names:
-            group["baseline"] = baseline
-        else:
-            parts, rows = by_key(values, seen.dtype), []
-            for key, (dtype, _) in fields_of((), seen.dtype).items():
-                rows.append(parts[key].reshape(*values.shape[:2], -1))
-                if dtype == PICTURE:
-                    group[f"maps/{key}"], rows[-1] = parts[key][0], rows[-1].sum(-1, keepdims=True)
-            values = np.concatenate(rows, axis=-1)
-        group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
-        for name, part in parts_of(seen, "seen"):
-            group[name] = part
-        if not pictures:
-            group["features"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
-        states = explanation(explanation_of_states, explained)
-    work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
-    return ()
+    split, sub_goal = judgement.split, judgement.case.sub_goal
+    dataset = open_dataset(judgement.case.data)
+    states, kinds = _to_explain(judgement)
+    facts: dict[str, Any] = {"kinds": kinds, "states": len(split.labels)}
+    looked_at = work.facts.setdefault("looked_at", {"ensemble": work.place_of(judgement), "sub_goals": {}})
+    looked_at["sub_goals"][sub_goal] = facts
+    if len(states):
+        group = work.arrays.create_group(f"saliency/{sub_goal}")
+        facts["places"] = judgement.write_states(group, states)
+        ensemble, seen, baseline = judgement.see(states)
+        attributions = attributed(ensemble, seen, baseline)
+        _write_attributions(group, attributions.values.astype(np.float32), seen)
+        error = attributions.completeness_error()
+        facts |= {"how": attributions.method, "completeness_error": float(error.max())}
+        if kinds:
+            for row, kind in enumerate(kinds):
+                columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
+                yield tidy_members(columns, **work.place_of(judgement), scope=f"state: {kind}")
+    if split.observations.dtype == PICTURE:
+        facts |= {"colours": _colours(dataset), **_write_gallery(work.arrays, judgement)}
+    else:
+        facts["features"] = dataset.features()
+
+
+def _colours(dataset: Dataset) -> int:
+    """How many colours each frame of a stack has."""
+    default = 3 if dataset.observation_shape[-1] == 3 else 1
+    return dataset.channels.get("", (1, default))[1]
+
+
+def _to_explain(judgement: Judgement) -> tuple[NDArray[np.int64], list[str]]:
+    """Which held-out states are explained, and of pictures their kinds; of unseen rooms where positives are in them."""
+    split, judged = judgement.split, judgement.judged
+    unseen = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
+    among = np.flatnonzero(unseen) if split.labels[unseen].any() else np.arange(len(unseen))
+    picked = pick_to_explain(judged.probabilities[among], judged.predictions[among], split.labels[among])
+    if split.observations.dtype == PICTURE:
+        return among[[state for state, _ in picked]].astype(np.int64), [kind for _, kind in picked]
+    first = [state for state, _ in picked[:1]] if split.observations.dtype.names else []
+    return among[[*first, *spread_rows(len(among), AVERAGED).tolist()]], []
 
 
 def pick_to_explain(
@@ -86,197 +104,241 @@ def pick_to_explain(
     ``true positive``: where most of K members are right and surest on average; ``disagree``: where members differ and
     their probabilities are furthest apart; ``false positive``: where most err, and are surest. Fewer where none are.
     """
-    positive, mean = predictions.sum(1), probabilities.mean(1)
-    spread = probabilities.max(1) - probabilities.min(1)
+    positive = predictions.sum(axis=1)
+    surest = -(positive + probabilities.mean(axis=1))
+    apart = probabilities.min(axis=1) - probabilities.max(axis=1)
+    candidates = (
+        (labels & (positive > 0), surest),
+        ((positive > 0) & (positive < predictions.shape[1]), apart),
+        (~labels & (positive > 0), surest),
+    )
     picked: list[tuple[int, str]] = []
-    for kind, mask, order in (
-        ("true positive", labels & (positive > 0), -(positive + mean)),
-        ("disagree", (positive > 0) & (positive < predictions.shape[1]), -spread),
-        ("false positive", ~labels & (positive > 0), -(positive + mean)),
-    ):
+    for kind, (mask, order) in zip(KINDS, candidates, strict=True):
         free = mask.copy()
-        free[[index for index, _ in picked]] = False
+        free[[state for state, _ in picked]] = False
         if free.any():
             picked.append((int(np.where(free, order, np.inf).argmin()), kind))
     return picked
 
 
-def _about(material: Material, states: Sequence[Entry]) -> str:
-    saliency = material.metrics["saliency"]
-    return (
-        f"Attributions by {states[0]['method'] if states else 'DeepLift'} of each member of {saliency['ensemble']} "
-        f"(seed {saliency['seed']}), against {saliency['baseline']}."
-    )
+def _write_attributions(group: Any, values: NDArray[np.float32], seen: Any) -> None:
+    from hypogoal.hypotheses.deep_lift import by_key
+
+    if seen.dtype.names:
+        parts = by_key(values, seen.dtype)
+        rows = []
+        for key, (dtype, _) in fields_of((), seen.dtype).items():
+            of_key = parts[key].reshape(*values.shape[:2], -1)
+            if dtype == PICTURE:
+                group[f"maps/{key}"] = parts[key][0]
+                of_key = of_key.sum(axis=-1, keepdims=True)
+            rows.append(of_key)
+        values = np.concatenate(rows, axis=-1)
+    group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
+    for name, part in parts_of(seen, "seen"):
+        group[name] = part
 
 
-def sections(material: Material) -> list[Block]:
-    """Attributions of every member of one ensemble on a few held-out states."""
-    saliency = material.metrics["saliency"]
-    title = "What members look at"
-    if saliency is None:
-        lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
-        return [page.section("saliency", title, [], [], lacking, folded=True)]
-    states = [state for goal in saliency["sub_goals"] for state in goal["states"]]
-    errors = [member["completeness_error"] for state in states for member in state["members"]]
-    text = (
-        f"{_about(material, states)} What a state shares with that mean gets no attribution. {COLOURS} The state shows "
-        "through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member that "
-        "goes by what other contexts lack cannot transfer."
-    )
-    blocks = [page.shown(material, drawn) for drawn in feature_figures(material)]
-    if blocks:
-        text = f"{_about(material, states)} A member that goes by what means something else elsewhere cannot transfer."
+def _write_gallery(arrays: Any, judgement: Judgement) -> dict[str, Any]:
+    """Write states to look through into ``gallery/SUB_GOAL``, with attributions of the first of them."""
+    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, method_of
+
+    split, sub_goal = judgement.split, judgement.case.sub_goal
+    sub_goals = len(judgement.case.config["sub_goals"])
+    places = [split.origins[name] for name in PLACES if name in split.origins]
+    states = pick_for_gallery(judgement.judged.predictions, split.labels, places, rng_for(0, "browse", sub_goal))
+    states = states[: GALLERY // sub_goals]
+    group = arrays.create_group(f"gallery/{sub_goal}")
+    places_of = judgement.write_states(group, states)
+    ensemble, seen, baseline = judgement.see(states[: EXPLAINED // sub_goals])
+    if method_of(ensemble.members[0]) != DEEP_LIFT:
+        seen = seen[: INTEGRATED // sub_goals]
+    colours = _colours(open_dataset(judgement.case.data))
+    if len(seen):
+        values = flat(attributed(ensemble, seen, baseline).values, colours)
+        group["attributions"] = to_bytes(values)
+        group["brightness"] = brightness(seen, colours)
+    return {"gallery_places": places_of}
+
+
+def pick_for_gallery(
+    predictions: NDArray[np.bool_],
+    labels: NDArray[np.bool_],
+    places: Sequence[NDArray[np.int64]],
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """States by how interesting they are, int64 (N,): kinds of outcome take turns, and within each the places.
+
+    Takes predictions (N, K), labels (N,), places (N,) each. First come states on which members disagree, then those on
+    which all err, then the others; ``rng`` draws among states alike.
+    """
+    errors = (predictions != labels[:, None]).sum(axis=1)
+    outcome = np.where(errors == 0, 2, np.where(errors == predictions.shape[1], 1, 0))
+    order = rng.permutation(len(labels))
+    if places:
+        _, place = np.unique(np.stack(places, axis=1), axis=0, return_inverse=True)
+        order = take_turns(order, place.reshape(-1))
+    order = take_turns(order, outcome * 2 + labels)
+    return order[np.argsort(outcome[order] == 2, kind="stable")]
+
+
+def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Indices (n,), better ones first, reordered so that ``groups`` (N,) take turns: each one's first, second, ..."""
+    turn = pd.Series(order).groupby(groups[order]).cumcount().to_numpy()
+    return order[np.argsort(turn, kind="stable")]
+
+
+def context(results: Results) -> dict[str, Any] | None:
+    """For the template: whose members, and the states of the gallery."""
+    looked_at = results.facts.get("looked_at")
+    if looked_at is None:
+        return None
+    sub_goals = looked_at["sub_goals"]
+    states = []
+    for name, facts in sub_goals.items():
+        states += _gallery_states(results.within(f"gallery/{name}"), name, facts)
+    explained = [facts for facts in sub_goals.values() if facts.get("how")]
+    return {
+        "ensemble": looked_at["ensemble"],
+        "how": explained[0]["how"] if explained else None,
+        "error": max((facts["completeness_error"] for facts in explained), default=0.0),
+        "is_of_numbers": any("features" in facts for facts in sub_goals.values()),
+        "states": states,
+        "sub_goals": [*sub_goals],
+        "total": max(facts["states"] for facts in sub_goals.values()),
+        "places": sorted({state["place"] for state in states}),
+    }
+
+
+def _gallery_states(
+    arrays: Mapping[str, NDArray[Any]], sub_goal: str, facts: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Each state's pictures and what members predict of it."""
+    states = []
+    explained = arrays.get("attributions", ())
+    for index in range(len(arrays.get("labels", ()))):
+        truth = bool(arrays["labels"][index])
+        maps = [""] * len(arrays["predictions"][index])
+        if index < len(explained):
+            grey = reduced(arrays["brightness"][index] / 255)
+            images = [attribution_image(reduced(values / FULL), grey) for values in explained[index]]
+            maps = [source(image_png(image), "png") for image in images]
+        members = []
+        for says, probability, attributions in zip(
+            arrays["predictions"][index], arrays["probabilities"][index], maps, strict=True
+        ):
+            members.append({"says": bool(says), "probability": fixed(probability), "map": attributions})
+        wrong = sum(member["says"] != truth for member in members)
+        outcome = "all right" if wrong == 0 else "all wrong" if wrong == len(members) else "disagree"
+        shown = picture(coloured(arrays["observations"][index], facts["colours"]))
+        place = facts["gallery_places"][index]
+        texts = {"sub_goal": sub_goal, "truth": truth, "outcome": outcome, "place": place}
+        states.append({"source": shown, "members": members, **texts})
+    return states
+
+
+def figures(results: Results) -> Iterator[Drawn]:
+    """Figures 2 and 9 of each sub-goal, a true positive where there is one; of numbers, which features members use."""
+    looked_at = results.facts.get("looked_at")
+    explained = {}
+    for name, facts in (looked_at["sub_goals"] if looked_at else {}).items():
+        if facts.get("how"):
+            explained[name] = facts
+    for sub_goal, facts in explained.items():
+        arrays = results.within(f"saliency/{sub_goal}")
+        suffix = f"-{sub_goal}" if len(explained) > 1 else ""
+        if "features" in facts:
+            values = np.abs(arrays["attributions"]).mean(axis=0)
+            bars = bars_of_features(values.reshape(len(values), -1), facts["features"])
+            yield Drawn(f"features{suffix}", "What members go by", bars, {"sub_goal": sub_goal})
+            cameras = [name.removeprefix("maps/") for name in arrays if name.startswith("maps/")]
+            if cameras:
+                maps = attributions_of_cameras(arrays, cameras)
+                yield Drawn(f"cameras{suffix}", "Where members look", maps, {"sub_goal": sub_goal})
+            continue
+        names = ("observations", "seen", "attributions", "probabilities", "predictions", "labels")
+        state = {name: arrays[name][0] for name in names}
+        details = {"sub_goal": sub_goal, "kind": facts["kinds"][0], "place": facts["places"][0]}
+        details["colours"] = facts["colours"]
+        figure2 = attributions_of_members(state, facts["colours"])
+        figure9 = attributions_of_channels(state, facts["colours"])
+        yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", figure2, details)
+        yield Drawn(f"figure9{suffix}", "Figure 9: attributions of every frame", figure9, details)
+
+
+def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
+    word = "positive" if state["predictions"][member] else "negative"
+    right = bool(state["predictions"][member]) == bool(state["labels"])
+    return f"member {member}: {word} {state['probabilities'][member]:.2f}" + ("" if right else ", wrong")
+
+
+def attributions_of_members(state: Mapping[str, NDArray[Any]], colours: int) -> Figure:
+    """Figure 2: a state and what each member goes by in it; of a stack of frames the last."""
+    grey = brightness(state["seen"], colours) / 255
+    truth = "positive" if state["labels"] else "negative"
+    panels = [(coloured(state["observations"], colours), f"truth: {truth}")]
+    for member, values in enumerate(state["attributions"]):
+        panels.append((attribution_image(flat(values, colours), grey), _said(state, member)))
+    return _grid(panels, min(4, len(panels)))
+
+
+def attributions_of_channels(state: Mapping[str, NDArray[Any]], colours: int) -> Figure:
+    """Figure 9: a row per member, a column per frame, oldest first, above them the frames; of one frame its colours."""
+    channels = state["seen"].shape[-1]
+    per_column = colours if channels > colours else 1
+    starts = range(0, channels, per_column)
+    if channels == colours == 3:
+        names = ["red", "green", "blue"]
     else:
-        blocks = [
-            _cards(material, goal["sub_goal"], index, state)
-            for goal in saliency["sub_goals"]
-            for index, state in enumerate(goal["states"])
-        ]
-    check = (
-        "Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
-        f"{max(errors, default=0.0):.0e} (log-odds)."
-    )
-    missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
-    return [page.section("saliency", title, [text, check if errors else ""], blocks, missing, folded=True)]
-
-
-def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block:
-    arrays = material.within(f"saliency/{sub_goal}")
-    observation, truth = arrays["observations"][index], bool(arrays["labels"][index])
-    place = page.texts(arrays["places"])[index]
-    cards = [
-        {
-            "png": page.picture(observation),
-            "alt": f"A held-out state; {sub_goal} is {'reached' if truth else 'not reached'}.",
-            "title": f"truth: {page.label_of(truth)}",
-            "lines": [{"class": "negative", "text": place}] if place else [],
-        }
-    ]
-    for member in state["members"]:
-        number = member["member"]
-        prediction = page.verdict(arrays["probabilities"][index, number], arrays["verdicts"][index, number], truth)
-        lines = [prediction]
-        if observation.shape[-1] != 3 and member["last_frame"] is not None:
-            lines.append({"class": "negative", "text": f"last frame: {100 * member['last_frame']:.0f} %"})
-        values = flat(arrays["attributions"][index, number])
-        drawn = image_png(attribution_image(values, brightness(arrays["seen"][index]) / 255))
-        alt = f"Attributions of member {number}, which predicts {prediction['text']}."
-        cards.append({"png": page.encoded(drawn), "alt": alt, "title": f"member {number}", "lines": lines})
-    return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
-
-
-def feature_figures(material: Material) -> Iterator[Drawn]:
-    """Of observations that are no pictures: which features each member goes by, a plot for each sub-goal."""
-    saliency = material.metrics["saliency"]
-    for goal in (goal["sub_goal"] for goal in (saliency["sub_goals"] if saliency and material.of_numbers() else ())):
-        arrays = material.within(f"saliency/{goal}")
-        caption = f"Mean absolute attribution on held-out states of {goal}, the {MOST_BARS} largest at most."
-        values = np.abs(arrays["attributions"]).mean(0)
-        plot = bars_of_features(values.reshape(len(values), -1), page.texts(arrays["features"]))
-        yield Drawn(f"features-{goal}", f"What members go by: {goal}", plot, caption, heading=goal)
-        cameras = [name.removeprefix("maps/") for name in arrays if name.startswith("maps/")]
-        if cameras:
-            maps = attributions_of_cameras(arrays, cameras)
-            yield Drawn(f"cameras-{goal}", f"Where members look: {goal}", maps, f"Attributions in one state. {COLOURS}")
+        names = [f"{age} before" if age else "newest frame" for age in range(len(starts) - 1, -1, -1)]
+    frames = [state["seen"][..., start : start + per_column] for start in starts]
+    panels = [(coloured(frame, per_column), name) for frame, name in zip(frames, names, strict=True)]
+    for member, values in enumerate(state["attributions"]):
+        for start, frame in zip(starts, frames, strict=True):
+            part = values[..., start : start + per_column].sum(axis=-1)
+            title = "" if start else _said(state, member)
+            panels.append((attribution_image(part, frame.mean(axis=-1) / 255), title))
+    return _grid(panels, len(frames))
 
 
 def attributions_of_cameras(arrays: Mapping[str, NDArray[Any]], cameras: Sequence[str]) -> Figure:
     """A row per camera of mixed observations: its picture in one state, and what each member goes by in it."""
-    state = {name: arrays[name][0] for name in ("probabilities", "verdicts", "labels")}
+    state = {name: arrays[name][0] for name in ("probabilities", "predictions", "labels")}
     panels = []
     for camera in cameras:
-        grey = brightness(arrays[f"seen/{camera}"][:1])[0] / 255
-        panels.append((arrays[f"observations/{camera}"][0], camera))
+        grey = brightness(arrays[f"seen/{camera}"][0]) / 255
+        panels.append((last_frame(arrays[f"observations/{camera}"][0]), camera))
         for member, values in enumerate(arrays[f"maps/{camera}"]):
             title = _said(state, member) if camera == cameras[0] else ""
             panels.append((attribution_image(flat(values), grey), title))
-    return _grid(panels, 1 + len(arrays["probabilities"][0]))
+    return _grid(panels, 1 + len(state["predictions"]))
 
 
 def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:
     """Bars side by side, those of features that members (K, numbers) go by most."""
-    order = np.argsort(-values.mean(0), kind="stable")[:MOST_BARS]
-    high, places = 0.8 / len(values), np.arange(len(order))
-    with drawing(0.7 + 0.35 * len(order), 4) as (figure, axes):
+    order = np.argsort(-values.mean(axis=0), kind="stable")[:MOST_BARS]
+    high = 0.8 / len(values)
+    places = np.arange(len(order))
+    with styled():
+        figure, axes = plot(0.7 + 0.35 * len(order))
         for member, of_member in enumerate(values):
             colour = PALETTE[member % len(PALETTE)]
             axes.barh(places + high * member, of_member[order], high, color=colour, label=f"member {member}")
         axes.set_yticks(places + (0.8 - high) / 2, [names[feature] for feature in order])
         axes.invert_yaxis()
         axes.set_xlabel("mean absolute attribution, log-odds")
+        legend_below(figure, [axes], 4)
     return figure
-
-
-def figures(material: Material) -> Iterator[Drawn]:
-    """Figures 2 and 9: of each sub-goal the first state that is explained, a true positive where there is one."""
-    if material.of_numbers():
-        yield from feature_figures(material)
-        return
-    saliency = material.metrics["saliency"]
-    goals = [goal for goal in (saliency["sub_goals"] if saliency else ()) if goal["states"]]
-    for goal in goals:
-        arrays = material.within(f"saliency/{goal['sub_goal']}")
-        state = {name: arrays[name][0] for name in EXPLAINED}
-        suffix = f"-{goal['sub_goal']}" if len(goals) > 1 else ""
-        place = page.texts(arrays["places"])[0]
-        error = max(member["completeness_error"] for member in goal["states"][0]["members"])
-        description = (
-            f"{_about(material, goal['states'])} A held-out state of {goal['sub_goal']}"
-            f"{f' ({place})' if place else ''}: {KINDS[goal['states'][0]['kind']]}. {COLOURS} They add up to the "
-            f"difference in log-odds within {error:.0e}."
-        )
-        colours = state["seen"].shape[-1] == 3
-        every = "Colour by colour." if colours else "Every frame that members see."
-        last = "" if colours else " Of the stack of frames the last."
-        members, frames = attributions_of_members(state), attributions_of_every_frame(state)
-        yield Drawn(f"figure2{suffix}", "Figure 2", members, f"Figure 2 of the paper. {description}{last}")
-        yield Drawn(f"figure9{suffix}", "Figure 9", frames, f"Figure 9 of the paper. {description} {every}")
-
-
-def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
-    prediction = page.verdict(state["probabilities"][member], state["verdicts"][member], bool(state["labels"]))
-    return f"member {member}: {prediction['text']}"
-
-
-def attributions_of_members(state: Mapping[str, NDArray[Any]]) -> Figure:
-    """Figure 2: what each member goes by in one state, of which ``state`` holds ``EXPLAINED``; of a stack the last."""
-    grey = brightness(state["seen"]) / 255
-    panels = [(state["observations"], f"truth: {page.label_of(bool(state['labels']))}")]
-    for member, values in enumerate(state["attributions"]):
-        panels.append((attribution_image(flat(values), grey), _said(state, member)))
-    return _grid(panels, min(4, len(panels)))
-
-
-def attributions_of_every_frame(state: Mapping[str, NDArray[Any]]) -> Figure:
-    """Figure 9: a row per member, a column per frame, oldest first, above them the frames; of colours one of each."""
-    frames = np.moveaxis(state["seen"], -1, 0)
-    ages = [f"{age} step{'s' if age > 1 else ''} before" for age in range(len(frames) - 1, 0, -1)]
-    names = ["red", "green", "blue"] if len(frames) == 3 else [*ages, "newest frame"]
-    panels = list(zip(frames, names, strict=True))
-    for member, values in enumerate(state["attributions"]):
-        for channel, frame in enumerate(frames):
-            title = "" if channel else _said(state, member)
-            panels.append((attribution_image(values[..., channel], frame / 255), title))
-    return _grid(panels, len(frames))
 
 
 def _grid(panels: Sequence[tuple[NDArray[np.uint8], str]], columns: int) -> Figure:
     """Pictures with titles, and what the colours mean; each has a scale of its own, so the key has no numbers."""
-    figure, places = grid_of_pictures(-(-len(panels) // columns), columns, KEY)
-    for place, (image, title) in zip(places, panels, strict=False):
-        show_picture(place, image, title)
-    where: dict[str, Any] = {"location": "bottom", "fraction": 0.05, "shrink": 0.6, "aspect": 40}
     with styled():
-        bar = figure.colorbar(ScalarMappable(Normalize(-1, 1), SIGNED), ax=places, **where)
+        figure, places = pictures(-(-len(panels) // columns), columns)
+        for place, (image, title) in zip(places, panels, strict=False):
+            show_picture(place, image, title)
+        key = ScalarMappable(Normalize(-1, 1), SIGNED)
+        bar = figure.colorbar(key, ax=places, location="bottom", fraction=0.05, shrink=0.6, aspect=40)
         bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
         bar.set_label("attribution in log-odds, each picture on its own scale")
     return figure
-
-
-QUESTION = Question(
-    look=look,
-    view=lambda work: {"saliency": work.kept("saliency", work.shown)},
-    sections=sections,
-    figures=figures,
-    needed={"figure2": NEEDED, "figure9": NEEDED},
-)

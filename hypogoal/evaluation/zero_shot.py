@@ -5,24 +5,22 @@ What limits an agent, its options tell: they stop at a false positive of their m
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
-from rich.table import Table as Printed
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain
-from hypogoal.evaluation import page
-from hypogoal.evaluation.choosing import UNIFORM, UNIFORM_CHOICE
 from hypogoal.evaluation.curves import NEAR, scores
+from hypogoal.evaluation.house import over, per_run
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import Metrics
-from hypogoal.evaluation.page import Block, Material, Question
-from hypogoal.evaluation.table import Number, Row, Table, by_fields, rows_of, select, tabulate
+from hypogoal.evaluation.names import UNIFORM
+from hypogoal.evaluation.page import Results, bounded, displayed
 from hypogoal.meta.config import layout_seeds
 
 if TYPE_CHECKING:
@@ -32,7 +30,6 @@ EPISODES = 3  # of an agent on each layout
 AT_ONCE = 100  # layouts
 PATIENCE = 10  # timeouts after which an option alone is given up
 OF_AGENTS, OF_OPTIONS = ("success", "near", "within_2", "length"), ("success", "near", "within_2", "false_positives")
-MEAN = "mean"  # in place of a member's number
 TITLE = "On other layouts, without learning"
 SCOPE = "zero-shot"
 Played = dict[str, NDArray[np.float64]]  # a number of each layout (L,)
@@ -100,123 +97,70 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> list[tuple[dict[str,
     return players
 
 
-def rows(work: Work) -> Iterator[Row]:
+def rows(work: Work) -> Iterator[pd.DataFrame]:
     """Every agent, uniform-random choice among its options, and each option on every layout; none without layouts."""
     for artefact in work.contents.agents if work.layouts else ():
         if "options.safetensors" not in artefact.manifest.files:
             work.progress.advance(len(work.layouts))
             continue
-        path = work.contents.name(artefact)
-        place = {"method": work.agent_of[path], "scope": SCOPE, "seed": artefact.seed, "artefact": path}
-        parts = []
+        place = {**work.place(artefact), "scope": SCOPE}
         for first in range(0, len(work.layouts), AT_ONCE):
             layouts = work.layouts[first : first + AT_ONCE]
-            parts.append(played(artefact, layouts))
+            for fields, numbers in played(artefact, layouts):
+                wide = pd.DataFrame(numbers).assign(layout=layouts)
+                fields = {name: value for name, value in {**place, **fields}.items() if name != "layout"}
+                yield wide.melt("layout", var_name="quantity").assign(**fields)
             work.progress.advance(len(layouts))
-        for players in zip(*parts, strict=True):  # the same one on all layouts
-            where = place | players[0][0]
-            names = OF_OPTIONS if "member" in where else OF_AGENTS
-            columns = [np.concatenate([scores[name] for _, scores in players]).tolist() for name in names]
-            for layout, *numbers in zip(work.layouts, *columns, strict=True):
-                yield from rows_of(dict(zip(names, numbers, strict=True)), **where, layout=layout)
 
 
-def _columns(names: Sequence[str]) -> dict[str, Number]:
-    return {name: Number(name, SCOPE, "steps" if name == "length" else "fraction") for name in names}
+def facts(work: Work) -> dict[str, Any]:
+    """The layouts, and on how many of them each agent was trained, too."""
+    trained: dict[str, int] = {}
+    for artefact in work.contents.agents if work.layouts else ():
+        seeds = layout_seeds(artefact.config.get("layouts") or "", artefact.config["layout_seed"])
+        name = work.place(artefact)["method"]
+        trained[name] = max(trained.get(name, 0), len({*seeds}.intersection(work.layouts)))
+    return {"other_layouts": [*work.layouts], "trained_on": trained}
 
 
-def view(work: Work) -> dict[str, Any]:
-    """Over layouts: ``agents``, each with uniform-random choice among its options below it, and ``options`` alone."""
-    if not work.layouts:
-        return {}
-
-    def agent(row: Row) -> str:
-        return work.agent_of[row.artefact]
-
-    rows = select(work.rows, scope=SCOPE)
-    by_chooser = Table(
-        {"agent": agent, "name": "method"},
-        _columns(OF_AGENTS),
-        cell=lambda key: (SCOPE, key[0], UNIFORM if key[1] == UNIFORM else "agent"),
-    )
-    by_member = Table(
-        {"agent": agent, "sub_goal": "sub_goal", "member": "member"},
-        _columns(OF_OPTIONS),
-        cell=lambda key: (SCOPE, *map(str, key)),
-    )
-    agents = tabulate((row for row in rows if not row.sub_goal), by_chooser)
-    for entry in agents:
-        configs = [run.config for run in work.agents[entry["agent"]]]
-        trained = [layout_seeds(config.get("layouts", ""), config["layout_seed"]) for config in configs]
-        entry["trained_on"] = max(len({*seeds}.intersection(work.layouts)) for seeds in trained)
-    of_options: list[Row] = []  # the mean member of each sub-goal, then each member
-    for members in by_fields((row for row in rows if row.sub_goal), agent, "sub_goal").values():
-        of_options += [*(row._replace(member=MEAN) for row in members), *members]
-    return {"zero_shot": {"layouts": list(work.layouts), "agents": agents, "options": tabulate(of_options, by_member)}}
+def tables(results: Results) -> dict[str, pd.DataFrame]:
+    """Over layouts: agents, uniform-random choice among their options, and each option alone and the mean member."""
+    numbers = results.of(scope=SCOPE)
+    methods = numbers[numbers["method"] != UNIFORM].drop_duplicates("artefact").set_index("artefact")["method"]
+    agents = pd.concat([per_run(numbers[numbers["sub_goal"] == ""], name, SCOPE) for name in OF_AGENTS])
+    chooser = agents["method"].where(agents["method"] == UNIFORM, "the agent's")
+    agents = agents.assign(chooser=chooser, method=agents["artefact"].map(methods))
+    of_options = numbers[numbers["sub_goal"] != ""]
+    parts = [per_run(of_options, name, SCOPE).assign(member="mean") for name in OF_OPTIONS]
+    for member, of_member in of_options.groupby("member"):
+        parts += [per_run(of_member, name, SCOPE).assign(member=str(member)) for name in OF_OPTIONS]
+    options = pd.concat(parts)
+    return {
+        "other-layouts": over(agents, ["method", "chooser"]),
+        "other-layouts-options": over(options, ["method", "sub_goal", "member"]),
+    }
 
 
-SCORES = (
-    page.number("success, %", "success", page.interval, 0, 100),
-    page.number(f"within {NEAR} shortest, %", "near", page.interval, 0, 100),
-    page.number("within 2, %", "within_2", page.interval, 0, 100),
-)
-AGENTS = (
-    page.label("agent", lambda entry: UNIFORM_CHOICE if entry["name"] == UNIFORM else entry["name"]),
-    *SCORES,
-    page.number("steps", "length", page.interval, 0),
-    page.number("trained on", "trained_on"),
-    page.number("runs", "runs"),
-)
-OPTIONS = (
-    page.label("options of", "agent", once=True),
-    page.label("sub-goal", "sub_goal", once=lambda entry: (entry["agent"], entry["sub_goal"])),
-    page.number("member", "member"),
-    *SCORES,
-    page.number("false positives, %", "false_positives", page.interval, 0, 100),
-)
-
-
-def summary(metrics: Metrics) -> list[Printed]:
-    """For a terminal: agents, and the mean member of each sub-goal."""
-    if not (zero_shot := metrics.get("zero_shot")):
-        return []
-    means = [
-        entry | {"name": f"{entry['sub_goal']}, mean member"}
-        for entry in zero_shot["options"]
-        if entry["member"] == MEAN
-    ]
-    return [page.terminal(TITLE, (AGENTS[0], SCORES[0], SCORES[2]), [*zero_shot["agents"], *means])]
-
-
-def sections(material: Material) -> list[Block]:
-    """A table of agents and one of options; none where no layouts were given."""
-    if not (zero_shot := material.metrics.get("zero_shot")):
-        return []
-    layouts = zero_shot["layouts"]
-    text = (
-        f"Trained agents play {len(layouts)} layouts ({layouts[0]} to {layouts[-1]}), {EPISODES} episodes each, "
-        "without learning: options are greedy, choices drawn as in training. Uniform-random choice among the same "
-        "options plays them, too. Each option also plays alone, from where episodes begin and anew at each timeout, "
-        f"until its member is positive or for {PATIENCE} timeouts. It succeeds if its true sub-goal holds then; "
-        "if not, its member's prediction was a false positive. The rest of 100 % never had a positive prediction."
-    )
-    caption = f"Over layouts. Trained on: how many of these layouts its training drew from, too. {page.INTERVALS}"
-    tables = [page.table(AGENTS, zero_shot["agents"], caption=caption.format(units="layouts"))]
-    tables.append(page.table(OPTIONS, zero_shot["options"], tight=True, heading="Each option alone"))
-    return [page.section("zero-shot", TITLE, [text], [block for block in tables if block["rows"]])]
-
-
-QUESTION = Question(
-    rows=rows,
-    view=view,
-    summary=summary,
-    sections=sections,
-    meanings={
-        "within_2": (
-            "fraction",
-            "share (scope zero-shot) that succeeded within twice the shortest path: of an agent's episodes on a layout "
-            "that it was given, or an option's that began there, to its true sub-goal; near: within 1.5 of it",
-        ),
-        "false_positives": ("fraction", "share of an option's executions alone that end at a false positive"),
-    },
-)
+def context(results: Results) -> dict[str, Any] | None:
+    """For the template: a table of agents and one of options; nothing where no layouts were given."""
+    if results.of(scope=SCOPE).empty:
+        return None
+    computed = tables(results)
+    columns = {
+        "success, %": ("success", bounded(0, 100)),
+        f"within {NEAR} shortest, %": ("near", bounded(0, 100)),
+        "within 2, %": ("within_2", bounded(0, 100)),
+    }
+    by = {"method": "agent", "chooser": "choice"}
+    table = displayed(computed["other-layouts"], by, columns | {"steps": ("length", bounded(0))})
+    by = {"method": "options of", "sub_goal": "sub-goal", "member": "member"}
+    more = columns | {"false positives, %": ("false_positives", bounded(0, 100))}
+    return {
+        "table": table,
+        "options": displayed(computed["other-layouts-options"], by, more),
+        "printed": table[["success, %", "within 2, %"]],
+        "layouts": results.facts["other_layouts"],
+        "trained_on": results.facts["trained_on"],
+        "episodes": EPISODES,
+        "patience": PATIENCE,
+    }

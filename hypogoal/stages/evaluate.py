@@ -23,14 +23,15 @@ def evaluate(
 ) -> Done:
     """Compute every number of a run: accuracy, curves, choices.
 
-    ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them. ``out`` gets ``metrics.json``,
-    ``numbers.csv``, ``arrays.h5`` and, of a run of an experiment, ``results.csv``.
+    ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them. ``out`` gets ``numbers.csv``,
+    each question's ``tables/*.csv``, ``run.json`` (what is missing, provenance), ``arrays.h5`` and, of a run of an
+    experiment, ``results.csv``.
     """
     from hypogoal.core.processes import prepare
     from hypogoal.data import create_hdf5
     from hypogoal.evaluation import questions
-    from hypogoal.evaluation.judging import cases_of
-    from hypogoal.evaluation.run import find
+    from hypogoal.evaluation.judging import Work, cases_of
+    from hypogoal.evaluation.run import find, with_missing
     from hypogoal.meta.config import layout_seeds
 
     prepare()
@@ -52,15 +53,13 @@ def evaluate(
             create_hdf5(draft.files / "arrays.h5") as arrays,
             Progress("evaluate", total=parts, quiet=call.quiet) as progress,
         ):
-            work = questions.work_of(contents, arrays, progress, played)
-            questions.judge_ensembles(work, cases)
-            questions.answer(work)
-            missing = questions.missing(work)
-            if left := cells.unmade(run):
-                missing.append(f"{len(left)} of the run's cells are not done; the first is {left[0]}")
-            metrics = questions.metrics_of(work, settings, data, missing)
-        questions.write(draft.files, metrics, work.rows)
+            work = Work(contents, arrays, progress, played)
+            results = questions.answer(work, cases, settings, data)
+        if left := cells.unmade(run):
+            line = f"{len(left)} of the run's cells are not done; the first is {left[0]}"
+            results = with_missing(results, [line])
+        questions.write(draft.files, results)
         cells.write_results(run, draft.files)
-    table = drawn(questions.summary_table(metrics), WIDTH).splitlines()
+    table = drawn(questions.summary(results), WIDTH).splitlines()
     is_of_run = call.out == run / "evaluation"
     return Done(table, ("report", run) if is_of_run else ("show", call.out))

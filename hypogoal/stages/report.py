@@ -5,7 +5,6 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import say
 from hypogoal.stages import NO_SETTINGS, Call, Done, stage
@@ -43,35 +42,29 @@ def report(
     if format != "svg":
         raise UserError("--format is for --figures", format, "Give --figures DIR too, or leave it out.")
 
-    from hypogoal.evaluation import films
-    from hypogoal.evaluation.page import Material, film
-    from hypogoal.evaluation.plots import to_png
-    from hypogoal.evaluation.questions import render
-    from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
+    from hypogoal.evaluation.films import agents_of, films_of
+    from hypogoal.evaluation.plots import to_file
+    from hypogoal.evaluation.questions import all_figures, render
+    from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation, with_missing
 
-    source = evaluation_of(run)
-    agents = films.agents_to_play(run, videos)
+    evaluation = evaluation_of(run)
+    agents = agents_of(run)[: 1 if videos is None else videos]
     config = {"videos": len(agents) if videos is None else videos}
-    inputs = [source.path]
-    for agent in agents:
-        inputs.append(agent.path)
+    inputs = [evaluation.path, *(agent.path for agent in agents)]
     with call.draft("report", config, inputs) as draft:
-        evaluation = read_evaluation(run)
-        played, unplayed = films.films_of(agents, run, videos)
-        shown = [film(each.gif, each.caption) for each in played[:1] if len(each.gif) <= MOST_BYTES]
-        missing = [*evaluation.metrics["missing"], *unplayed]
-        metrics = {**evaluation.metrics, "missing": missing}
-        material = Material(metrics, evaluation.arrays, films=shown)
-        with fitting(source.path):
-            page = render(material, versions()["hypogoal"])
+        results = read_evaluation(run)
+        films, missing = films_of(agents, run, videos)
+        results = with_missing(results, missing)
+        with fitting(evaluation.path):
+            every = all_figures(results)
+            shown = [film.told() for film in films[:1] if len(film.gif) <= MOST_BYTES]
+            page = render(results, every, shown)
         (draft.files / "index.html").write_text(page, encoding="utf-8")
-        drawn = draft.files / "figures"
-        drawn.mkdir()
-        for name, figure in material.figures.items():
-            (drawn / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
-            (drawn / f"{name}.png").write_bytes(to_png(figure))
-        for each in played:
-            filmed = draft.files / "videos"
-            filmed.mkdir(exist_ok=True)
-            (filmed / each.name).write_bytes(each.gif)
+        (draft.files / "figures").mkdir()
+        for _, drawn in every:
+            for kind in ("svg", "png"):
+                (draft.files / "figures" / f"{drawn.name}.{kind}").write_bytes(to_file(drawn.figure, kind))
+        for film in films:
+            (draft.files / "videos").mkdir(exist_ok=True)
+            (draft.files / "videos" / film.name).write_bytes(film.gif)
     return Done()

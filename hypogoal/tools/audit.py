@@ -42,7 +42,7 @@ def audit(
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation import audit as played
-    from hypogoal.evaluation.numbers import plain
+    from hypogoal.evaluation.house import plain
     from hypogoal.learners.world import columns_of
     from hypogoal.meta.setup import Setup
     from hypogoal.meta.training import assemble

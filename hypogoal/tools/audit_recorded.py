@@ -2,14 +2,11 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
-from hypogoal.evaluation.numbers import plain
-from hypogoal.evaluation.page import Block
 from hypogoal.evaluation.recorded_page import draw, findings_of, lines_of, look_at, write_next
 from hypogoal.importing.labels import COLUMNS
 from hypogoal.stages import Call
@@ -26,8 +23,7 @@ def audit_recorded(call: Call, source: Path, sub_goal: str | None) -> list[str]:
     artefact = open_artefact(source, "ensemble")
     goals = _chosen(artefact, sub_goal)
     data = artefact.input("data")
-    parts: list[dict[str, Any]] = []
-    sections: list[Block] = []
+    every = []
     with (
         call.draft("recorded-audit", {"sub_goals": goals}, [source, data]) as draft,
         Progress("audit", len(goals), quiet=call.quiet) as progress,
@@ -35,15 +31,15 @@ def audit_recorded(call: Call, source: Path, sub_goal: str | None) -> list[str]:
         for goal in goals:
             look = look_at(artefact, data, goal, device)
             findings = findings_of(look)
-            parts.append(findings.numbers)
-            sections.append(findings.section)
+            every.append(findings)
             write_next(
                 draft.files / "next" / goal, COLUMNS, look.unlabelled[findings.rows], findings.rows, findings.disputed
             )
             progress.advance()
-        text = json.dumps(plain({"sub_goals": parts}), indent=1)
+        parts = [findings.numbers for findings in every]
+        text = json.dumps({"sub_goals": parts}, indent=1)
         (draft.files / "audit.json").write_text(text + "\n", encoding="utf-8")
-        page = draw(source.name, sections, lines_of(parts))
+        page = draw(source.name, every)
         (draft.files / "index.html").write_text(page, encoding="utf-8")
     return lines_of(parts)
 

@@ -1,19 +1,17 @@
 """Spec F5, F7: several evaluated runs side by side, as one page and its numbers."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from hypogoal.core.artefacts import create, versions
+from hypogoal.core.artefacts import create
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation import compare as beside
-from hypogoal.evaluation.page import Material, draw_page
+from hypogoal.evaluation.plots import slug, to_file
 from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
-from hypogoal.evaluation.table import read_rows
 
 
 def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
-    """Compare evaluated runs, the others with the first, in an artefact with ``figures/*.svg``; returns its page.
+    """Compare evaluated runs, the others with the first; returns the page of an artefact with ``*.csv`` beside it.
 
     Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
@@ -31,33 +29,17 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
         force=force,
     ) as draft:
         labels = beside.labels_of([run.resolve().as_posix() for run in runs])
-        metrics, arrays, rows = {}, {}, {}
-        for label, run in zip(labels, runs, strict=True):
-            evaluation = read_evaluation(run, "curves/")
-            metrics[label] = evaluation.metrics
-            arrays[label] = evaluation.arrays
-            rows[label] = read_rows(evaluation.source.path / "numbers.csv")
+        results = dict(zip(labels, map(read_evaluation, runs), strict=True))
         with fitting(where):
-            reason = beside.why_not(metrics)
+            reason = beside.why_not(results)
             if reason is not None:
                 do = "Choose runs of one experiment, evaluated alike."
                 raise UserError("these runs cannot be compared", reason, do)
-            comparison = beside.comparison_of(runs, metrics, rows)
-            material = Material(comparison, {})
-            sections = beside.compared_sections(
-                metrics,
-                arrays,
-                comparison,
-                material,
-            )
-            version = versions().get("hypogoal", "unknown")
-            subtitle = f"{', '.join(labels)}; hypogoal {version}"
-            page = draw_page(f"hypogoal: {len(runs)} runs compared", subtitle, sections, version)
-        text = json.dumps(comparison, indent=1, allow_nan=False)
+            page, figures, tables = beside.page_of(results, [str(run) for run in runs])
         (draft.files / "index.html").write_text(page, encoding="utf-8")
-        (draft.files / "metrics.json").write_text(text + "\n", encoding="utf-8")
-        figures = draft.files / "figures"
-        figures.mkdir()
-        for name, drawing in material.drawings.items():
-            (figures / f"{name}.svg").write_text(drawing, encoding="utf-8")
+        for name, table in tables.items():
+            table.to_csv(draft.files / f"{name}.csv", index=False)
+        (draft.files / "figures").mkdir()
+        for drawn in figures:
+            (draft.files / "figures" / f"{slug(drawn.name)}.svg").write_bytes(to_file(drawn.figure, "svg"))
     return out / "index.html"

@@ -90,9 +90,9 @@ def test_what_an_error_says_to_do(shell: Shell) -> None:
     shell(printed(shell("hypogoal report 'a run'", 2), "First run: ") + " --trust")
     shell("hypogoal report 'a run'")
     shell("hypogoal train-options 'a run/ensemble' --out 'a run/options' -q --trust")
-    since = read_evaluation(Path("a run")).metrics["missing"]
+    since = read_evaluation(Path("a run")).facts["missing"]
     shell(printed(since[-1], "options: made since this evaluation (evaluate it again: ") + " --trust")
-    assert read_evaluation(Path("a run")).metrics["missing"] == []
+    assert read_evaluation(Path("a run")).facts["missing"] == []
     Path("not yet").mkdir()
     shell(printed(shell("hypogoal evaluate 'not yet'", 2), "Train something into it first: "))
     for given in ("collect doorkey --out x --set bogus=1", "train-meta e --out o --gae-lambda 3", "show runs --bogus"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hypogoal.evaluation.pictures import overlay
-from hypogoal.evaluation.selection import preference
+from hypogoal.evaluation.selection import numbers_of_choices
 from hypogoal.hypotheses.scores import (
     best_mean_worst,
     best_threshold,
@@ -15,6 +15,7 @@ from hypogoal.hypotheses.scores import (
     most_and_least,
     ranking,
 )
+from hypogoal.options.tables import Choices
 
 YES, NO = True, False
 LABELS = np.array([YES, YES, YES, YES, NO, NO])
@@ -83,8 +84,22 @@ def test_preference_of_an_uncaring_chooser_is_one():
     expected = (offered / offered.sum(1, keepdims=True)).sum(0)
     choices = np.where(offered, rng.random(offered.shape), -1).argmax(1)
     chosen = np.bincount(choices, minlength=3)
-    np.testing.assert_allclose(preference(chosen, expected), 1, atol=0.05)
-    np.testing.assert_array_equal(preference(np.array([3, 0]), np.array([2.0, 0.0])), [1.5, np.nan])
+    none = np.zeros(3, np.int64)
+    table = Choices(none, np.arange(3), offered.sum(0), chosen, expected, none, none)
+    np.testing.assert_allclose(numbers_of_choices(table, 3)["preference"], 1, atol=0.05)
+
+
+def test_choices_by_hand():
+    """Spec F6: two windows of four options; one is never offered, one never chosen in the first."""
+    rows = [
+        (100, 0, 40, 10, 20.0, 5, 50), (100, 1, 40, 20, 10.0, 20, 40), (100, 2, 0, 0, 0.0, 0, 0),
+        (100, 3, 10, 0, 5.0, 0, 0), (200, 0, 40, 0, 10.0, 0, 0), (200, 1, 40, 30, 10.0, 30, 60),
+        (200, 2, 0, 0, 0.0, 0, 0), (200, 3, 10, 10, 5.0, 9, 20),
+    ]  # fmt: skip
+    found = numbers_of_choices(Choices.of_rows(rows), 4)
+    np.testing.assert_allclose(found["preference"], [10 / 30, 50 / 20, np.nan, 1])
+    np.testing.assert_allclose(found["chosen"], [10, 50, 0, 10])
+    np.testing.assert_allclose(found["duration"], [5, 2, np.nan, 2])
 
 
 def test_the_most_and_the_least_preferred_member():

@@ -9,7 +9,7 @@ from planted import harsh, planted
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.evaluation.choosing import judge, qualities, rank_correlation
+from hypogoal.evaluation.choosing import judge, qualities
 from hypogoal.evaluation.frozen import Choices, play
 from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.meta.ppo import MetaPolicy
@@ -77,14 +77,6 @@ def decisions(options: list[int], offered: list[list[int]], count: int) -> Choic
     for row, some in enumerate(offered):
         allowed[row, some] = True
     return Choices(np.zeros(len(options), np.int64), np.array(options), allowed)
-
-
-def test_rank_correlation_by_hand() -> None:
-    """Spec H2: Spearman's with ties: ranks (1, 2.5, 2.5, 4) and (1, 3, 2, 4) give 9/sqrt(90)."""
-    first, second = np.array([1.0, 2.0, 2.0, 9.0]), np.array([0.1, 0.3, 0.2, 0.4])
-    assert rank_correlation(first, second) == pytest.approx(4.5 / np.sqrt(4.5 * 5))
-    assert rank_correlation(first, -(second**3)) == pytest.approx(-4.5 / np.sqrt(4.5 * 5))
-    assert math.isnan(rank_correlation(np.ones(3), second[:3]))
 
 
 def test_choices_by_hand() -> None:

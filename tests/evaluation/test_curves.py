@@ -1,17 +1,18 @@
 """Spec F5: curves over environment steps, numbers over runs, against values worked by hand."""
 
-import numpy as np
-import pytest
+import math
 
-from hypogoal.evaluation.curves import curves, run_numbers, steps_to_solve, trailing_mean
-from hypogoal.evaluation.numbers import (
-    BOOTSTRAP_FROM,
-    STUDENT,
-    by_layout,
-    interquartile_mean,
-    interval,
-    mean_and_error,
-    over,
+import numpy as np
+from made_up import LEARNED, results_of, row
+
+from hypogoal.evaluation.curves import (
+    context,
+    curves,
+    figures,
+    run_numbers,
+    steps_to_solve,
+    tables,
+    trailing_mean,
 )
 from hypogoal.options.tables import Episodes
 
@@ -86,75 +87,32 @@ def test_what_does_not_succeed_is_no_success():
     assert curves(hundred, np.array([100]))["success"][0] == 0
 
 
-def test_mean_and_standard_error_by_hand():
-    """Spec F5: of 2, 4, 6: mean 4, variance 4, error 2 / sqrt(3)."""
-    assert mean_and_error(np.array([2.0, 4.0, 6.0])) == pytest.approx((4, 2 / np.sqrt(3)))
-    mean, error = mean_and_error(np.array([3.0]))
-    assert mean == 3
-    assert np.isnan(error)
-    assert np.isnan(mean_and_error(np.array([]))).all()
+def test_agents_over_runs() -> None:
+    """Spec F5: mean over layouts, each once; how many got to 95 %, and the median that counts those that did not."""
+    rows = []
+    for number, (layout, success, steps) in enumerate(((100, 1, 1_000), (100, 1, 2_000), (101, 0, math.nan))):
+        place = {"method": "option agent", "layout": layout, "seed": number, "artefact": f"a-{number}"}
+        rows += [row("success", success, **place), row("steps_to_95", steps, **place), row("steps", 9_000, **place)]
+    results = results_of(*rows, agents={"option agent": LEARNED})
+    made = tables(results)
+    assert made["agents"].set_index("quantity")["mean"]["success"] == 0.5
+    assert made["agents-solved"].to_dict("records") == [
+        {"method": "option agent", "runs": 3, "reached": 2, "median": 2_000}
+    ]
+    shown = context(results)["table"]
+    assert shown.loc["option agent", "95 % at"] == "2 of 3" and shown.loc["option agent", "runs"] == "3"
+    assert context(results_of()) is None
 
 
-def test_interquartile_mean_by_hand():
-    """Spec F5: of eight values the middle four; one outlier more or less does not move it."""
-    values = np.array([0.0, 1, 2, 3, 4, 5, 6, 1000])
-    assert interquartile_mean(values) == 3.5
-    assert interquartile_mean(values[::-1]) == 3.5
-
-
-def test_students_interval_by_hand():
-    """Spec F5: 2, 4, 6: mean 4, error 2 / sqrt(3), t of two degrees of freedom 4.303; of one value there is none."""
-    low, high, kind = interval(np.array([2.0, 4.0, 6.0]), np.random.default_rng(0))
-    assert (low, high) == pytest.approx((4 - 4.3027 * 2 / np.sqrt(3), 4 + 4.3027 * 2 / np.sqrt(3)), abs=1e-3)
-    assert kind == STUDENT
-    low, high, kind = interval(np.array([2.0]), np.random.default_rng(0))
-    assert np.isnan([low, high]).all()
-    assert kind == "no interval"
-
-
-def test_a_bootstrap_is_of_eight_values_at_least():
-    """Spec F5: and the seed fixes it."""
-    values = np.arange(8.0)
-    assert interval(values[:7], np.random.default_rng(2))[2] == STUDENT
-    found = interval(values, np.random.default_rng(2))
-    assert found == interval(values, np.random.default_rng(2))
-    assert "bootstrap" in found[2]
-
-
-@pytest.mark.parametrize(("runs", "least"), [(2, 0.93), (3, 0.93), (5, 0.93), (7, 0.93), (10, 0.9)])
-def test_intervals_hold_as_often_as_they_say(runs, least):
-    """Spec F5: how often what is reported of normal runs holds the true value; 95 % are meant.
-
-    Bootstraps of the interquartile mean of ten are known to be a little narrow. Two seeds of each layout, whose
-    layouts differ more than its seeds, are as many values as there are layouts.
-    """
-    rng, layouts = np.random.default_rng(runs), np.repeat(range(runs), 2).tolist()
-    count, held = 1_000 if runs < BOOTSTRAP_FROM else 300, 0
-    for cell in range(count):
-        values = np.repeat(rng.normal(3, 1, runs), 2) + rng.normal(0, 0.3, 2 * runs)
-        low, high = over(values.tolist(), "", str(cell), layouts=layouts)["interval"]
-        held += low <= 3 <= high
-    assert least <= held / count <= 0.98
-
-
-def test_runs_of_a_layout_count_once():
-    """Spec F5: two layouts, of one of which there are three runs: 1 and 5, not 1, 1, 1 and 5."""
-    found = over([0.0, 1.0, 2.0, 5.0], "steps", layouts=[8, 8, 8, 9])
-    assert (found["mean"], found["standard_error"], found["n"]) == (3, 2, 4)
-    assert found["interval_over"] == f"layouts: {STUDENT}"
-    alone = over([0.0, 1.0, 2.0, 5.0], "steps", layouts=[8] * 4)
-    assert (alone["mean"], alone["interval_over"]) == (2, f"runs: {STUDENT}")
-    np.testing.assert_array_equal(
-        by_layout(np.array([[0, 1], [2, np.nan], [5, np.nan]]), [8, 8, 9])[0], [[1, 1], [5, np.nan]]
-    )
-
-
-def test_aggregate_leaves_out_what_is_not_a_number():
-    """Spec F5: n says how many runs there were a number of."""
-    found = over([1.0, float("nan"), 3.0], "steps", layouts=[5, 6, 7])
-    assert (found["mean"], found["n"], found["unit"]) == (2.0, 2, "steps")
-    assert found["interval"] == pytest.approx([2 - 12.706, 2 + 12.706], abs=1e-3)
-    empty = over([], "steps")
-    assert empty["n"] == 0
-    assert np.isnan(empty["mean"])
-    assert np.isnan(empty["iqm"])
+def test_a_figure_of_lengths_that_are_all_alike_says_nothing() -> None:
+    """Spec F7: Figure 6 is drawn, with random play dotted; the figure of lengths only where they differ."""
+    place = {"method": "option agent", "layout": 1, "seed": 0, "artefact": "a"}
+    rows = [row("reward", step / 200, step=step, **place) for step in (100, 200)]
+    rows += [row("solved_length", 9, step=step, **place) for step in (100, 200)]
+    agents = {"agents": {"option agent": LEARNED}}
+    random = row("random_success", 0.2, layout=1)
+    assert [drawn.name for drawn in figures(results_of(*rows, random, **agents))] == ["figure6"]
+    more = row("solved_length", 8, step=200, **place | {"artefact": "b", "seed": 1})
+    drawn = list(figures(results_of(*rows, more, random, **agents)))
+    assert [each.name for each in drawn] == ["figure6", "figure6-length"]
+    assert drawn[0].about["dotted"] == ["random play"]

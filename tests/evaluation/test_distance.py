@@ -3,22 +3,26 @@
 import numpy as np
 import pytest
 from ladder_run import COLUMNS, executions
+from made_up import results_of, row
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.evaluation.distance import (
     BEGAN_INSIDE,
+    BEST,
     HIT,
     MISS,
+    WORST,
     at_base,
+    context,
     counted,
-    distance_table,
     fates,
+    figures,
     option_numbers,
-    options_of,
     rows_of_ladder,
+    tables,
 )
-from hypogoal.evaluation.table import BEST, VALIDATED, WORST, rows_of
+from hypogoal.evaluation.house import joined
 from hypogoal.options.tables import Executions
 
 
@@ -70,79 +74,92 @@ def test_the_last_hundred_of_each_option_count(read):
     assert np.isnan(one["executions_deviation"])
 
 
-def learned(*arguments, **more):
-    """What is said of the options of one ladder, by sub-goal."""
-    return options_of(rows_of_ladder(*arguments, **more, ladder="1L", artefact="options"))
+def of_ladder(read, rows, sub_goals=("down",), members=1, **more):
+    """What is said of the options of one ladder: a column for each number, by sub-goal and member."""
+    config = {"sub_goals": sub_goals, "members": members, "mask_reached": False, **more}
+    thresholds = np.full(len(sub_goals) * members, 0.5)
+    found = joined(rows_of_ladder(read(rows), config, {"down": 0}, thresholds, {"ladder": "1L", "artefact": "options"}))
+    return found.set_index(["sub_goal", "quantity", "member"])["value"].sort_index()
 
 
 def test_best_worst_and_validated_member(read):
     """Spec F3: the best is the nearest; an option that was never offered, since it always began inside, counts 300."""
     rows = executions(0, [30, 50]) + executions(1, [10, 20]) + executions(2, [100], inside=1)
-    (found,) = learned(read(rows), ("down",), 4, {"down": 0}, masked=False)
-    distances = [option["distance"] for option in found["options"]]
-    assert distances[:3] == [40, 15, 300]
-    assert np.isnan(distances[3])
-    assert (found["best"], found["worst"], found["validated"]) == (1, 2, 0)
-    (masked,) = learned(read(rows), ("down",), 4, {}, masked=True)
-    assert (masked["options"][3]["distance"], masked["options"][3]["executions"]) == (300, 0)
-    assert [option["distance"] for option in masked["options"][:3]] == distances[:3]
-    assert masked["validated"] is None
-    (nothing,) = learned(read([]), ("down",), 2, {}, masked=True)
-    assert (nothing["best"], nothing["worst"]) == (None, None)
-    assert np.isnan(nothing["options"][0]["distance"])
+    found = of_ladder(read, rows, members=4)["down"]
+    assert found["distance"].to_dict() == {0: 40, 1: 15, 2: 300}
+    picked = {name: found[name].item() for name in (BEST, WORST, "validated_member")}
+    assert picked == {BEST: 1, WORST: 2, "validated_member": 0}
+    masked = of_ladder(read, rows, members=4, mask_reached=True)["down"]
+    assert masked["distance"].to_dict() == {0: 40, 1: 15, 2: 300, 3: 300}
+    nothing = of_ladder(read, [], members=2, mask_reached=True)["down"]
+    assert "distance" not in nothing and BEST not in nothing
 
 
 def test_two_sub_goals_have_their_own_members(read):
     """Spec D1: option g*K + k is member k of sub-goal g."""
     rows = executions(1, [3]) + executions(2, [8]) + executions(3, [5])
-    first, second = learned(read(rows), ("down", "up"), 2, {}, masked=False)
-    assert (first["sub_goal"], first["best"]) == ("down", 1)
-    assert [option["option"] for option in second["options"]] == [2, 3]
-    assert (second["best"], second["worst"]) == (1, 0)
+    found = of_ladder(read, rows, ("down", "up"), 2)
+    assert (found["down", BEST].item(), found["up", BEST].item(), found["up", WORST].item()) == (1, 1, 0)
+    assert found["up", "distance"].to_dict() == {0: 8, 1: 5}
 
 
-def stopped(ladder, seed, distances, method="dbat", groups=2, validated=0, number=0):
+def stopped(ladder, seed, *distances, method="D-BAT", groups=2, validated=0, number=0):
     """Rows of one artefact's options."""
     place = {"method": method, "N": groups, "sub_goal": "down", "ladder": ladder, "seed": seed}
     place["artefact"] = f"{method}-{ladder}-{seed}-{number}"
-    shares = {"reached_base": 0.5, "inside_at_start": 0.0, "timed_out": 0.25, "died": 0.0}
+    rows = []
     for member, distance in enumerate(distances):
-        numbers = {"distance": float(distance), "executions_deviation": 2.0, **shares}
-        yield from rows_of(numbers, **place, member=member)
-    picked = {BEST: int(np.argmin(distances)), WORST: int(np.argmax(distances)), VALIDATED: validated}
-    yield from rows_of(picked, **place)
+        numbers = {"distance": distance, "executions_deviation": 2.0, "reached_base": 0.5, "timed_out": 0.25}
+        rows += [row(name, value, member=member, **place) for name, value in numbers.items()]
+    picked = {BEST: np.nanargmin(distances), WORST: np.nanargmax(distances), "validated_member": validated}
+    return rows + [row(name, value, **place) for name, value in picked.items()]
 
 
 def test_mean_over_ladders_then_over_seeds():
     """Spec F3, Figure 4: another member may be the best on each ladder; then mean and spread over seeds."""
-    rows = [*stopped("1L", 0, [10, 30]), *stopped("2-6", 0, [60, 20])]
-    rows += [*stopped("1L", 1, [14, 30]), *stopped("2-6", 1, [40, 36])]
-    rows += stopped("1L", 0, [2], "oracle termination", None, None)
-    over, oracle = distance_table(rows, ["1L", "2-6"])
-    assert over["best"]["mean"] == pytest.approx((15 + 25) / 2)
-    assert over["best"]["standard_deviation"] == pytest.approx(np.sqrt(50))
-    assert over["validated"]["mean"] == pytest.approx((35 + 27) / 2)
-    assert over["mean"]["mean"] == pytest.approx((30 + 30) / 2)
-    assert over["worst"]["mean"] == pytest.approx((45 + 35) / 2)
-    assert over["executions_deviation"]["mean"] == 2
-    assert (over["reached_base"]["mean"], over["timed_out"]["mean"]) == (0.5, 0.25)
-    assert (over["seeds"], over["incomplete_seeds"]) == (2, [])
-    assert (oracle["seeds"], oracle["incomplete_seeds"]) == (0, [0])
-    assert np.isnan(oracle["best"]["mean"])
+    rows = [
+        *stopped("1L", 0, 10, 30),
+        *stopped("2-6", 0, 60, 20),
+        *stopped("1L", 1, 14, 30),
+        *stopped("2-6", 1, 40, 36),
+    ]
+    rows += stopped("1L", 0, 2, method="oracle termination", groups=None)
+    results = results_of(*rows, ladders=["1L", "2-6"])
+    table = tables(results)["distance"].set_index(["method", "quantity"])
+    assert {*table.index.get_level_values("method")} == {"D-BAT"}, "the oracle lacks a ladder"
+    found = table.loc["D-BAT"]
+    means = [found["mean"][which] for which in ("best", "validated", "mean", "worst", "executions_deviation")]
+    assert means == [20, 31, 30, 40, 2]
+    assert found["standard_deviation"]["best"] == pytest.approx(np.sqrt(50))
+    assert (found["mean"]["reached_base"], found["mean"]["timed_out"], found["n"]["best"]) == (0.5, 0.25, 2)
+    assert context(results)["table"].loc[(2, "D-BAT"), "best"] == "20.0 ± 7.1"
+    assert [drawn.name for drawn in figures(results)] == ["figure4"]
+    assert context(results_of()) is None
 
 
 def test_options_of_several_ensembles_with_one_seed_all_count():
     """Spec F3: three artefacts alike in seed and ladder are three, not the last one read."""
-    rows = [row for away in (10, 200, 90) for row in stopped("1L", 0, [away], number=away)]
-    (found,) = distance_table(rows, ("1L",))
-    assert (found["seeds"], found["best"]["mean"]) == (3, 100)
+    rows = [each for away in (10, 200, 90) for each in stopped("1L", 0, away, number=away)]
+    found = tables(results_of(*rows, ladders=["1L"]))["distance"].set_index("quantity")
+    assert (found["n"]["best"], found["mean"]["best"]) == (3, 100)
 
 
 def test_unlike_ladders_are_not_averaged():
-    """Spec F3: a seed that lacks one of the ladders is left out of the mean over ladders, and told."""
-    rows = [*stopped("1L", 0, [10]), *stopped("2-6", 0, [30]), *stopped("1L", 1, [1])]
-    (over,) = distance_table(rows, ["1L", "2-6"])
-    assert (over["best"]["mean"], over["best"]["n"], over["incomplete_seeds"]) == (20, 1, [1])
+    """Spec F3: a seed that lacks one of the ladders is left out of the mean over ladders."""
+    rows = [*stopped("1L", 0, 10), *stopped("2-6", 0, 30), *stopped("1L", 1, 1)]
+    found = tables(results_of(*rows, ladders=["1L", "2-6"]))["distance"].set_index("quantity")
+    assert (found["mean"]["best"], found["n"]["best"]) == (20, 1)
+
+
+def test_options_are_paired_by_ladder_and_seed():
+    """Spec F3: the nearer is the better; oracle terminations are not a method; members never executed count nothing."""
+    rows = [*stopped("1L", 0, 10, np.nan), *stopped("1R", 0, 20, np.nan)]
+    rows += [*stopped("1L", 0, 40, method="one"), *stopped("1R", 0, 10, method="one")]
+    rows += stopped("1L", 0, 0, method="oracle termination", groups=None)
+    pairs = tables(results_of(*rows, ladders=["1L", "1R"]))["distance-pairs"].set_index("quantity")
+    best = pairs.loc["distance, best member"]
+    assert (best["first"], best["second"], best["n"], best["wins"], best["units"]) == ("D-BAT", "one", 2, 1, 1)
+    assert pairs["difference"].tolist() == [-10, -10, -10]
 
 
 @pytest.mark.parametrize("text", ["step,option\n1,2\n", ",".join(COLUMNS) + "\n" + "nan," * 9 + "1\n", ""])

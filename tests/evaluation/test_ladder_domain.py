@@ -1,13 +1,13 @@
 """Spec F1, F3, F4: what the evaluation asks of a domain with rooms, Montezuma's Revenge has."""
 
-import h5py
 import numpy as np
 import pytest
 from ladder_run import COLUMNS
 
 from hypogoal.core.files import write_table
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.distance import at_base, distance_table, fates, options_of, rows_of_ladder, show_stops
+from hypogoal.evaluation.distance import at_base, rows_of_ladder
+from hypogoal.evaluation.house import joined
 from hypogoal.options.tables import Executions
 
 
@@ -23,20 +23,15 @@ def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
     assert own.distance[1] == 0
     assert own.distance[0] > own.distance[2] > 4
     assert at_base(own).tolist() == [False, True, False, True, False]
-    place = {"method": "single CNN", "N": 2, "ladder": "2-6", "seed": 0, "artefact": "options"}
-    rows = list(rows_of_ladder(own, domain.usual_sub_goals, 1, {}, masked=False, **place))
-    (over,) = distance_table(rows, ["2-6"])
-    assert over["best"]["mean"] == pytest.approx(away.mean())
-    with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
-        (shown,) = show_stops(options_of(rows), ["2-6"], {"options": own}, domain, arrays)
-        assert shown["rooms"] == [2, 6]
-        assert arrays["stops/options/0/fates"][()].tolist() == fates(own).tolist()
-        pictures = [arrays[f"pictures/{room}"][()] for room in shown["rooms"]]
-        pixels = arrays["stops/options/0/pixels"][()]
+    config = {"sub_goals": domain.usual_sub_goals, "members": 1, "mask_reached": False, "start": "2-6"}
+    place = {"method": "one classifier", "N": 2, "ladder": "2-6", "seed": 0, "artefact": "options"}
+    rows = joined(rows_of_ladder(own, config, {}, np.full(1, 0.5), place))
+    assert rows[rows["quantity"] == "distance"]["value"].tolist() == pytest.approx([away.mean()])
+    pictures = [domain.picture(room) for room in (2, 6)]
+    pixels = np.asarray(domain.pixel(own.positions()))
     assert all(picture.shape == (210, 160, 3) and picture.dtype == np.uint8 for picture in pictures)
     assert (pictures[0] != pictures[1]).any()
     assert (pixels >= 0).all() and (pixels < [160, 210]).all()
-    assert set(shown["columns"][0]) >= {"method", "member", "option", "distance"}
 
 
 def test_the_domain_names_its_kinds_and_starts():

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from hypogoal.data import States
+from hypogoal.data import Collected, States, write_dataset
+from hypogoal.evaluation.house import joined
 from hypogoal.evaluation.judging import Case, Judged, Judgement, Work
 from hypogoal.evaluation.pictures import attribution_image, image_png
 from hypogoal.evaluation.run import Contents
@@ -14,10 +15,8 @@ from hypogoal.evaluation.saliency import look, pick_to_explain
 from hypogoal.hypotheses.deep_lift import (
     DEEP_LIFT,
     INTEGRATED,
-    Attributions,
     attributable,
     attributed,
-    explanation,
     mean_state,
     method_of,
 )
@@ -185,7 +184,7 @@ def test_the_state_that_is_the_baseline_has_no_attribution():
     assert np.abs(attributed(ensemble, state[None], state).values).max() < BOUND
 
 
-def test_attributions_are_to_what_members_see(tmp_path):
+def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
     """Spec F2: of an ensemble that sees a window, what is attributed to, drawn and averaged is the window."""
 
     class Windowed(Members):
@@ -199,30 +198,28 @@ def test_attributions_are_to_what_members_see(tmp_path):
     ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
     observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
     split = States(observations, np.array([True, False, False]))
+
     yes = np.array([[True], [True], [False]])
     judged = Judged(np.array([[0.9], [0.8], [0.1]], np.float32), yes, yes[2:], np.array([0.5], np.float32))
+    stored = States(observations, split.labels[:, None])
+    data = Collected((1, 3, 1), ("down",), stored, stored, stored)
+    write_dataset(tmp_path / "data.h5", data, domain="x", config={}, seed=0)
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
-        here = Here(tmp_path, "down", tmp_path, {})
-        work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None, shown=0)
-        look(work, Judgement(0, here, split, observations[2:], None, judged))
-        (found,) = work.looked["saliency"]
+        here = Here(tmp_path / "data.h5", "down", tmp_path, {"sub_goals": ["down"]})
+        work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None)
+        work.browsed = 0
+        monkeypatch.setattr(Work, "place_of", lambda work, judgement: {"artefact": "ensemble"})
+        rows = joined(look(work, Judgement(0, here, split, observations[2:], None, judged)))
         group = arrays["saliency/down"]
         assert group["observations"].shape == (2, 1, 3, 1)
         assert group["seen"].shape == (2, 1, 2, 1)
         np.testing.assert_allclose(group["attributions"][:, 0, 0, :, 0], [[0, 2], [1, 0]])
-    assert [state["kind"] for state in found["states"]] == ["true positive", "false positive"]
-
-
-def test_the_check_is_reported():
-    """Spec F2: by state and member; an attribution that does not add up shows."""
-    values = np.zeros((1, 2, 1, 1, 2))
-    values[0, 0] = [[[3.0, -1.0]]]
-    found = Attributions(values, np.array([[2.5, 0.0]]), np.array([0.25, 0.0]))
-    ((first, second),) = (row["members"] for row in explanation(found, [(7, "disagree")]))
-    assert first["attributed"] == 2
-    assert first["completeness_error"] == pytest.approx(0.25)
-    assert first["last_frame"] == pytest.approx(1 / 4)
-    assert np.isnan(second["last_frame"])
+        assert arrays["gallery/down/attributions"].shape == (3, 1, 1, 2)
+    assert work.facts["looked_at"]["sub_goals"]["down"]["kinds"] == ["true positive", "false positive"]
+    errors = rows[rows["quantity"] == "completeness_error"]
+    assert (
+        errors["scope"].tolist() == ["state: true positive", "state: false positive"] and errors["value"].max() < BOUND
+    )
 
 
 def test_the_states_that_are_explained():

@@ -1,18 +1,15 @@
 """The verdict on made-up shares of solved episodes, where the right sentence is known (Spec F7)."""
 
 import math
-from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import pytest
-from works import work_of
+from made_up import LEARNED, results_of, row
 
-from hypogoal.evaluation.choosing import FROZEN, UNIFORM
-from hypogoal.evaluation.curves import Run
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.numbers import ONE, ensemble_title, plain
-from hypogoal.evaluation.table import Row
+from hypogoal.evaluation.choosing import FROZEN
+from hypogoal.evaluation.names import ONE, RANDOM, UNIFORM
+from hypogoal.evaluation.page import Results
+from hypogoal.evaluation.questions import sentences
 from hypogoal.evaluation.verdict import (
     ALIKE,
     BETTER,
@@ -20,30 +17,28 @@ from hypogoal.evaluation.verdict import (
     HYPOTHESES,
     UNDECIDED,
     WORSE,
-    baselines,
-    compare,
+    context,
     findings,
     outcome_of,
-    sentence,
-    verdict,
 )
-from hypogoal.options.tables import Episodes
+
+SEVERAL = "D-BAT, 3 members"
+AGENTS = {SEVERAL: LEARNED, ONE: LEARNED | {"members": 1}, RANDOM: LEARNED | {"chooser": "random"}}
 
 
-def pairs_of(*shares: tuple[float, float], layouts: bool = True) -> list[tuple[Row, Row]]:
-    """Shares of solved episodes, a pair a layout, or a pair a seed of one layout."""
-    places: list[dict[str, Any]] = [
-        {"layout": number if layouts else 0, "seed": number} for number in range(len(shares))
-    ]
-    return [tuple(Row("success", value, **place) for value in pair) for pair, place in zip(shares, places, strict=True)]
-
-
-def said(subject: str, *shares: tuple[float, float], **more: Any) -> str:
-    """The sentence of these pairs, as a page has it."""
-    second = "uniform-random choice among its own options" if subject == CHOOSING else ONE
-    finding = compare(subject, "D-BAT, 3 members", second, pairs_of(*shares, **more))
-    assert finding is not None
-    return sentence(plain(asdict(finding)))
+def run_of(
+    shares: dict[str, list[float]], played: dict[str, list[float]] | None = None, *, layouts: bool = True, **facts: Any
+) -> Results:
+    """A run: by agent the shares solved at the end of training, and those ``played`` frozen, by layout or by seed."""
+    rows = []
+    for scope, table in (("", shares), (FROZEN, played or {})):
+        for method, values in table.items():
+            owner = SEVERAL if method == UNIFORM else method
+            for number, value in enumerate(values):
+                place = {"layout": number if layouts else 0, "seed": number, "artefact": f"{owner}-{number}"}
+                rows.append(row("success", value, method=method, scope=scope, **place))
+    named = {name: made for name, made in AGENTS.items() if name in shares or name in (played or {})}
+    return results_of(*rows, agents=named, **facts)
 
 
 @pytest.mark.parametrize(
@@ -61,169 +56,112 @@ def said(subject: str, *shares: tuple[float, float], **more: Any) -> str:
     ],
 )
 def test_each_kind_of_outcome(shares: list[tuple[float, float]], outcome: str) -> None:
-    finding = compare(CHOOSING, "", "", pairs_of(*shares))
-    assert finding is not None and finding.outcome == outcome
-    assert finding.units == len(shares)
-    assert finding.difference == pytest.approx(sum(first - second for first, second in shares) / len(shares))
+    """An agent against uniform-random choice among its own options, frozen, even where training says the contrary."""
+    first, second = map(list, zip(*shares, strict=True))
+    played = {SEVERAL: first, UNIFORM: second}
+    (found,) = findings(run_of({SEVERAL: [0.0] * len(first), RANDOM: [1.0] * len(first)}, played))
+    assert (found["subject"], found["second"], found["outcome"]) == (CHOOSING, UNIFORM, outcome)
+    assert found["units"] == len(shares)
+    assert found["difference"] == pytest.approx(sum(a - b for a, b in shares) / len(shares))
+    assert -1 <= found["low"] <= found["high"] <= 1 or math.isnan(found["low"])
 
 
 def test_a_small_certain_difference_is_none() -> None:
-    """An interval within the margin is no difference, also where 0 lies outside of it."""
+    """An interval within the margin is no difference, also where 0 lies outside of it; NaN bounds are of one unit."""
     assert outcome_of(0.05, 0.02, 0.08) == ALIKE
     assert outcome_of(0.09, 0.02, 0.16) == BETTER
-
-
-def test_seeds_are_the_units_of_a_single_layout() -> None:
-    """And the sentence says what the units are."""
-    assert "over 3 seeds" in said(CHOOSING, (1.0, 0.5), (0.9, 0.4), (1.0, 0.45), layouts=False)
-    assert "on this layout" in said(CHOOSING, (1.0, 0.5), layouts=False)
-    assert said(HYPOTHESES, (1.0, 0.2), (0.2, 1.0)).startswith("Whether several hypotheses mattered is undecided over")
-
-
-def test_several_runs_of_a_layout_count_once() -> None:
-    pairs = pairs_of((1.0, 0.0), (0.0, 1.0))
-    again = [tuple(row._replace(layout=0) for row in pairs[0]) for _ in range(9)]
-    finding = compare(CHOOSING, "", "", [*again, pairs[1]])
-    assert finding is not None and (finding.units, finding.difference) == (2, 0.0)
-
-
-def test_intervals_stay_within_what_a_difference_can_be() -> None:
-    finding = compare(CHOOSING, "", "", pairs_of((1.0, 0.0), (0.5, 0.5)))
-    assert finding is not None and finding.interval == (-1.0, 1.0)
-
-
-def test_no_pairs_no_finding() -> None:
-    assert compare(CHOOSING, "", "", []) is None
-
-
-def metrics_of(*findings: Any, **parts: Any) -> dict[str, Any]:
-    empty: dict[str, Any] = {"agents": [], "hypotheses": [], "distance": {"options": []}}
-    return {**empty, **parts, "verdict": {"findings": [plain(asdict(finding)) for finding in findings]}}
-
-
-def test_one_run_is_called_no_evidence() -> None:
-    one, three = (compare(CHOOSING, "", "", pairs_of(*[(1.0, 0.2)] * count)) for count in (1, 3))
-    two = compare(CHOOSING, "", "", pairs_of((1.0, 0.2), (1.0, 0.2)))
-    assert verdict(metrics_of(two))[-1].startswith("Two runs are not evidence")
-    assert verdict(metrics_of(one))[-1] == "One run is not evidence: train more layouts or seeds."
-    assert len(verdict(metrics_of(three))) == 1
-
-
-def test_without_controls_nothing_is_claimed() -> None:
-    agent = {"name": "options (learned members)", "kind": "meta", "success": {"mean": 0.5}}
-    lines = verdict(metrics_of(agents=[agent]))
-    assert "50 %" in lines[0] and "unknown" in lines[1]
-
-
-def test_an_ensemble_alone_has_shown_nothing_yet() -> None:
-    scores = {name: {"mean": value} for name, value in (("best", 0.94), ("mean", 0.76), ("worst", 0.59))}
-    lines = verdict(metrics_of(hypotheses=[{"name": "dbat, K=3", "sub_goal": "door", **scores}]))
-    assert lines[0].startswith("No agent has been trained yet")
-    assert ".94 for the best member" in lines[1] and ".59 for the worst" in lines[1]
-
-
-def test_options_without_a_comparison() -> None:
-    options = [{"method": "dbat, K=3", "validated": 1, "options": [{"reached_base": 0.0}, {"reached_base": 0.25}]}]
-    lines = verdict(metrics_of(distance={"options": options}))
-    assert lines[0] == "Options of D-BAT, 3 members stop at the sub-goal in 25 % of their executions."
-    assert "unknown" in lines[1]
-
-
-def test_baselines_stand_beside_what_they_were_given() -> None:
-    agent = {"name": "PPO tuned", "kind": "baseline", "success": {"mean": 0.0}, "runs": [{"steps": 250_000}]}
-    assert baselines(metrics_of(agents=[agent])).endswith("PPO tuned 0 % (after 250,000 steps).")
-    assert baselines(metrics_of()) == ""
-
-
-@pytest.mark.parametrize(
-    ("name", "title"),
-    [
-        ("dbat, K=3", "D-BAT, 3 members"),
-        ("no diversity, K=3", "no diversity, 3 members"),
-        ("single CNN", ONE),
-        ("oracle termination", "oracle termination"),
-    ],
-)
-def test_names_of_ensembles_for_people(name: str, title: str) -> None:
-    assert ensemble_title(name) == title
-
-
-def test_nan_bounds_are_those_of_one_unit() -> None:
     assert outcome_of(0.5, math.nan, math.nan) == BETTER
 
 
-def agent(chooser: str, members: int) -> Run:
-    """A trained agent of D-BAT's members, whose episodes do not matter here."""
-    ensemble = f"dbat, K={members}"
-    config = {"chooser": chooser, "members": members, "termination": "learned", "ensemble": ensemble}
-    none = np.zeros(0, np.bool_)
-    return Run("meta", chooser, 7, config, Episodes(none, none, none, none, none), {})
-
-
-def run_of(shares: dict[str, list[float]], played: dict[str, list[float]] | None = None, **agents: Run) -> Work:
-    """The work on a run: by agent the shares solved at the end of training, and those ``played`` frozen, by layout."""
-    work = work_of()
-    work.agents = {name: [one] for name, one in agents.items()}
-    for scope, table in (("", shares), (FROZEN, played or {})):
-        for method, values in table.items():
-            owner = "several" if method == UNIFORM else method
-            work.rows += [
-                Row("success", value, method, layout=layout, seed=7, artefact=f"{owner}-{layout}", scope=scope)
-                for layout, value in enumerate(values)
-            ]
-    return work
-
-
-SEVERAL, SINGLE, RANDOMLY = agent("ppo", 3), agent("ppo", 1), agent("random", 3)
-
-
-def test_an_agent_is_compared_with_uniform_choice_among_its_own_options() -> None:
-    """Frozen play, even where an agent that chose at random is there too, and training says the contrary."""
-    work = run_of(
-        {"several": [0.0, 0.0, 0.0], "randomly": [1.0, 1.0, 1.0]},
-        {"several": [1.0, 0.9, 1.0], UNIFORM: [0.2, 0.1, 0.3]},
-        several=SEVERAL,
-        randomly=RANDOMLY,
+def test_seeds_are_the_units_of_a_single_layout() -> None:
+    """And the sentence says what the units are, with the interval."""
+    played = {SEVERAL: [1.0, 0.9, 1.0], UNIFORM: [0.5, 0.4, 0.45]}
+    (sentence,) = sentences(run_of({SEVERAL: [0.0]}, played, layouts=False))
+    assert sentence == (
+        "Choosing mattered over 3 seeds: the agent solves 97 % of the episodes, uniform-random choice among its own "
+        "options 45 % (+52 points [44, 59])."
     )
-    (finding,) = findings(work)
-    assert finding.second == "uniform-random choice among its own options"
-    assert (finding.subject, finding.outcome, finding.units) == (CHOOSING, BETTER, 3)
-    assert (finding.success, finding.other) == pytest.approx((2.9 / 3, 0.2))
+    one = sentences(run_of({SEVERAL: [0.0]}, {SEVERAL: [1.0], UNIFORM: [0.5]}))
+    assert one[0].startswith("Choosing mattered on this layout:") and "points" not in one[0]
+    assert one[1] == "One run is not evidence: train more layouts or seeds."
 
 
 def test_without_frozen_play_an_agent_is_compared_with_one_that_chose_at_random() -> None:
-    """At the end of training, run by run; that one has learned options of its own, and the finding says so."""
-    work = run_of({"several": [0.2, 0.1, 0.3], "randomly": [1.0, 0.9, 1.0]}, several=SEVERAL, randomly=RANDOMLY)
-    (finding,) = findings(work)
-    assert finding.second == "an agent whose choice is uniform-random"
-    assert (finding.outcome, finding.success, finding.other) == (WORSE, pytest.approx(0.2), pytest.approx(2.9 / 3))
-
-
-def test_frozen_play_of_the_agent_alone_does_not_replace_the_fallback() -> None:
-    """Without uniform-random choice among the same options there is nothing frozen to compare with."""
-    work = run_of(
-        {"several": [0.9, 0.9, 0.9], "randomly": [0.9, 0.9, 0.9]},
-        {"several": [1.0, 1.0, 1.0]},
-        several=SEVERAL,
-        randomly=RANDOMLY,
-    )
-    (finding,) = findings(work)
-    assert (finding.outcome, finding.success) == (ALIKE, pytest.approx(0.9))
-
-
-def test_only_runs_of_the_same_layout_and_seed_are_compared() -> None:
-    work = run_of({"several": [0.9, 0.2]}, several=SEVERAL, randomly=RANDOMLY)
-    work.rows += [Row("success", 0.4, "randomly", layout=1, seed=7), Row("success", 0.9, "randomly", layout=0, seed=8)]
-    (finding,) = findings(work)
-    assert (finding.units, finding.success, finding.other) == (1, 0.2, 0.4)
+    """At the end of training, run by run; frozen play of the agent alone does not replace that."""
+    (found,) = findings(run_of({SEVERAL: [0.2, 0.1, 0.3], RANDOM: [1.0, 0.9, 1.0]}, {SEVERAL: [1.0, 1.0, 1.0]}))
+    assert (found["second"], found["outcome"]) == (RANDOM, WORSE)
+    assert (found["share"], found["other"]) == pytest.approx((0.2, 2.9 / 3))
 
 
 def test_several_members_are_compared_with_one_classifier() -> None:
     """Both frozen where both have played so, else both in training; one classifier alone has no finding."""
-    trained = {"several": [0.5, 0.5, 0.5], "single": [0.5, 0.5, 0.5]}
-    both = run_of(trained, {"several": [1.0, 0.9, 1.0], "single": [0.3, 0.2, 0.3]}, several=SEVERAL, single=SINGLE)
-    one = run_of(trained, {"several": [1.0, 0.9, 1.0]}, several=SEVERAL, single=SINGLE)
-    assert [(each.subject, each.outcome, each.second) for each in findings(both)] == [(HYPOTHESES, BETTER, ONE)]
-    assert [(each.subject, each.outcome) for each in findings(one)] == [(HYPOTHESES, ALIKE)]
-    assert list(findings(run_of({"single": [0.5]}, single=SINGLE))) == []
-    assert list(findings(run_of({"randomly": [0.5]}, randomly=RANDOMLY))) == []
+    trained = {SEVERAL: [0.5, 0.5, 0.5], ONE: [0.5, 0.5, 0.5]}
+    both = findings(run_of(trained, {SEVERAL: [1.0, 0.9, 1.0], ONE: [0.3, 0.2, 0.3]}))
+    assert [(each["subject"], each["outcome"], each["second"]) for each in both] == [(HYPOTHESES, BETTER, ONE)]
+    one = findings(run_of(trained, {SEVERAL: [1.0, 0.9, 1.0]}))
+    assert [(each["subject"], each["outcome"]) for each in one] == [(HYPOTHESES, ALIKE)]
+    assert findings(run_of({ONE: [0.5]})) == findings(run_of({RANDOM: [0.5]})) == []
+
+
+def test_an_own_chooser_has_its_finding() -> None:
+    """Spec E6: beside the built-in one's, by its name."""
+    own = "option agent, chooser=first:First"
+    rows = []
+    for method, value in ((own, 1.0), (UNIFORM, 0.1)):
+        rows.append(row("success", value, method=method, scope=FROZEN, layout=1, seed=0, artefact="own"))
+    results = results_of(*rows, agents={own: LEARNED | {"chooser": "first:First"}})
+    (found,) = findings(results)
+    assert (found["first"], found["outcome"]) == (own, BETTER)
+
+
+def test_only_runs_of_the_same_layout_and_seed_are_compared() -> None:
+    """Nine seeds of one layout and one of another count once each."""
+    rows = [row("success", 0.9, method=SEVERAL, layout=0, seed=seed, artefact=f"s-{seed}") for seed in range(9)]
+    rows += [row("success", 0.0, method=ONE, layout=0, seed=seed, artefact=f"o-{seed}") for seed in range(9)]
+    rows += [row("success", 0.1, method=SEVERAL, layout=1, seed=0, artefact="s")]
+    rows += [row("success", 1.0, method=ONE, layout=1, seed=0, artefact="o")]
+    rows += [row("success", 1.0, method=ONE, layout=2, seed=0, artefact="p")]
+    (found,) = findings(results_of(*rows, agents=AGENTS))
+    assert (found["units"], found["difference"]) == (2, pytest.approx(0.0))
+
+
+def ladder(method: str, seed: int, *shares: float, validated: int | None = 0) -> list[dict]:
+    """Rows of options on a ladder."""
+    place = {"method": method, "N": 1, "ladder": "1L", "seed": seed, "artefact": f"{method}-{seed}", "sub_goal": "down"}
+    rows = [row("reached_base", share, member=member, **place) for member, share in enumerate(shares)]
+    return rows + ([] if validated is None else [row("validated_member", validated, **place)])
+
+
+def test_options_on_ladders_are_compared_by_the_member_that_validation_picks() -> None:
+    """The first where nothing could be validated."""
+    rows = [each for seed in range(3) for each in ladder("D-BAT, 2 members", seed, 0.0, 0.9, validated=1)]
+    rows += [each for seed in range(3) for each in ladder(ONE, seed, 0.1, validated=None)]
+    (sentence,) = sentences(results_of(*rows, ladders=["1L"]))
+    assert sentence.startswith(
+        "Several hypotheses mattered over 3 seeds: options of D-BAT, 2 members stop at the sub-goal"
+    )
+    assert "in 90 % of the executions, those of one classifier in 10 %" in sentence
+    alone = sentences(results_of(*ladder("D-BAT, 2 members", 0, 0.25), ladders=["1L"]))
+    assert alone[0] == "Options of D-BAT, 2 members stop at the sub-goal in 25 % of their executions."
+    assert "unknown" in alone[1]
+
+
+def test_without_controls_nothing_is_claimed() -> None:
+    lines = sentences(run_of({SEVERAL: [0.5]}))
+    assert lines[0] == "D-BAT, 3 members: 50 % of the last training episodes solved." and "unknown" in lines[1]
+    assert sentences(results_of(agents=AGENTS)) == ["No episode of an agent has ended yet: train with more steps."]
+
+
+def test_an_ensemble_alone_has_shown_nothing_yet() -> None:
+    place = {"method": SEVERAL, "artefact": "e", "sub_goal": "door", "scope": "heldout"}
+    rows = [row("balanced_accuracy", value, member=member, **place) for member, value in enumerate((0.94, 0.75, 0.59))]
+    lines = sentences(results_of(*rows))
+    assert lines[0].startswith("No agent has been trained yet")
+    assert "0.94 for the best member, 0.76 on average, 0.59 for the worst" in lines[1]
+
+
+def test_baselines_stand_beside_what_they_were_given() -> None:
+    place = {"method": "PPO tuned", "layout": 1, "seed": 0, "artefact": "ppo"}
+    rows = [row("success", 0.0, **place), row("steps", 250_000, **place)]
+    found = context(results_of(*rows, agents={"PPO tuned": {"kind": "baseline"}}))["baselines"]
+    assert found == [{"name": "PPO tuned", "success": 0.0, "steps": 250_000}]

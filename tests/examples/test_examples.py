@@ -9,6 +9,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from openings import agrees
@@ -22,7 +23,7 @@ from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.evaluation import explorer
+from hypogoal.evaluation import saliency
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
@@ -95,9 +96,9 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
     assert load_options(run / "wide").policies.network.cells.features == 64
     for goal, row in open_dataset(run / "data.h5").counts()["labelled"].items():
         assert 10 < row["positives"] < row["states"] - 10, goal
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    assert [row["sub_goal"] for row in metrics["ensembles"][0]["sub_goals"]] == ["hold-key", "open-door"]
-    assert metrics["agents"][0]["runs"]
+    numbers = pd.read_csv(run / "evaluation" / "numbers.csv")
+    assert [*numbers.query("quantity == 'states'")["sub_goal"]] == ["hold-key", "open-door"]
+    assert "reward" in {*numbers["quantity"]}
     assert "open-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
     agrees(run, OWN_TASK, UNKNOWN)
 
@@ -193,7 +194,7 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYPOGOAL_TRUST")
     lines = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", "").splitlines()
-    monkeypatch.setattr(explorer, "MOST_INTEGRATED", 2)
+    monkeypatch.setattr(saliency, "INTEGRATED", 2)
     two = settings("sub_goals=collect-red-key,open-red-door")
     few = {**SHORT, "collect": settings("unlabelled_seeds=1", "heldout_layouts=1")}
     few["train-ensemble"] = [*SHORT["train-ensemble"], *two]
@@ -201,12 +202,11 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
         if words[:1] == ["hypogoal"]:
             assert main([*words[1:], *few.get(words[1], ())]) == 0, words
     run = tmp_path / "runs" / "backbone"
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    states = [state for goal in metrics["saliency"]["sub_goals"] for state in goal["states"]]
-    assert states and all(state["method"] == "integrated gradients" for state in states)
-    worst = max(member["completeness_error"] for state in states for member in state["members"])
-    assert worst < 1e-3
-    assert "Attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    facts = json.loads((run / "evaluation" / "run.json").read_text(encoding="utf-8"))
+    told = [*facts["looked_at"]["sub_goals"].values()]
+    assert told and all(goal["how"] == "integrated gradients" for goal in told)
+    assert max(goal["completeness_error"] for goal in told) < 1e-3
+    assert "attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
     agrees(run, "Take the red key, open the red door", "One run is not evidence")
     layers, (width,) = runpy.run_path(example.name)["vit"]((64, 64, 3))
     member = nn.Sequential(*layers, nn.Flatten(), nn.Linear(96, width), nn.ReLU(), nn.Linear(width, 2)).eval()
@@ -235,12 +235,11 @@ def test_freeway_goes_through_all_stages(tmp_path: Path) -> None:
     assert main(["train-meta", str(ensemble), "--options", options, "--out", meta, "-q", *play]) == 0
     assert main(["evaluate", str(run), "-q"]) == 0
     assert main(["report", str(run)]) == 0
-    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    rows = {row["sub_goal"]: row for row in metrics["ensembles"][0]["sub_goals"]}
-    assert set(rows) == {"half-way", "far-side"} and metrics["agents"]
+    numbers = pd.read_csv(run / "evaluation" / "numbers.csv")
+    assert {*numbers.query("quantity == 'balanced_accuracy'")["sub_goal"]} == {"half-way", "far-side"}
+    assert "reward" in {*numbers["quantity"]}
     assert "far-side" in (run / "report" / "index.html").read_text(encoding="utf-8")
     agrees(run, OWN_TASK, UNKNOWN)
-    assert all(row["best"]["mean"] is not None for row in metrics["hypotheses"])
 
 
 def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,9 +250,8 @@ def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: py
     for line in example.read_text(encoding="utf-8").splitlines():
         if line.startswith("    hypogoal "):
             assert main(line.split()[1:]) == 0, line
-    metrics = json.loads(Path("runs/lamp/evaluation/metrics.json").read_text(encoding="utf-8"))
-    members = metrics["hypotheses"][0]
-    assert members["best"]["mean"] > 0.95 and members["worst"]["mean"] < 0.9
+    members = pd.read_csv("runs/lamp/evaluation/tables/hypotheses.csv").set_index("quantity")["mean"]
+    assert members["best"] > 0.95 and members["worst"] < 0.9
     assert "lamp-on" in Path("runs/lamp/report/index.html").read_text(encoding="utf-8")
     agrees(Path("runs/lamp"), "", "No agent has been trained yet", "D-BAT")
 

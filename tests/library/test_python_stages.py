@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import shutil
 from pathlib import Path
 
@@ -73,8 +72,7 @@ def test_what_is_made_is_a_path_with_something_to_show(
         made.show()
         assert word in capsys.readouterr().out
     assert hypogoal.Made(run / "data.h5").metrics["unlabelled"] == 9 * corridor.LENGTH
-    metrics = json.loads((run / "evaluation/metrics.json").read_text())
-    assert hypogoal.Made(run / "evaluation").metrics == metrics
+    assert {"method", "quantity", "value"} <= {*hypogoal.Made(run / "evaluation").metrics}
     assert len(hypogoal.load_ensemble(hypogoal.Made(run / "ensemble"), "left-end")) == 2
     shown = hypogoal.Made(write(tmp_path / "<b>&.h5"))._repr_html_()
     assert "&lt;b&gt;&amp;.h5" in shown and "<b>" not in shown

@@ -6,12 +6,13 @@ folder. Only the command line, the public Python names and the files of artefact
 changes inside the package. Seed 3 everywhere.
 """
 
+import contextlib
 import csv
 import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -267,7 +268,9 @@ def evaluated(run: Path) -> Table:
     evaluation = run / "evaluation"
     if not evaluation.exists():
         command("evaluate", str(run))
-    rows = numbers_of(evaluation / "numbers.csv") + metrics_of(evaluation / "metrics.json")
+    rows = numbers_of(evaluation / "numbers.csv")
+    for table in sorted(evaluation.glob("tables/*.csv")):
+        rows += table_of(table)
     return [("file", "place", "value"), *sorted(rows)]
 
 
@@ -287,29 +290,14 @@ def numbers_of(path: Path) -> Table:
     return rows
 
 
-def metrics_of(path: Path) -> Table:
-    """The numbers of ``metrics.json``, without what says where and with what they were made."""
-    metrics = json.loads(path.read_text(encoding="utf-8"))
-    for name in ("run", "format", "settings", "provenance", "quantities"):
-        metrics.pop(name, None)
+def table_of(path: Path) -> Table:
+    """The numbers of a question's table, each by its row's texts and its column."""
     rows: Table = []
-    for place, value in leaves(metrics):
-        rows.append(("metrics.json", renamed(place), number(value)))
+    for line, row in enumerate(rows_of(path)):
+        for column, text in row.items():
+            with contextlib.suppress(ValueError):
+                rows.append((f"tables/{path.name}", f"{line} {column}", number(float(text))))
     return rows
-
-
-def leaves(value: Any, place: str = "") -> Iterator[tuple[str, float]]:
-    """Each number and where it stands; of long lists of numbers some."""
-    if isinstance(value, bool | int | float):
-        yield place, float(value)
-    elif isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from leaves(inner, f"{place}/{key}")
-    elif isinstance(value, list):
-        long = len(value) > CURVE_POINTS and not any(isinstance(inner, Mapping) for inner in value)
-        numbered = list(enumerate(value))
-        for index, inner in thinned(numbered) if long else numbered:
-            yield from leaves(inner, f"{place}/{index}")
 
 
 def thinned(items: list[Any]) -> list[Any]:

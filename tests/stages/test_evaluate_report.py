@@ -1,31 +1,43 @@
 """Spec A5, F, F7: a run of real, tiny artefacts is evaluated and drawn; what is missing is named."""
 
+import csv
 import json
 import re
 import shutil
+import subprocess
+import sys
+import tomllib
 from html.parser import HTMLParser
+from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 from command_line import refuses, run
 from openings import agrees
 from toy_data import reseal
 
 from hypogoal.cells import Cell
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.run import read_evaluation
+from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.data import open_dataset
+from hypogoal.evaluation import house
+from hypogoal.evaluation.run import read_evaluation, thresholds_of
 from hypogoal.experiments.run import begin
+from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import report
 from hypogoal.stages.train_meta import train_meta
 
+STEPS = 1_024 + 2_048  # of options, then of agents
 GOALS = ["collect-red-key", "open-red-door"]
 
 
-@pytest.fixture(scope="module")
-def metrics(tiny_run):
-    """The numbers of the shared run."""
-    return json.loads((tiny_run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+@pytest.fixture
+def results(tiny_run):
+    """What was found in the shared run."""
+    return read_evaluation(tiny_run)
 
 
 def page_of(folder, **how):
@@ -38,36 +50,111 @@ def test_the_page_opens_with_the_task_and_a_verdict_of_its_numbers(tiny_run):
     agrees(tiny_run, "Take the red key, open the red door and reach the goal", "One run is not", "On primitive actions")
 
 
+def test_agents_are_grouped_and_counted_whole(tiny_run, results):
+    """Spec F5, E6, E7: the steps of train-options count, and its artefact is not an agent of its own."""
+    assert [*results.of(quantity="reward", step=pd.NA)["method"]] == [
+        "option agent", "random choice", "oracle terminations", "PPO tuned",
+    ]  # fmt: skip
+    own = results.of(artefact="meta", step=pd.NA, scope="").set_index("quantity")["value"]
+    rows = (tiny_run / "meta" / "episodes.csv").read_text().splitlines()[1:]
+    assert (own["steps"], own["episodes"]) == (STEPS, len(rows))
+    last = np.array([row.split(",") for row in rows[-100:]], dtype=float)
+    assert own["length"] == pytest.approx(last[:, 1].mean())
+    assert own["success"] == pytest.approx(last[:, 3].mean())
+    assert own["length_over_shortest"] == pytest.approx(last[:, 1].mean() / own["shortest_path"])
+    curve = results.of(artefact="meta", quantity="reward")["step"].dropna()
+    assert (curve.min() > 0, curve.max()) == (True, STEPS)
+
+
 def test_an_agent_without_a_whole_episode_is_said_to_be_one(tiny_run, tmp_path):
     """Spec F5: there is no success to speak of, neither 0 nor a dash."""
     train_meta(tiny_run / "ensemble", tmp_path / "meta", steps=512, max_episode_steps=100, random_episodes=2)
-    assert evaluate(tmp_path).metrics["agents"][0]["success"]["mean"] is None
+    numbers = evaluate(tmp_path).metrics
+    assert "success" not in {*numbers[numbers["scope"] == ""]["quantity"]}
     page = page_of(tmp_path)
     assert "No episode of an agent has ended yet" in page and "reached the goal in" not in page
 
 
 def test_what_was_made_since_is_said(tiny_copy):
     """Spec A5, F7: a report of an evaluation that does not know all that is there says what, and what to do."""
-    assert not [line for line in read_evaluation(tiny_copy).metrics["missing"] if "since" in line]
+    assert not [line for line in read_evaluation(tiny_copy).facts["missing"] if "since" in line]
     reseal(shutil.copytree(tiny_copy / "ppo", tiny_copy / "later"), seed=1)
     assert "later: made since this evaluation" in page_of(tiny_copy, force=True)
 
 
-def test_metrics_are_strict_json(tiny_run):
-    """Spec A5, A8: and the inputs' hashes are in the manifest."""
-    text = (tiny_run / "evaluation" / "metrics.json").read_text(encoding="utf-8")
-    assert not re.search(r"\b(NaN|Infinity)\b", text)
+def test_members_are_judged_on_heldout_states(tiny_run, results):
+    """Spec F1, F2: numbers of each ensemble, sub-goal and member, recomputed here from the file and the weights."""
+    methods = results.of(quantity="states").drop_duplicates("artefact").set_index("artefact")["method"]
+    dbat = "D-BAT, 2 members"
+    assert methods.to_dict() == {"another": dbat, "ensemble": dbat, "ensemble-none": "no diversity, 2 members"}
+    source = open_artefact(tiny_run / "ensemble")
+    split = open_dataset(tiny_run / "data.h5").heldout("collect-red-key")
+    yes = read_ensemble(source.path, source.config, "collect-red-key").predict(split.observations) > 0.5
+    recall, rejections = yes[split.labels].mean(0), (~yes)[~split.labels].mean(0)
+    own = results.of(artefact="ensemble", sub_goal="collect-red-key", scope="heldout").set_index("quantity")["value"]
+    np.testing.assert_allclose(own["balanced_accuracy"], (recall + rejections) / 2)
+    assert own["disagreement"] == pytest.approx((yes[:, 0] != yes[:, 1]).mean())
+    assert own["layouts"] == len(set(split.origins["layout_seed"].tolist()))
+    table = pd.read_csv(tiny_run / "evaluation/tables/hypotheses.csv")
+    assert len(table[table["quantity"] == "best"]) == len(GOALS) + 1
+
+
+def test_thresholds_are_those_of_members_and_of_options(tiny_run, tmp_path):
+    """Whatever rule set them; of options they are the artefact's, which may have fallen since."""
+    source = open_artefact(tiny_run / "ensemble-none")
+    wanted = read_ensemble(source.path, source.config, "open-red-door").thresholds.tolist()
+    assert wanted[0] != 0.5
+    with (tiny_run / "evaluation" / "numbers.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["quantity"] == "threshold" and row["scope"] == "heldout"]
+    told = {
+        name: [float(row["value"]) for row in rows if row["artefact"] == name] for name in ("another", source.path.name)
+    }
+    assert told == {"another": [0.5] * 4, "ensemble-none": wanted}
+
+    shutil.copytree(tiny_run / "meta", tmp_path / "meta")
+    weights = load_tensors(tmp_path / "meta" / "options.safetensors")
+    weights["thresholds"][3] = -np.log(3.0)
+    save_tensors(tmp_path / "meta" / "options.safetensors", weights)
+    assert thresholds_of(Artefact(tmp_path / "meta")) == pytest.approx([0.5] * 3 + [0.25])
+    assert np.isnan(thresholds_of(open_artefact(tiny_run / "meta-oracle"))).all()
+
+
+def test_selection_counts_every_decision(tiny_run, results):
+    """Spec F6: what was chosen and offered, and the random chooser's control beside it; oracle has no members."""
+    table = pd.read_csv(tiny_run / "evaluation/tables/choices.csv")
+    assert [*table["method"].unique()] == ["option agent", "random choice"]
+    choices = np.genfromtxt(tiny_run / "meta-random" / "choices.csv", delimiter=",", names=True)
+    random = table[table["method"] == "random choice"]
+    assert len(random) == 4
+    assert random["chosen"].sum() == choices["chosen"].sum()
+    assert random["expected"].sum() == pytest.approx(choices["chosen"].sum())
+    often = random["preference"][random["expected"] > 40]
+    assert len(often) and often.between(0.5, 1.7).all()
+    overlaid = [name for name in results.arrays if name.startswith("terminations/meta/")]
+    counts = results.arrays["termination-states/meta/counts"]
+    assert results.arrays[overlaid[0]].shape == (64, 64, 3)
+    assert sorted(f"terminations/meta/{option}" for option in np.flatnonzero(counts)) == sorted(overlaid)
+
+
+def test_every_number_is_explained(tiny_run, results):
+    """Spec A5, A8: each quantity has its unit and meaning, run.json is strict, the inputs' hashes in the manifest."""
+    meanings = tomllib.loads((Path(house.__file__).parent / "quantities.toml").read_text(encoding="utf-8"))
+    assert {*results.numbers["quantity"]} <= {*meanings}
+
+    def refuse(name):
+        raise AssertionError(name)
+
+    json.loads((tiny_run / "evaluation" / "run.json").read_text(), parse_constant=refuse)
     kinds = sorted(entry.kind for entry in open_artefact(tiny_run / "evaluation", "evaluation").manifest.inputs)
     assert kinds == ["baseline", "data", "ensemble", "ensemble", "ensemble", "meta", "meta", "meta"]
 
 
-def test_what_is_missing_is_named(tiny_run, metrics, tmp_path):
-    """Spec F: no silent absence, in the metrics, on the page and in an evaluation of a run with a baseline only."""
-    assert metrics["missing"] == [], "what nobody asked for is not missed"
+def test_what_is_missing_is_named(results, tiny_run, tmp_path):
+    """Spec F: no silent absence, in the results, on the page and in an evaluation of a run with a baseline only."""
+    assert results.facts["missing"] == [], "what nobody asked for is not missed"
     shutil.copytree(tiny_run / "ppo", tmp_path / "ppo")
-    alone = evaluate(tmp_path).metrics
-    assert alone["missing"][0] == "no ensemble"
-    assert alone["ensembles"] == alone["selection"] == []
+    evaluate(tmp_path)
+    assert read_evaluation(tmp_path).facts["missing"] == ["no ensemble"]
     assert "<li>no ensemble</li>" in page_of(tmp_path)
 
 
@@ -87,17 +174,18 @@ def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypat
     told = "\n".join(lines)
     assert "D-BAT, 2 members" in told and "no diversity, 2 members" in told
     assert "PPO" not in told and "last 100" not in told
-    metrics = json.loads((tmp_path / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    assert metrics["missing"] == ["no agents", "1 of the run's cells are not done; the first is other"]
-    row = next(row for row in metrics["hypotheses"] if row["sub_goal"] == "collect-red-key")
-    numbers = [f"{row[which]['mean']:.3f}" for which in ("best", "mean", "worst")]
+    facts = json.loads((tmp_path / "evaluation" / "run.json").read_text(encoding="utf-8"))
+    assert facts["missing"] == ["no agents", "1 of the run's cells are not done; the first is other"]
+    table = pd.read_csv(tmp_path / "evaluation/tables/hypotheses.csv").set_index(["method", "sub_goal", "quantity"])
+    means = table["mean"].sort_index()["D-BAT, 2 members", "collect-red-key"]
     (line,) = (line for line in lines if "collect-red-key" in line)
-    assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
+    assert [cell.strip() for cell in line.split("│")[3:6]] == [
+        f"{means[which]:.3f}" for which in ("best", "mean", "worst")
+    ]
     for path in (tmp_path, tmp_path / "evaluation"):
         assert line in run("show", path).out.splitlines()
-    assert json.loads(run("show", tmp_path / "evaluation", "--json").out)["numbers"] == metrics
-    (tmp_path / "evaluation" / "metrics.json").write_text("{}", encoding="utf-8")
-    refuses("metrics.json is changed since it was written", "show", tmp_path)
+    (tmp_path / "evaluation" / "run.json").write_text("{}", encoding="utf-8")
+    refuses("run.json", "show", tmp_path)
 
 
 class Structure(HTMLParser):
@@ -137,7 +225,7 @@ def test_the_page_is_whole_and_needs_nothing_else(tiny_run):
     assert found.stack == []
     assert len(found.ids) == len(set(found.ids))
     inside = {f"#{identity}" for identity in found.ids}
-    drawn = ("data:image/png;base64,", "data:image/gif;base64,")
+    drawn = tuple(f"data:image/{kind};base64," for kind in ("png", "gif", "svg+xml"))
     assert all(link.startswith(drawn) or link in inside for link in found.links)
     assert not {"link", "iframe", "object"} & set(found.tags)
     assert not re.search(r"fetch\(|XMLHttpRequest|import\(|https?://(?!www\.w3\.org/)", "".join(found.scripts))
@@ -150,18 +238,18 @@ def test_the_page_shows_all_of_it_each_time_the_same(tiny_run, tiny_copy):
     page = page_of(tiny_copy, force=True)
     assert page == (tiny_run / "report" / "index.html").read_text(encoding="utf-8")
     for title in (
-        "Summary", "Hypotheses", "Explore the hypotheses",
+        "Summary", "Hypotheses",
         "Which hypotheses are chosen, and where they stop", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     names = [path.name for path in (tiny_run / "report" / "figures").iterdir()]
     drawn = {name.rpartition(".")[0] for name in names}
-    assert {"reward", "members", "figure7"} <= drawn
+    assert {"figure6", "members", "figure7"} <= drawn
     assert sorted(names) == sorted(f"{name}.{kind}" for name in drawn for kind in ("svg", "png"))
-    assert page.count("<figure") == 1 + len(drawn) and page.count("data:image/gif;base64,") == 1
+    assert page.count("data:image/gif;base64,") == 1
     assert re.search(r"Episode \d of meta, layout 100: \d+ steps", page)
-    assert page.count("<h3>Seed by seed: ") == 1, "one run of an agent is no table of pairs"
-    assert "1 run: layout seed 100, run seed 0" in page
+    assert page.count("<h3>Seed by seed") == 1, "one run of an agent is no table of pairs"
+    assert "Layouts: 100; run seeds: 0." in page
     assert "Missing in this run" not in page
 
 
@@ -192,6 +280,16 @@ def test_the_papers_figures_as_files(tiny_run, tmp_path):
     assert [line.partition(":")[0] for line in missing] == ["Figure 3", "Figure 4", "Figure 5", "Figure 8"]
     assert all("It needs" in line and line in captions for line in missing)
     refuses("exists already", *command)
+
+
+def test_a_figure_is_the_same_whatever_the_folder_would_have_matplotlib_do(tiny_run, tmp_path):
+    """Spec F7, G1: in a folder with a matplotlibrc."""
+    run("report", tiny_run, "--figures", tmp_path / "a")
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nfigure.dpi: 100000\nsavefig.bbox: tight\n")
+    command = [sys.executable, "-P", "-m", "hypogoal", "report", str(tiny_run), "--figures", "b"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
+    drawn = [{file.name: file.read_bytes() for file in (tmp_path / name).iterdir()} for name in "ab"]
+    assert drawn[0] == drawn[1]
 
 
 def test_what_cannot_be_evaluated_is_one_line(tiny_copy, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import corridor_env
@@ -17,7 +16,8 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.env import SUB_GOALS
 from hypogoal.domains.gymnasium.domain import GymnasiumDomain
-from hypogoal.evaluation.selection import practised
+from hypogoal.evaluation import selection
+from hypogoal.evaluation.run import read_evaluation
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import assemble
@@ -54,16 +54,15 @@ def test_an_agent_of_own_labels_is_evaluated(own_run: Path) -> None:
     """Spec A5, F6: everything but the match, of which nobody knows; that is said."""
     run("train-meta", own_run / "ensemble", "--out", own_run / "meta", *FEW)
     run("evaluate", own_run, "-q")
-    metrics = json.loads((own_run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    (goal,) = metrics["selection"][0]["runs"][0]["sub_goals"]
-    assert goal["sub_goal"] == "at-the-door" and [member["match"] for member in goal["members"]] == [None, None]
-    assert sum(member["chosen"] for member in goal["members"]) > 0
+    results = read_evaluation(own_run)
+    chosen = results.of(quantity="chosen", sub_goal="at-the-door")["value"]
+    assert len(chosen) == 2 and chosen.sum() > 0 and results.of(quantity="match").empty
     text = "no truth of at-the-door to match members with: doorkey has collect-blue-key, collect-green-key, "
-    (line,) = (line for line in metrics["missing"] if line.startswith(text))
+    (line,) = (line for line in results.facts["missing"] if line.startswith(text))
     assert line.endswith(
         "and go-to-goal; import them under one of these names, if it is one of them, then evaluate again"
     )
-    assert not (own_run / "meta" / "exploits.csv").exists() and metrics["exploits"]["over_runs"] == []
+    assert not (own_run / "meta" / "exploits.csv").exists() and results.of(quantity="fires_far").empty
     run("report", own_run)
     assert "no truth of at-the-door" in (own_run / "report" / "index.html").read_text(encoding="utf-8")
 
@@ -91,23 +90,23 @@ def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
     run("train-ensemble", data, "--out", tmp_path / "ensemble", *few)
     run("train-options", tmp_path / "ensemble", "--out", made / "options", *FEW)
     shown_text = " ".join(run("evaluate", made).out.split())
-    assert "What options did while they learned" in shown_text and "near-the-end" in shown_text
-    metrics = json.loads((made / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    assert metrics["missing"][1:] == [
+    assert "options of" in shown_text and "near-the-end" in shown_text
+    results = read_evaluation(made)
+    assert results.facts["missing"][1:] == [
         "no truth of near-the-end to match members with: corridor_env:DOMAIN has left-end and right-end; add "
         "near-the-end to the sub-goals of its GymnasiumDomain, with a function that says where it holds, then evaluate "
         "again"
     ]
-    members = metrics["selection"][0]["runs"][0]["sub_goals"][0]["members"]
-    row = practised("near-the-end", members)
-    assert row["chosen"] == sum(member["chosen"] for member in members) > 0 and 1 <= row["duration"] <= 10
+    table = selection.context(results)["table"].loc["near-the-end"]
+    chosen = results.of(quantity="chosen")["value"].sum()
+    assert int(table["executions"]) == chosen > 0 and 1 <= float(table["steps"]) <= 10
     run("report", made)
     page = (made / "report" / "index.html").read_text(encoding="utf-8")
     assert "andom choice while options learn" in page and "Whether hypotheses mattered is unknown" in page
     known = GymnasiumDomain(CorridorEnv, {**SUB_GOALS_OF_CORRIDOR, "near-the-end": lambda env: env.unwrapped.cell == 4})
     monkeypatch.setattr(corridor_env, "DOMAIN", known)
     run("evaluate", made, "--force", "-q")
-    assert json.loads((made / "evaluation" / "metrics.json").read_text())["missing"] == ["no ensemble"]
+    assert read_evaluation(made).facts["missing"] == ["no ensemble"]
 
 
 def test_true_sub_goals_that_the_domain_does_not_have_are_refused(own_run: Path) -> None:

@@ -12,7 +12,7 @@ from PIL import Image
 from hypogoal.core.artefacts import Artefact, create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
-from hypogoal.evaluation.films import agents_of, play_films
+from hypogoal.evaluation.films import agents_of, films_of, play_films
 from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
@@ -61,7 +61,7 @@ def test_videos_are_of_the_agents_that_choose(tiny_run):
     """Spec E1, F7: of the one that learned to choose, not of the random chooser; a frame for each of the episode's."""
     agents = agents_of(tiny_run)
     assert [artefact.path.name for artefact in agents] == ["meta"]
-    films = play_films(agents, tiny_run, 2)
+    films = [*play_films(agents, tiny_run, 2)]
     assert [film.name for film in films] == ["meta-episode-0.gif", "meta-episode-1.gif"]
     with Image.open(io.BytesIO(films[0].gif)) as video:
         assert video.format == "GIF"
@@ -83,8 +83,9 @@ def test_a_run_without_such_an_agent_is_one_line(tmp_path):
     """Spec G2: what is missing is named."""
     with create(tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0):
         pass
+    assert films_of(agents_of(tmp_path), tmp_path, None) == ([], [])
     with pytest.raises(UserError, match="Videos need a meta artefact with learned terminations"):
-        agents_of(tmp_path)
+        films_of(agents_of(tmp_path), tmp_path, 1)
 
 
 def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch):
@@ -99,7 +100,8 @@ def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch
     (film,) = play_films(agents_of(tiny_run), tiny_run, None)
     assert film.name == "meta-episode-3.gif" and len(plays) == 1
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
-    assert play_films(agents_of(tiny_run), tiny_run, None)[0].name == "meta-episode-0.gif"
+    (film,) = play_films(agents_of(tiny_run), tiny_run, None)
+    assert film.name == "meta-episode-0.gif"
 
 
 def test_what_is_drawn_of_a_frame():

@@ -1,0 +1,92 @@
+"""What members know of held-out states, wherever their thresholds lie, and which features they have found (F1, H1)."""
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from made_up import results_of, row
+
+from hypogoal.evaluation import hypotheses
+from hypogoal.evaluation.hypotheses import coverage, knowledge
+from hypogoal.evaluation.judging import Judged
+from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
+
+RNG = np.random.default_rng(0)
+LABELS = RNG.random(60) < 0.3
+PROBABILITIES = np.clip(RNG.random((60, 3)) + np.array([0.5, 0.1, -0.2]) * LABELS[:, None], 0, 1).astype(np.float32)
+CONTEXTS = np.repeat(np.arange(6), 10)
+EVERY = np.ones(60, dtype=np.bool_)
+JUDGED = Judged(PROBABILITIES, PROBABILITIES > 0.5, PROBABILITIES[:0] > 0.5, np.full(3, 0.5, np.float32))
+
+
+def test_members_numbers_are_their_scores() -> None:
+    """Ranking, the best threshold, and what the own one loses."""
+    found, _ = knowledge(JUDGED, EVERY, LABELS, CONTEXTS)
+    accuracy = member_scores(JUDGED.predictions, LABELS)["balanced_accuracy"]
+    best = best_threshold(PROBABILITIES, LABELS)[1]
+    assert found["ranking"].tolist() == ranking(PROBABILITIES, LABELS).tolist()
+    assert found["at_best_threshold"].tolist() == best.tolist()
+    assert found["calibration_gap"].tolist() == (best - accuracy).tolist()
+    assert min(found["calibration_gap"]) >= 0
+
+
+def test_the_best_is_picked_where_it_is_not_scored() -> None:
+    """By hand: the member that is best on contexts 0, 2, 4 on the others, and the other way round."""
+    first = CONTEXTS % 2 == 0
+    ranked = [ranking(PROBABILITIES[half], LABELS[half]) for half in (first, ~first)]
+    expected = (ranked[1][ranked[0].argmax()] + ranked[0][ranked[1].argmax()]) / 2
+    _, found = knowledge(JUDGED, EVERY, LABELS, CONTEXTS)
+    assert found["cross_fitted_ranking"] == pytest.approx(expected)
+    for contexts in (None, CONTEXTS * 0):
+        assert math.isnan(knowledge(JUDGED, EVERY, LABELS, contexts)[1]["cross_fitted_ranking"])
+
+
+CROSSED = np.array(list(product((0, 1), repeat=4)) * 20)  # (320, 4)
+PLANTED = dict(zip("abcd", CROSSED.T, strict=True))
+SURE = np.where(CROSSED, 0.9, 0.1).astype(np.float32)  # a member for each feature
+
+
+@pytest.mark.parametrize(
+    ("members", "covered"),
+    [
+        (SURE, 1.0),
+        (np.repeat(SURE[:, [2]], 6, axis=1), 0.25),
+        (np.full((320, 4), 0.3, np.float32), 0.0),
+        (RNG.random((320, 4)).astype(np.float32), 0.0),
+        ((SURE[:, :1] > 0.5) & (SURE[:, 1:2] > 0.5), 0.0),
+        (0.6 * SURE[:, :1] + 0.2 * SURE[:, 1:2], 0.0),
+        (0.6 * SURE[:, :1] - 0.2 * SURE[:, 1:2], 0.0),
+    ],
+    ids=["one each", "copies of one", "constant", "guesses", "two at once", "a hint of another", "a hint against"],
+)
+def test_coverage_of_members_whose_knowledge_is_known(members: np.ndarray, covered: float) -> None:
+    """Spec H1: a member owns a feature if it ranks by it and by no other, neither way round."""
+    assert coverage(members.astype(np.float32), PLANTED) == covered
+
+
+def accuracies(method: str, seed: int, **by_goal: list[float]) -> list[dict]:
+    """Rows of an ensemble's members."""
+    rows = []
+    for sub_goal, values in by_goal.items():
+        place = {
+            "method": method,
+            "seed": seed,
+            "artefact": f"{method}-{seed}",
+            "sub_goal": sub_goal,
+            "scope": "heldout",
+        }
+        rows += [row("balanced_accuracy", value, member=member, **place) for member, value in enumerate(values)]
+    return rows
+
+
+def test_best_mean_and_worst_member_over_seeds() -> None:
+    """And the first method against the second, by seed and sub-goal."""
+    rows = accuracies("D-BAT, 2 members", 0, red=[0.8, 0.6]) + accuracies("D-BAT, 2 members", 1, red=[0.9, 0.5])
+    results = results_of(*rows, *accuracies("one classifier", 1, red=[0.7]))
+    table = hypotheses.tables(results)["hypotheses"].set_index(["method", "quantity"])["mean"]
+    found = [table["D-BAT, 2 members", which] for which in ("best", "mean", "worst")]
+    assert found == pytest.approx([0.85, 0.7, 0.55])
+    (best,) = hypotheses.tables(results)["hypotheses-pairs"].query("quantity.str.contains('best')").to_dict("records")
+    assert (best["n"], best["difference"]) == (1, pytest.approx(0.2))
+    assert hypotheses.context(results_of()) is None
