@@ -28,7 +28,13 @@ from hypogoal.learners.double_dqn import Batch, DoubleDQN
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options.config import STACK, PaperConfig
-from hypogoal.options.learner import FILE, Learner, Policies, SavedOptions, Transitions
+from hypogoal.options.learner import (
+    FILE,
+    Learner,
+    Policies,
+    SavedOptions,
+    Transitions,
+)
 from hypogoal.options.parts import Ids
 
 
@@ -57,7 +63,11 @@ class PaperQNetwork(nn.Module):
         )
         sides = [((side - 2) // 2 - 2) // 2 for side in (height, width)]
         self.gru = nn.GRU(32 * math.prod(sides), self.HIDDEN, batch_first=True)
-        self.values = nn.Sequential(nn.Linear(self.HIDDEN, 128), nn.ReLU(), nn.Linear(128, actions))
+        self.values = nn.Sequential(
+            nn.Linear(self.HIDDEN, 128),
+            nn.ReLU(),
+            nn.Linear(128, actions),
+        )
 
     def see(self, images: Tensor) -> Tensor:
         """uint8 (N, H, W, C) -> features float32 (N, F)."""
@@ -128,7 +138,8 @@ class PaperLearner(Learner):
             fault = "network=paper needs experience=own"
             raise UserError(fault, f"experience={config.experience}", "Give --set experience=own.")
         if engine.observation_dtype != PICTURE:
-            raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
+            fault = "the paper's networks see pictures only"
+            raise UserError(fault, "network=paper", "Give --set network=light.")
 
     @classmethod
     def policies(cls, saved: SavedOptions) -> Policies:
@@ -137,8 +148,9 @@ class PaperLearner(Learner):
     def build(self, config: PaperConfig, seed: int) -> None:
         self.members = []
         for option in range(self.options):
+            shape, actions = self.engine.observation_shape, self.engine.n_actions
             with DrawsFrom(torch_generator(seed, "option-weights", option)):
-                network = PaperQNetwork(self.engine.observation_shape, self.engine.n_actions)
+                network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), config))
         self.windows = np.zeros((self.engine.count, config.recurrence), np.int64)  # of running executions
         self.lengths = np.zeros(self.engine.count, np.int64)  # of these, how many of the last states are real
@@ -166,11 +178,12 @@ class PaperLearner(Learner):
         for option in np.unique(options):
             rows = options == option
             network = self.members[option].online.eval()
-            windows = left_aligned(self.windows[rows], self.lengths[rows])
+            lengths = self.lengths[rows]
+            windows = left_aligned(self.windows[rows], lengths)
             states, places = np.unique(windows, return_inverse=True)
             features = network.see(self.tensor(self.engine.images(states)))
             windows = self.tensor(places.reshape(windows.shape))
-            values = network(features, windows, torch.from_numpy(self.lengths[rows]))
+            values = network(features, windows, torch.from_numpy(lengths))
             chosen[rows] = values.argmax(1).cpu().numpy()
         return chosen
 
@@ -203,22 +216,29 @@ class PaperLearner(Learner):
 
     def _update(self, option: int, member: Member) -> float:
         """One update of a member's policy; returns the loss, 0 where all steps drawn are forgotten."""
-        config, most = self.config, self.config.recurrence
+        config = self.config
+        most = config.recurrence
         indices, weights = member.replay.sample(config.option_batch, self.rng)
         steps = member.replay.data.at(indices)
         padding = np.arange(most + 1) < most - steps.length[:, None]
         known = (self.engine.remembers(steps.path) | padding).all(axis=1)
         if not known.any():
             return 0.0
-        indices, weights, steps = indices[known], weights[known], steps.at(known)
+        indices = indices[known]
+        weights = weights[known]
+        steps = steps.at(known)
 
-        path, length = steps.path.astype(np.int64), steps.length.astype(np.int64)
+        path = steps.path.astype(np.int64)
+        length = steps.length.astype(np.int64)
         later = np.minimum(length + 1, most)
-        windows = np.stack([left_aligned(path[:, :-1], length), left_aligned(path[:, 1:], later)])
+        now = left_aligned(path[:, :-1], length)
+        next_ones = left_aligned(path[:, 1:], later)
+        windows = np.stack([now, next_ones])
         states, places = np.unique(windows, return_inverse=True)
         images = self.tensor(self.engine.images(states))  # each once; BatchNorm counts it once (DEV-51)
         before, after = self.tensor(places.reshape(windows.shape))
-        online, target = member.online.train(), member.target
+        online = member.online.train()
+        target = member.target
         features = online.see(images)
         values = online(features, before, torch.from_numpy(length))
         with torch.no_grad():

@@ -24,8 +24,19 @@ from hypogoal.learners.double_dqn import Batch, DoubleDQN
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.observations import Observations, standard_of
 from hypogoal.options.config import STACK, LightConfig
-from hypogoal.options.learner import FILE, Learner, Policies, SavedOptions, Transitions
-from hypogoal.options.networks import LightQNetwork, PictureEmbedding, apply_all_to_states, apply_to_states
+from hypogoal.options.learner import (
+    FILE,
+    Learner,
+    Policies,
+    SavedOptions,
+    Transitions,
+)
+from hypogoal.options.networks import (
+    LightQNetwork,
+    PictureEmbedding,
+    apply_all_to_states,
+    apply_to_states,
+)
 from hypogoal.options.parts import Flags, Ids
 
 POSITIVES_KEPT = 512  # per member
@@ -120,7 +131,8 @@ class LightLearner(Learner):
 
         With own experience, False for all options but the one that was running.
         """
-        states, next_states = rows.state.astype(np.int64), rows.next_state.astype(np.int64)
+        states = rows.state.astype(np.int64)
+        next_states = rows.next_state.astype(np.int64)
         if not self.running_only:
             return self.terminations.of(states), self.terminations.of(next_states)
         option = rows.option.astype(np.int64)
@@ -156,7 +168,9 @@ class LightLearner(Learner):
             weights=self.tensor(weights),
             learns=self.tensor(learns),
         )
-        values = self._values(lessons.state.astype(np.int64), lessons.next_state.astype(np.int64))
+        states = lessons.state.astype(np.int64)
+        next_states = lessons.next_state.astype(np.int64)
+        values = self._values(states, next_states)
         loss, errors = self.networks.update(*values, batch, range(self.options), self.steps)
         self.replay.set_priorities(indices, errors[: len(indices)])
         return loss
@@ -165,7 +179,8 @@ class LightLearner(Learner):
         """Transitions, the first of them drawn from the replay at indices int64 (m,), and weights float32 (n,)."""
         kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
         if self.engine.memory is not None:
-            kept &= self.engine.remembers(self.positive.state) & self.engine.remembers(self.positive.next_state)
+            kept &= self.engine.remembers(self.positive.state)
+            kept &= self.engine.remembers(self.positive.next_state)
         counts = kept.sum(1)
         have = np.flatnonzero(counts)
         extra = round(self.config.option_batch * POSITIVE_SHARE) if len(have) else 0
@@ -182,7 +197,8 @@ class LightLearner(Learner):
 
     def _values(self, states: Ids, next_states: Ids) -> tuple[Tensor, Tensor, Tensor]:
         """The online network in states (with gradients) and in next states, the target in these; (n, O, A) each."""
-        online, target = self.networks.online, self.networks.target
+        online = self.networks.online
+        target = self.networks.target
         if isinstance(online.cells, PictureEmbedding):  # whose states hardly ever occur twice
             images = self.tensor(self.engine.images(np.concatenate([states, next_states])))
             now, later = images.float().split(len(states))
@@ -194,7 +210,10 @@ class LightLearner(Learner):
         here, after = self.tensor(places).split(len(states))
         values, others = apply_all_to_states((online, target), self.engine, distinct)
         # index_select, not indexing, whose gradient takes several times as long.
-        return values.index_select(0, here), values.detach().index_select(0, after), others.index_select(0, after)
+        now = values.index_select(0, here)
+        next_online = values.detach().index_select(0, after)
+        next_target = others.index_select(0, after)
+        return now, next_online, next_target
 
     def weights(self) -> dict[str, Tensor]:
         return {f"online.{name}": value for name, value in self.networks.online.state_dict().items()}
@@ -207,7 +226,8 @@ class LightPolicies:
     """Greedy policies of saved options that share one network (Spec D8)."""
 
     def __init__(self, saved: SavedOptions):
-        weights, embedding = below("online.", saved.weights), saved.config["embedding"]
+        weights = below("online.", saved.weights)
+        embedding = saved.config["embedding"]
         actions = saved.actions("online.heads.weight", saved.count)
         standard = standard_of(saved.shape) if "cells.mean" in weights else None  # the weights' own replaces it
         make = partial(

@@ -17,7 +17,12 @@ from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Outcome
 from hypogoal.options.parts import Flags, Floats, Ids
-from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
+from hypogoal.options.tables import (
+    Choices,
+    Episodes,
+    Executions,
+    Exploits,
+)
 
 STOPS_KEPT = 128  # per option
 

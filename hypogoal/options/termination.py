@@ -18,7 +18,13 @@ from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part
+from hypogoal.options.parts import (
+    Flags,
+    Floats,
+    Ids,
+    Part,
+    load_part,
+)
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
 ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
