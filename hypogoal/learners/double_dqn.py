@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -69,7 +69,7 @@ class DoubleDQN(Resumable):
     ``config`` is a ``LearnerConfig``; gradients are cut to the norm ``largest``.
     """
 
-    CHANGING = ("online", "target", "optimiser", "updates")
+    CHANGING: ClassVar[tuple[str, ...]] = ("online", "target", "optimiser", "updates")
 
     def __init__(self, online: nn.Module, config: Any, largest: float = math.inf):
         self.online, self.config, self.largest = online, config, largest

@@ -119,6 +119,8 @@ class Member(DoubleDQN):
     """One member's policy: networks, optimiser, replay, and the steps since its last update."""
 
     CHANGING = (*DoubleDQN.CHANGING, "replay", "due")
+    online: PaperQNetwork
+    target: PaperQNetwork
 
     def __init__(self, online: PaperQNetwork, config: PaperConfig):
         super().__init__(online, config)
@@ -182,8 +184,8 @@ class PaperLearner(Learner):
             windows = left_aligned(self.windows[rows], lengths)
             states, places = np.unique(windows, return_inverse=True)
             features = network.see(self.tensor(self.engine.images(states)))
-            windows = self.tensor(places.reshape(windows.shape))
-            values = network(features, windows, torch.from_numpy(lengths))
+            seen = self.tensor(places.reshape(windows.shape))
+            values = network(features, seen, torch.from_numpy(lengths))
             chosen[rows] = values.argmax(1).cpu().numpy()
         return chosen
 
@@ -257,8 +259,14 @@ class PaperLearner(Learner):
             weights=self.tensor(weights),
             learns=torch.ones_like(terminal)[:, None],
         )
-        each = [outputs[:, None] for outputs in (values, next_online, next_target)]
-        loss, errors = member.update(*each, batch, [option], self.option_steps[option])
+        loss, errors = member.update(
+            values[:, None],
+            next_online[:, None],
+            next_target[:, None],
+            batch,
+            [option],
+            self.option_steps[option],
+        )
         member.replay.set_priorities(indices, errors)
         return loss
 
