@@ -79,7 +79,7 @@ class TrainingStates(Resumable):
         kept = [np.require(states, requirements=["C", "W"]) for states in (observations, unlabelled)]
         self._tables: patches.Tables | None = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
-            self._tables = patches.make_tables(kept, ensemble.networks[0])
+            self._tables = patches.make_tables(kept[0], ensemble.networks[0], kept[1])
         self._states: list[Tensor] = []
         if self._tables is None:
             self._states = [as_tensor(states).to(self.device) for states in kept]

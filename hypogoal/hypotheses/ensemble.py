@@ -214,7 +214,7 @@ class Ensemble(nn.Module):
         """Logits (K, N, 2); computes each distinct patch once if that pays."""
         members, device = self.networks, self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables([observations], members[0])
+            tables = patches.make_tables(observations, members[0])
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
                 return torch.stack([patches.forward(member, batch) for member in members])

@@ -54,7 +54,7 @@ def test_groups_pass_together_and_batchnorm_sees_them_apart(name: str, counted: 
 def double_batch(images: NDArray[np.uint8], network: nn.Sequential, *groups: NDArray[np.int64]) -> patches.Batch:
     """A batch in double precision."""
     batch = patches.take(patches._tables(images, patches.windows_of(network) or []), *groups)
-    shares = tuple(tuple(share.double() for share in level) for level in batch.shares)
+    shares = [[(share.double(), places) for share, places in level] for level in batch.shares]
     return dataclasses.replace(batch, first=batch.first.double(), shares=shares)
 
 
@@ -96,8 +96,8 @@ def test_tables_by_hand() -> None:
     assert windows == [[1.0] * 4] * 3 + [[1.0, 1.0, 1.0, 0.0]] + [[1.0] * 4] * 4
     assert len(level.parts) == 2
     batch = patches.take(tables, np.array([0]))
-    assert sorted(batch.shares[0][0][0].tolist()) == [0.25, 0.75]
-    assert batch.places == ((4,),)
+    (((share, places),),) = batch.shares
+    assert sorted(share[0].tolist()) == [0.25, 0.75] and places == 4
 
 
 def test_only_what_repeats_is_tabled() -> None:
@@ -106,10 +106,10 @@ def test_only_what_repeats_is_tabled() -> None:
     windows = patches.windows_of(network)
     assert windows == [(5, 2), (3, 2), (3, 2), (4, 2)]
     noise = np.random.default_rng(0).integers(256, size=(8, 48, 48, 3), dtype=np.uint8)
-    assert patches.make_tables([noise], network) is None
-    assert patches.make_tables([grid_world(80, 6)], network) is not None
-    assert patches.make_tables([grid_world(80, 6)[:0]], network) is None
-    assert patches.make_tables([grid_world(80, 6)], nn.Sequential(nn.Dropout())) is None
+    assert patches.make_tables(noise, network) is None
+    assert patches.make_tables(grid_world(80, 6), network) is not None
+    assert patches.make_tables(grid_world(80, 6)[:0], network) is None
+    assert patches.make_tables(grid_world(80, 6), nn.Sequential(nn.Dropout())) is None
     for layer in (
         nn.Conv2d(3, 4, 3, padding=1),
         nn.Conv2d(3, 3, 3, groups=3),
