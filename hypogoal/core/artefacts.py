@@ -30,7 +30,9 @@ MANIFEST = "manifest.json"
 LOG = "metrics.jsonl"
 TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
 DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
-SIGNATURES = {DATA: b"\x89HDF\r\n\x1a\n", ARRAYS: b"PK\3\4"}  # how such files begin
+# How a file of a kind begins, and what its first bytes have, even if the rest is cut off: others' files stay.
+SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations")}
+FRONT = 1 << 16  # bytes of a file that are looked at for its kind
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers",)  # settings that change no result
 AGAIN = "Make the artefact again."
@@ -373,9 +375,9 @@ def kind_of(out: Path) -> str | None:
             return str(read_json(out / MANIFEST, "the manifest is", AGAIN)["kind"])
         return ""
     with out.open("rb") as file:
-        front = file.read(8)
-    for kind, signature in SIGNATURES.items():
-        if front.startswith(signature):
+        front = file.read(FRONT)
+    for kind, (begin, part) in SIGNATURES.items():
+        if front.startswith(begin) and part in front:
             return kind
     return ""
 
