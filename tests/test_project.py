@@ -205,13 +205,17 @@ def test_formats_are_readable_without_hypogoal(
         member = Ensemble("doorkey", (64, 64, 3), 1, torch_generator(0, "weights")).eval()
         write_ensemble(draft.files, "open-red-door", member)
     snippets = blocks(ROOT / "docs/formats.md", "python")
-    assert len(snippets) == 4 and not any("hypogoal" in snippet for snippet in snippets)
+    numbers = Path("runs/demo/evaluation/numbers.csv")
+    numbers.parent.mkdir()
+    numbers.write_text("quantity,value,method,scope,step\nsuccess,0.5,option agent,,\n")
+    assert len(snippets) == 5 and not any("hypogoal" in snippet for snippet in snippets)
     found: dict[str, Any] = {}
     for snippet in snippets:
         exec(compile(snippet, "docs/formats.md", "exec"), found)
     logits = member.logits(np.zeros((1, 64, 64, 3), np.uint8))[0]
     np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-6)
     printed = capsys.readouterr().out
+    assert "option agent" in printed
     positives = int(open_dataset(data).labelled("open-red-door").labels.sum())
     assert f"open-red-door: 7 states, {positives} positives, uint8 (4, 5, 3)" in printed
     assert "7 unlabelled states" in printed and "members.0.13.weight float32 (2, 100)" in printed

@@ -169,10 +169,10 @@ def test_the_terminal_summary_fits(ladders, results):
     lines = console.export_text().splitlines()
     assert max(map(len, lines)) <= 80
     text = "\n".join(lines)
-    assert re.search(r"no diversity, 2 members │ 1 │ 0\.\d\d │", text)
+    assert re.search(r"no diversity, 2 members +│ 1 +│ +0\.\d\d │", text)
     means = table_of(ladders, "distance").sort_index().loc[DBAT, 2]["mean"]
-    assert re.search(rf"2 │ {DBAT} +│ {means['best']:.1f} │ +\S+ │ {means['mean']:.1f} │ +\S+ │ +0 ", text)
-    assert re.search(r"– │ oracle termination +│ +3\.0 │ +– │ +3\.0 │ +3\.0 │ +75 ", text)
+    assert re.search(rf"2 +│ {DBAT} +│ +{means['best']:.1f} │ +\S+ │ +{means['mean']:.1f} │ +\S+ │ +0 ", text)
+    assert re.search(r"– +│ oracle termination +│ +3\.0 │ +– │ +3\.0 │ +3\.0 │ +75 ", text)
 
 
 def test_the_page_shows_ladders_and_nothing_of_agents(ladders, page):

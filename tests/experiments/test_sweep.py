@@ -166,10 +166,12 @@ def test_a_cell_that_fails_holds_only_those_that_need_it(whole: Path, out: Path,
 
 
 def test_a_cell_that_makes_nothing_has_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G2: own code that leaves with 0."""
+    """Spec G2: own code that leaves the cell's process with 0."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    (tmp_path / "leaver.py").write_text("import os\nos._exit(0)\n")
+    lines = ("import multiprocessing, os", "from hypogoal.domains.rooms.domain import DOMAIN")
+    leaves = "if multiprocessing.parent_process():\n    os._exit(0)\n"
+    (tmp_path / "leaver.py").write_text("\n".join([*lines, leaves]))
     toml = 'format = 1\nevaluate = false\ncells = [{ name = "data", command = "collect leaver:DOMAIN" }]'
     (tmp_path / "own.toml").write_text(toml)
     assert "but made nothing" in fails("run", "own.toml", "--out", "out", "-q").err

@@ -78,5 +78,5 @@ def test_attributions_to_numbers_are_complete(shape: tuple[int, ...]) -> None:
 
 def test_a_network_for_pictures_is_refused() -> None:
     """Spec G2."""
-    with pytest.raises(UserError, match=r"'montezuma' does not take these observations: .* mlp takes any"):
+    with pytest.raises(UserError, match=r"'montezuma' does not take these observations: .*mlp takes any"):
         trained(network="montezuma")

@@ -42,7 +42,9 @@ def walk(learner: Any, steps: int) -> None:
     engine = learner.engine
     options, rng = np.zeros(2, dtype=np.int64), np.random.default_rng(0)
     nothing, ends = np.zeros(2, dtype=np.bool_), np.ones(2, dtype=np.bool_)
-    for _ in range(steps):
+    for age in range(steps):
+        if isinstance(learner, PaperLearner):  # which keeps the states of running executions
+            learner.act(engine.ids, options, np.full(2, age))
         ids, actions = engine.ids.copy(), rng.integers(2, size=2)  # it only turns
         step = engine.step(actions)
         learner.observe(
@@ -132,7 +134,7 @@ def test_odd_settings_of_options_learn_too(changes: dict[str, Any]) -> None:
     learner = learner_of(LightLearner, **changes)
     learner.positives[0] = learner.option_steps[0] = 1  # one is known
     walk(learner, 30)
-    assert learner.updates > 0
+    assert learner.networks.updates > 0
 
 
 @pytest.mark.usefixtures("small_gru")

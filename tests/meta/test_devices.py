@@ -43,7 +43,8 @@ def test_another_device_gives_the_same(case: str, tmp_path: Path, monkeypatch: p
         resumed.restore(saved)
         assert played(resumed, STEPS - BREAK, tmp_path / "resumed") == found
         learner: Any = unbroken.learner
-        for member in [] if case.startswith("planned") else getattr(learner, "members", [learner]):
+        members = [] if case.startswith("planned") else getattr(learner, "members", None) or [learner.networks]
+        for member in members:
             assert member.updates
             assert all(isinstance(weight, FarTensor) for weight in member.online.parameters())
         fresh: Any = loop_of(case, FAR).learner
