@@ -24,6 +24,7 @@ MOVED = torch.ops.aten._to_copy.default
 COPIED = torch.ops.aten.copy_.default
 TURNED = torch.ops.aten.transpose_.default  # in place: what torch knows of the shape has to follow (GRU's last step)
 READ = (torch.ops.aten._local_scalar_dense.default,)
+PACKED = torch.ops.aten._pack_padded_sequence.default  # whose lengths torch wants on the CPU
 
 
 class FarTensor(torch.Tensor):
@@ -73,7 +74,7 @@ def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     far = [one for one in tensors if isinstance(one, FarTensor)]
     device = kwargs.get("device")
     to_far = torch.device(device).type == FAR if device is not None else bool(far) and func not in READ
-    if to_far and func is not COPIED and not (func is MOVED and device is not None):
+    if to_far and func not in (COPIED, PACKED) and not (func is MOVED and device is not None):
         strangers = [one for one in tensors if not isinstance(one, FarTensor) and one.dim()]
         assert not strangers, f"{func} with tensors of two devices: {[tuple(one.shape) for one in strangers]}"
     back = {id(one.near): one for one in far}
