@@ -24,7 +24,9 @@ MOVED = torch.ops.aten._to_copy.default
 COPIED = torch.ops.aten.copy_.default
 TURNED = torch.ops.aten.transpose_.default  # in place: what torch knows of the shape has to follow (GRU's last step)
 READ = (torch.ops.aten._local_scalar_dense.default,)
-PACKED = torch.ops.aten._pack_padded_sequence.default  # whose lengths torch wants on the CPU
+PACKED = torch.ops.aten._pack_padded_sequence.default
+# Lengths of sequences are on the CPU whatever the device: here one argument of each, and of PACKED the second result.
+WITH_LENGTHS = (PACKED, torch.ops.aten._pack_padded_sequence_backward.default, torch.ops.aten.gru.data)
 
 
 class FarTensor(torch.Tensor):
@@ -74,7 +76,7 @@ def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     far = [one for one in tensors if isinstance(one, FarTensor)]
     device = kwargs.get("device")
     to_far = torch.device(device).type == FAR if device is not None else bool(far) and func not in READ
-    if to_far and func not in (COPIED, PACKED) and not (func is MOVED and device is not None):
+    if to_far and func not in (COPIED, *WITH_LENGTHS) and not (func is MOVED and device is not None):
         strangers = [one for one in tensors if not isinstance(one, FarTensor) and one.dim()]
         assert not strangers, f"{func} with tensors of two devices: {[tuple(one.shape) for one in strangers]}"
     back = {id(one.near): one for one in far}
@@ -89,6 +91,8 @@ def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return found
     inference = torch.is_inference_mode_enabled() and all(one.is_inference() for one in far)  # a view is as its base
     with torch.inference_mode(inference), torch.set_grad_enabled(torch.is_grad_enabled()):
+        if func is PACKED:
+            return FarTensor(found[0]), found[1]
         return tree_map(lambda one: back.get(id(one), FarTensor(one)) if isinstance(one, torch.Tensor) else one, found)
 
 
