@@ -1,5 +1,6 @@
 """Spec A7, E7: train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,7 +44,7 @@ def train_baseline(
     played_world = world.played_world(played, collected, config)
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
-        chosen = chosen.model_copy(update={"environments": config.environments})
+        chosen = replace(chosen, environments=config.environments)
     engine = world.make_engine(played, played_world, config, chosen.environments)
     if dataset and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, dataset.unlabelled())
@@ -51,7 +52,7 @@ def train_baseline(
         "domain": domain,
         "domain_config": played_world,
         "environments": chosen.environments,
-        "hyperparameters": chosen.model_dump(mode="json"),
+        "hyperparameters": asdict(chosen),
     }
     inputs = [data] if data else []
     with call.training("baseline", settings, inputs, config.steps, tensorboard) as work:

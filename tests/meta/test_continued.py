@@ -15,7 +15,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import make_agent
 from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from hypogoal.learners.baselines.settings import PPOSettings
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.networks import LightMetaNetwork
 from hypogoal.meta.setup import frames_kept
@@ -166,7 +166,7 @@ def test_pictures_too_small_for_options_are_refused() -> None:
 def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:
     """Spec E7, G2: one line instead of what the library raises."""
     env = EngineEnv(DoorKeyEngine(100, 4, max_steps=50))
-    chosen = HYPERPARAMETERS["ppo", "paper"].model_copy(update={"rollout": 3})
+    chosen = PPOSettings(rollout=3)
     with pytest.raises(UserError, match="fewer than there are environments: environments=4"):
         make_agent(env, chosen, 0)
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from breaking import Breaking, Broken
 from gymnasium import spaces
 
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Step
@@ -115,8 +117,6 @@ def test_reaching_the_goal_is_a_terminal_state():
 @pytest.mark.parametrize("network", list(NETWORKS))
 def test_tile_codes_say_what_the_image_says(network):
     """Spec E7: with a table of tiles the network gives what the same weights give for the RGB image itself."""
-    from hypogoal.domains.doorkey.engine import DoorKeyEngine
-
     engine = DoorKeyEngine(3, 4)
     ids = engine.reachable()[::37]
     images = torch.from_numpy(engine.images(ids)).permute(0, 3, 1, 2).float() / 255
@@ -188,6 +188,25 @@ def test_global_randomness_is_given_back():
     torch.manual_seed(5)
     train(EngineEnv(Corridor(4)), HYPERPARAMETERS["ppo", "paper"], steps=100, seed=0)
     assert torch.rand(1) == expected
+
+
+@pytest.mark.parametrize(("agent", "last"), [("ppo", 4), ("dqn", 100)])
+def test_a_break_leaves_no_trace(agent, last, tmp_path):
+    """Spec G1: broken off before its last rollout and resumed, an agent ends with the same weights and episodes."""
+    chosen = HYPERPARAMETERS[agent, "tuned"]
+
+    def trained(checkpoints):
+        env = EngineEnv(DoorKeyEngine(100, chosen.environments, max_steps=40))
+        found = train(env, chosen, steps=2_560, seed=3, checkpoints=checkpoints)
+        return env.episodes, found.policy.state_dict()
+
+    episodes, unbroken = trained(Checkpoints(None))
+    path = tmp_path / "checkpoint"
+    with pytest.raises(Broken):
+        trained(Breaking(path, last))
+    resumed_episodes, resumed = trained(Checkpoints(path))
+    assert resumed_episodes == episodes
+    assert all(torch.equal(weight, resumed[name]) for name, weight in unbroken.items())
 
 
 def test_it_plays_in_the_agents_world(tmp_path):

@@ -1,7 +1,7 @@
 """An engine as a stable-baselines3 vectorised environment, and the list of episodes played in it."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from hypogoal.domains.base import Engine, check_step
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
+
+FIXED = "an engine's attributes are fixed, and it has no methods for single environments"
 
 
 class EngineEnv(VecEnv):
@@ -27,9 +29,17 @@ class EngineEnv(VecEnv):
         self.engine = engine
         self.tiles = engine.tiles
         first = self._observe(engine.ids[:1])
-        low, high = (0, 255) if first.dtype == PICTURE else (-math.inf, math.inf)
-        space: Any = spaces.Box(low, high, first.shape[1:], first.dtype.type)
-        super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
+        low, high = -math.inf, math.inf
+        if first.dtype == PICTURE:
+            low, high = 0, 255
+        space: Any = spaces.Box(
+            low,
+            high,
+            first.shape[1:],
+            first.dtype.type,
+        )
+        actions = spaces.Discrete(engine.n_actions)
+        super().__init__(engine.count, space, actions)
         self.episodes = EpisodeRecorder(engine.count)
         self._actions = np.zeros(engine.count, dtype=np.int64)
         self._checked = False  # the engine's first step
@@ -40,7 +50,9 @@ class EngineEnv(VecEnv):
         images = self.engine.images(ids)
         if images.dtype == PICTURE:
             return images.transpose(0, 3, 1, 2)
-        return standardised(images, *self.engine.standard) if self.engine.standard else images
+        if self.engine.standard is None:
+            return images
+        return standardised(images, *self.engine.standard)
 
     def reset(self) -> Observations:
         """Put every environment at the start of an episode."""
@@ -60,13 +72,18 @@ class EngineEnv(VecEnv):
         done = step.terminated | step.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(done):
-            infos[index]["terminal_observation"] = self._observe(step.next_ids[index : index + 1])[0]
+            [last] = self._observe(step.next_ids[index : index + 1])
+            infos[index]["terminal_observation"] = last
             infos[index]["TimeLimit.truncated"] = bool(not step.terminated[index])
-        return self._observe(self.engine.ids), step.rewards, done, infos
+        observations = self._observe(self.engine.ids)
+        return observations, step.rewards, done, infos
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
-        return {"engine": self.engine.snapshot(), "episodes": self.episodes.snapshot()}
+        return {
+            "engine": self.engine.snapshot(),
+            "episodes": self.episodes.snapshot(),
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of environments made with the same arguments."""
@@ -76,20 +93,18 @@ class EngineEnv(VecEnv):
     def close(self) -> None:
         """Nothing to close."""
 
-    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+    def get_attr(self, *_: Any, **__: Any) -> list[Any]:
         """None: VecEnv asks for ``render_mode``, and an engine is never shown."""
-        return [None] * len(list(self._get_indices(indices)))
+        return [None] * self.num_envs
 
-    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+    def set_attr(self, *_: Any, **__: Any) -> None:
         """Not supported: an engine's attributes are fixed."""
-        raise NotImplementedError("an engine's attributes are fixed")
+        raise NotImplementedError(FIXED)
 
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: None | int | Iterable[int] = None, **method_kwargs: Any
-    ) -> list[Any]:
+    def env_method(self, *_: Any, **__: Any) -> list[Any]:
         """Not supported: an engine has no per-environment methods."""
-        raise NotImplementedError("an engine has no per-environment methods")
+        raise NotImplementedError(FIXED)
 
-    def env_is_wrapped(self, wrapper_class: type, indices: None | int | Iterable[int] = None) -> Sequence[bool]:  # type: ignore[override]
+    def env_is_wrapped(self, *_: Any, **__: Any) -> list[bool]:
         """An engine wears no Gymnasium wrappers."""
-        return [False] * len(list(self._get_indices(indices)))
+        return [False] * self.num_envs

@@ -31,7 +31,14 @@ class BlockConvolution(nn.Module):
         count, height, width, channels = inputs.shape
         rows, columns = height // self.size, width // self.size
         inputs = inputs[:, : rows * self.size, : columns * self.size]
-        blocks = inputs.reshape(count, rows, self.size, columns, self.size, channels).transpose(2, 3)
+        blocks = inputs.reshape(
+            count,
+            rows,
+            self.size,
+            columns,
+            self.size,
+            channels,
+        ).transpose(2, 3)
         return self.linear(blocks.reshape(count, rows, columns, -1))
 
 
@@ -56,7 +63,11 @@ class CellNetwork(BaseFeaturesExtractor):
     ):
         super().__init__(space, FEATURES)
         self.rows = rows
-        self.first = BlockConvolution(space.shape[0] if tiles is None else tiles.shape[3], channels[0], CELL)
+        self.first = BlockConvolution(
+            space.shape[0] if tiles is None else tiles.shape[3],
+            channels[0],
+            CELL,
+        )
         pixels = None if tiles is None else torch.from_numpy(tiles.astype(np.float32) / 255.0)
         self.register_buffer("tiles", pixels, persistent=False)
         further: list[nn.Module] = []
@@ -65,9 +76,9 @@ class CellNetwork(BaseFeaturesExtractor):
         self.further = nn.Sequential(*further, nn.Flatten())
         with torch.no_grad():
             width = self.further(self._cells(torch.zeros(1, *space.shape))).shape[1]
-        layers: list[nn.Module] = [nn.Linear(width, FEATURES), nn.ReLU()]
-        for _ in range(dense - 1):
-            layers += [nn.Linear(FEATURES, FEATURES), nn.ReLU()]
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise([width, *[FEATURES] * dense]):
+            layers += [nn.Linear(before, after), nn.ReLU()]
         self.dense = nn.Sequential(*layers)
 
     def _cells(self, observations: Tensor) -> Tensor:
