@@ -1,102 +1,66 @@
-"""Progress on stderr, one line that changes in a terminal and lines elsewhere; and the log of a training."""
+"""Progress on stderr, a line that changes; and the log of a training."""
 
 import json
 import math
 import os
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from datetime import timedelta
 from pathlib import Path
 from typing import Any, Self
 
 from hypogoal.core.errors import UserError
 
-LINE_SECONDS = 10.0  # between lines
-REDRAW_SECONDS = 0.2  # of the line in a terminal
-LOOK_SECONDS = 1.0
-WIDTH = 79  # of the line in a terminal
+LINE = "{desc}: {n_fmt}/{total_fmt} in {elapsed}, {remaining} left{postfix}"
+FIRST_SECONDS = 1.0  # nothing is said of what takes less
+REDRAW_SECONDS = 0.2  # in a terminal
+LINE_SECONDS = 10.0  # elsewhere
 
 
 class Progress:
     """``with Progress("train-meta", total=300_000) as progress: progress.advance(32, success=0.5)``.
 
-    ``total`` may be set later, where it is not known at the beginning.
+    Attributes:
+        total: may be set later, where it is not known at the beginning.
+        done: units done.
     """
 
     def __init__(self, title: str, total: int, quiet: bool = False):
-        self.title, self.total, self.quiet = title, total, quiet
+        from tqdm import tqdm  # not before: it takes as long to import as the whole command line
+
+        self.total = total
         self.done = 0
-        self._terminal = sys.stderr.isatty()
-        self._numbers = ""
-        self.resume(0)
+        self._bar = tqdm(
+            desc=title,
+            total=total,
+            disable=quiet,
+            bar_format=LINE,
+            delay=FIRST_SECONDS,
+            mininterval=REDRAW_SECONDS if sys.stderr.isatty() else LINE_SECONDS,
+            miniters=1,
+            dynamic_ncols=True,
+        )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None and self.done:
-            self._say(f"done in {duration(time.monotonic() - self._began)}")
-        if self._terminal and not self.quiet:
-            print(file=sys.stderr)
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
 
     def resume(self, done: int) -> None:
         """``done`` units were done before this moment."""
-        self.done = self._before = done
-        self._began = self._said = time.monotonic()
+        self.done = self._bar.n = self._bar.initial = done
 
     def advance(self, n: int = 1, **numbers: float) -> None:
         """``n`` more units are done; ``numbers`` are shown beside them, except NaN (not known yet)."""
-        self.update(self.done + n, **numbers)
+        known = {name: value for name, value in numbers.items() if not math.isnan(value)}
+        if known:
+            self._bar.set_postfix(known, refresh=False)
+        self.done += n
+        self._bar.total = self.total
+        self._bar.update(n)
 
     def update(self, done: int, **numbers: float) -> None:
         """``done`` units are done in total."""
-        self.done = done
-        if numbers:
-            texts = [f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value)]
-            self._numbers = " ".join(texts)
-        now = time.monotonic()
-        pause = REDRAW_SECONDS if self._terminal else LINE_SECONDS
-        if now - self._said < pause or done >= self.total:
-            return
-        self._said = now
-        fresh = done - self._before
-        left = duration((now - self._began) * (self.total - done) / fresh) if fresh else "?"
-        self._say(f"{left} left {self._numbers}")
-
-    @contextmanager
-    def following(self, count: Callable[[], int]) -> Iterator[None]:
-        """Within the block call ``count`` each second for the units done by other processes."""
-        over = threading.Event()
-
-        def look() -> None:
-            while not over.wait(LOOK_SECONDS):
-                self.update(count())
-
-        thread = threading.Thread(target=look, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
-        self.update(count())
-
-    def _say(self, text: str) -> None:
-        line = f"{self.title}: {self.done}/{self.total}, {text}"
-        if self.quiet:
-            return
-        if self._terminal:
-            print(f"\r{line[:WIDTH]:{WIDTH}}", end="", file=sys.stderr, flush=True)
-        else:
-            print(line, file=sys.stderr, flush=True)
-
-
-def duration(seconds: float) -> str:
-    """Seconds as ``0:01:30``."""
-    return str(timedelta(seconds=round(seconds)))
+        self.advance(done - self.done, **numbers)
 
 
 class MetricsLog:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,8 @@ import numpy as np
 
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_log
 from hypogoal.core.processes import prepare
-from hypogoal.core.progress import MetricsLog
+from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
@@ -55,6 +54,7 @@ def train_sub_goal(
     seed: int,
     device: str,
     tensorboard: Path | None,
+    quiet: bool,
 ) -> dict[str, float]:
     """Train a sub-goal's ensemble, in a process of its own, and write it; returns its :func:`heldout_accuracy`.
 
@@ -82,10 +82,13 @@ def train_sub_goal(
     def state() -> dict[str, Any]:
         return {"training": training.snapshot(), "log": log.snapshot()}
 
-    with contextlib.closing(log), checkpoints:
+    steps = config.steps * len(training.rounds)
+    with contextlib.closing(log), Progress(f"train-ensemble {sub_goal}", steps, quiet) as progress, checkpoints:
+        progress.resume(training.step)
         for step, losses in training.steps():
             if training.due:
                 log.write(sub_goal=sub_goal, step=step, **losses.numbers())
+                progress.update(step)
             checkpoints.offer(state)
     checkpoints.save(state())
     write_ensemble(draft.files, sub_goal, training.ensemble)
@@ -95,15 +98,6 @@ def train_sub_goal(
 def log_of(draft: Draft, sub_goal: str) -> Path:
     """The log of one sub-goal's training, beside its checkpoint."""
     return draft.checkpoint / f"{sub_goal}.jsonl"
-
-
-def steps_in(logs: Iterable[Path]) -> int:
-    """How many steps of all sub-goals are in the logs that their processes are writing."""
-    steps = 0
-    for log in logs:
-        for row in read_log(log)[-1:]:
-            steps += row["step"]
-    return steps
 
 
 def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dict[str, float]:

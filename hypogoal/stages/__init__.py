@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 Place = str | os.PathLike[str]
 DOMAINS = "doorkey, montezuma, rooms, or module:object."
 WIDTH = 100  # of tables
-NO_SETTINGS = ("preset", "seed", "device")  # options that a stage without settings leaves out
+# Options that stages leave out which do not train, or have no settings.
+NO_TRAINING = ("device", "tensorboard")
+NO_SETTINGS = ("preset", "seed", *NO_TRAINING)
 LISTED = {  # every stage in its order, in a line; it is loaded when it is called
     "collect": "Collect labelled, unlabelled and held-out states.",
     "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
@@ -67,6 +69,7 @@ class Call:
     preset: Preset = None
     seed: Seed = 0
     device: Device = "auto"
+    tensorboard: Tensorboard = None
     force: Force = False
     resume: Resume = False
     quiet: Quiet = False
@@ -107,14 +110,13 @@ class Call:
         config: Mapping[str, Any],
         inputs: Sequence[Path],
         steps: int,
-        tensorboard: Path | None = None,
     ) -> Iterator["Training"]:
-        """The same for a training of so many steps; TensorBoard's folder gets the numbers of the log, too."""
+        """The same for a training of so many steps, with a log."""
         from hypogoal.core.artefacts import LOG
 
         with (
             self.draft(kind, config, inputs) as draft,
-            contextlib.closing(MetricsLog(draft.files / LOG, tensorboard)) as log,
+            contextlib.closing(MetricsLog(draft.files / LOG, self.tensorboard)) as log,
             Progress(self.stage, steps, quiet=self.quiet) as progress,
         ):
             yield Training(draft, log, progress)
@@ -135,7 +137,7 @@ class Done:
 
     lines: Sequence[str] = ()
     then: Sequence[object] = ()  # the words of the next command
-    path: Path | None = None  # where to look, if not where the stage says by default
+    path: Path | None = None  # where to look, if not at the output or its page
 
 
 def load_stage(name: str) -> "Stage":
@@ -164,7 +166,6 @@ class Stage:
         often: the settings changed most, options of the command.
         leaves_out: options of all stages that this one has not.
         into: what it writes by default, a name within what it works on.
-        page: the file of its output to look at, if not the output itself.
     """
 
     function: Callable[..., Done]
@@ -172,7 +173,6 @@ class Stage:
     often: Sequence[str] = ()
     leaves_out: Sequence[str] = ()
     into: str = ""
-    page: str = ""
 
     def __post_init__(self) -> None:
         self.name = self.function.__name__.replace("_", "-")
@@ -235,7 +235,8 @@ class Stage:
                     say(line)
                 if done.then:
                     say(f"next: {own_code.command(*done.then)}")
-            say(done.path or call.out / self.page)
+            page = call.out / "index.html"
+            say(done.path or (page if page.is_file() else call.out))
 
         source = self.source.replace(kind=Parameter.KEYWORD_ONLY)
         parameters = [source, *self.inputs, self.out, *self.options, *self._settings()]

@@ -9,10 +9,10 @@ from hypogoal.core.artefacts import DATA
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
-from hypogoal.stages import DOMAINS, Call, Done, stage
+from hypogoal.stages import DOMAINS, NO_TRAINING, Call, Done, stage
 
 
-@stage("collect doorkey --out data/doorkey.h5", leaves_out=["device"])
+@stage("collect doorkey --out data/doorkey.h5", leaves_out=NO_TRAINING)
 def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     """Collect labelled, unlabelled and held-out states.
 

@@ -13,12 +13,7 @@ MOST_BYTES = 2_000_000  # of a film on the page
 FILMS = "Films of the policy over options, in the report's videos/*.gif; the page shows one. Default: one, if possible."
 
 
-@stage(
-    "report runs/mine --videos 3",
-    leaves_out=NO_SETTINGS,
-    into="report",
-    page="index.html",
-)
+@stage("report runs/mine --videos 3", leaves_out=NO_SETTINGS, into="report")
 def report(
     call: Call,
     run: Annotated[Path, Argument(help="An evaluated run.")],

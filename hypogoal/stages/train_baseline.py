@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.errors import UserError
-from hypogoal.stages import DOMAINS, Call, Done, Tensorboard, outcome_of, stage
+from hypogoal.stages import DOMAINS, Call, Done, outcome_of, stage
 
 
 @stage(
@@ -19,12 +19,10 @@ def train_baseline(
     domain: Annotated[str, Argument(help=DOMAINS)],
     *,
     data: Annotated[Path | None, Option(help="Play in the world where these states were collected.")] = None,
-    tensorboard: Tensorboard = None,
 ) -> Done:
     """Train PPO or DQN on primitive actions, to compare.
 
-    Without ``data`` it plays in the world of the domain's defaults. ``tensorboard``, a folder, gets the numbers of the
-    log.
+    Without ``data`` it plays in the world of the domain's defaults.
     """
     from hypogoal.core.processes import prepare
     from hypogoal.core.tensors import save_tensors
@@ -55,7 +53,7 @@ def train_baseline(
         "hyperparameters": asdict(chosen),
     }
     inputs = [data] if data else []
-    with call.training("baseline", settings, inputs, config.steps, tensorboard) as work:
+    with call.training("baseline", settings, inputs, config.steps) as work:
         env = EngineEnv(engine)
         files = work.draft.files
         kept = work.draft.checkpoints()

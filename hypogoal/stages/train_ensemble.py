@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.artefacts import LOG
-from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
+from hypogoal.stages import Call, Done, outcome_of, stage
 
 TITLES = {
     "best": "held-out balanced accuracy: best member",
@@ -29,41 +29,45 @@ def train_ensemble(
     data: Annotated[Path, Argument(help="The HDF5 file that 'collect' wrote.")],
     *,
     unlabelled: Annotated[list[Path] | None, Option(help=ELSEWHERE)] = None,
-    tensorboard: Tensorboard = None,
 ) -> Done:
     """Train diverse classifiers (members) of each sub-goal.
 
     Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
-    of those of ``data``. ``tensorboard``, a folder, gets the losses, each sub-goal's in a folder of its own.
+    of those of ``data``. Each sub-goal has a progress line and a folder of TensorBoard's of its own.
     """
     from hypogoal.core.processes import allowed, in_processes, prepare
     from hypogoal.data import open_dataset
-    from hypogoal.hypotheses.sub_goals import checked, log_of, steps_in, train_sub_goal
+    from hypogoal.hypotheses.sub_goals import checked, log_of, train_sub_goal
     from hypogoal.options.visited import unlabelled_file
 
     device = prepare(call.device)
     dataset = open_dataset(data)
     config, sub_goals = checked(call.settings(dataset.domain), dataset)
     others = [unlabelled_file(path, dataset) for path in unlabelled or ()]
-    steps = len(sub_goals) * config.steps
-    if config.schedule == "sequential":
-        steps *= config.members
     settings = _described(config, sub_goals, dataset)
-    with call.training("ensemble", settings, [data, *others], steps) as work:
+    with call.draft("ensemble", settings, [data, *others]) as draft:
         jobs = []
         for sub_goal in sub_goals:
-            board = Path(tensorboard, sub_goal) if tensorboard else None
-            job = partial(train_sub_goal, work.draft, data, others, sub_goal, config, call.seed, device, board)
+            board = Path(call.tensorboard, sub_goal) if call.tensorboard else None
+            job = partial(
+                train_sub_goal,
+                draft,
+                data,
+                others,
+                sub_goal,
+                config,
+                call.seed,
+                device,
+                board,
+                quiet=call.quiet,
+            )
             jobs.append(job)
-        logs = [log_of(work.draft, sub_goal) for sub_goal in sub_goals]
         accuracies: list[dict[str, float]] = [{} for _ in jobs]
-        work.draft.checkpoint.mkdir(exist_ok=True)
-        work.progress.resume(steps_in(logs))
-        with work.progress.following(partial(steps_in, logs)):
-            workers = min(allowed(config.workers), len(jobs))
-            in_processes(jobs, workers, accuracies.__setitem__)
-        texts = [log.read_text(encoding="utf-8") for log in logs]
-        (work.draft.files / LOG).write_text("".join(texts), encoding="utf-8")
+        draft.checkpoint.mkdir(exist_ok=True)
+        workers = min(allowed(config.workers), len(jobs))
+        in_processes(jobs, workers, accuracies.__setitem__)
+        texts = [log_of(draft, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
+        (draft.files / LOG).write_text("".join(texts), encoding="utf-8")
     return Done(_outcome(accuracies, call.out), _next(call.out, dataset.domain))
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
+from hypogoal.stages import Call, Done, outcome_of, stage
 
 FIXED = (  # as of the options trained before
     *("network", "recurrence", "embedding", "termination"),
@@ -28,12 +28,10 @@ def train_meta(
     ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
     options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
-    tensorboard: Tensorboard = None,
 ) -> Done:
     """Learn from the reward which options to choose.
 
-    Options start fresh, or continue as those of an ``options`` artefact. ``tensorboard``, a folder, gets the numbers of
-    the log.
+    Options start fresh, or continue as those of an ``options`` artefact.
     """
     from hypogoal.meta import training
     from hypogoal.options.tables import Episodes
@@ -44,7 +42,7 @@ def train_meta(
     steps = setup.config.steps
     settings = agents.description(setup, **_steps_spent(practice))
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training("meta", settings, inputs, steps, tensorboard) as work:
+    with call.training("meta", settings, inputs, steps) as work:
         loop = training.assemble(setup)
         if practice:
             training.continue_with(loop, practice)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.stages import Call, Done, Tensorboard, outcome_of, stage
+from hypogoal.stages import Call, Done, outcome_of, stage
 
 FIXED = ("network", "recurrence", "embedding", "termination")  # as of the options trained before
 
@@ -20,11 +20,10 @@ def train_options(
     ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
     options: Annotated[Path | None, Option(help="Continue these options, perhaps elsewhere.")] = None,
-    tensorboard: Tensorboard = None,
 ) -> Done:
     """Learn an option (a policy) for every member.
 
-    ``options``, an artefact, are trained further. ``tensorboard``, a folder, gets the numbers of the log.
+    ``options``, an artefact, are trained further.
     """
     from hypogoal.evaluation.nearness import distances_of
     from hypogoal.meta import training
@@ -38,7 +37,7 @@ def train_options(
         steps *= setup.options
     settings = agents.description(setup, steps=steps)
     inputs = [ensemble, options] if options else [ensemble]
-    with call.training("options", settings, inputs, steps, tensorboard) as work:
+    with call.training("options", settings, inputs, steps) as work:
         loop = training.assemble(setup)
         if practice:
             training.continue_with(loop, practice)

@@ -98,13 +98,12 @@ def _on_recorded_data(call: Call, source: str, sub_goal: str | None, member: int
         do = "Give --domain and --sub-goal; or an ensemble's folder alone."
         raise UserError("on recorded data an audit takes an ensemble, all members, without settings", source, do)
     lines = audit_recorded(call, Path(source), sub_goal)
-    page = call.out / "index.html"
     data = open_artefact(call.out).input(DATA)
     goal, *others = open_dataset(data).sub_goals
     if others:
-        return Done(lines, path=page)
+        return Done(lines)
     table = call.out / "next" / goal / TO_FILL_IN
     lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
     more = data.with_name(f"{data.stem}-more.h5")
     then = ("import", data, "--label", f"{goal}={table}", "--out", more)  # which takes labels of one sub-goal
-    return Done(lines, then, path=page)
+    return Done(lines, then)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -19,48 +17,29 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.stages import outcome_of
 
 
-def test_without_a_terminal_there_is_a_line_now_and_then(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With the time left; a run without a whole episode has no success, and no 'nan' either."""
-    with Progress("train", total=10) as bar:
-        bar.update(3, success=0.5)
-        assert capsys.readouterr().err == "", "ten seconds are not over"
-        monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
-        bar.update(5, success=math.nan, loss=0.25)
-        bar.update(6)
-    first, second, last = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"train: 5/10, (\?|0:00:0\d) left loss 0\.25", first)
-    assert re.fullmatch(r"train: 6/10, (\?|0:00:0\d) left loss 0\.25", second)
-    assert last == "train: 6/10, done in 0:00:00"
-    numbers = {"steps": 5, "episodes": 0, "success": math.nan, "loss": 0.25}
-    assert outcome_of(numbers) == ["steps 5, episodes 0, loss 0.25"]
-
-
-def test_what_others_do_is_counted(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec A6: how far other processes are is asked again and again, so that a line comes while they work."""
+def test_a_line_says_how_far_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the time left by the pace since the last resume; a number that is not known yet is left out."""
+    monkeypatch.setattr(progress, "FIRST_SECONDS", 0.0)
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
-    monkeypatch.setattr(progress, "LOOK_SECONDS", 0.01)
-    asked = itertools.count()
-    with Progress("train", total=10_000) as bar, bar.following(lambda: next(asked)):
-        until = time.monotonic() + 30
-        while bar.done < 6 and time.monotonic() < until:
-            time.sleep(0.01)
-    assert "train: 5/10000" in capsys.readouterr().err
+    with Progress("train-meta", total=1) as line:
+        line.total = 1_500_000
+        line.resume(1_000_000)
+        line.update(1_234_567, success=0.123, length=math.nan)
+        line.advance()
+    *_, last = capsys.readouterr().err.split("\r")
+    assert re.fullmatch(r"train-meta: 1234568/1500000 in 00:0\d, 00:0\d left, success=0.123 *\n", last)
+    assert line.done == 1_234_568
 
 
-def test_a_line_fits_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawn over and over, with the time left by the pace since the last resume."""
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    monkeypatch.setattr(progress, "REDRAW_SECONDS", 0.0)
-    with Progress("train-meta", total=1) as bar:
-        bar.total = 1_500_000
-        bar.resume(1_000_000)
-        bar.update(1_234_567, success=0.123, length=123.0)
-        bar.update(1_234_568)
-    first, *_, last = capsys.readouterr().err.split("\r")[1:]
-    assert len(first) == 79 and re.match(r"train-meta: 1234567/1500000, 0:00:0\d left success 0.123 length 123 ", first)
-    assert last.endswith("\n") and last.split() == ["train-meta:", "1234568/1500000,", "done", "in", "0:00:00"]
+def test_what_is_short_or_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    for quiet in (False, True):
+        with Progress("train", total=10, quiet=quiet) as line:
+            line.advance(10)
+        assert capsys.readouterr().err == "" and line.done == 10
+
+
+def test_a_result_without_a_whole_episode_has_no_success() -> None:
+    assert outcome_of({"steps": 5, "episodes": 0, "success": math.nan}) == ["steps 5, episodes 0"]
 
 
 def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
