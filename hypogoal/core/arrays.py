@@ -27,7 +27,8 @@ class Columns(Resumable):
     """Arrays (n, ...), one for each field."""
 
     def __len__(self) -> int:
-        return len(getattr(self, self.names()[0]))
+        first, *_ = vars(self).values()
+        return len(first)
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -48,41 +49,35 @@ class Columns(Resumable):
     @classmethod
     def zeros(cls, *shape: int) -> Self:
         """So many rows of zeros, for all columns alike."""
-        columns = {}
-        for name, dtype in cls.types().items():
-            columns[name] = np.zeros(shape, dtype)
-        return cls(**columns)
+        columns = [np.zeros(shape, dtype) for dtype in cls.types().values()]
+        return cls(*columns)
 
     @classmethod
     def cast(cls, *columns: Any) -> Self:
         """From a sequence for each column, of whatever type."""
-        arrays = []
-        for values, dtype in zip(columns, cls.types().values(), strict=True):
-            arrays.append(np.asarray(values, dtype))
+        types = cls.types().values()
+        arrays = map(np.asarray, columns, types)
         return cls(*arrays)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all parts, one part after another."""
-        columns = {}
-        for name in cls.names():
-            columns[name] = np.concatenate([getattr(part, name) for part in parts])
-        return cls(**columns)
+        each = [vars(part).values() for part in parts]
+        columns = map(np.concatenate, zip(*each, strict=True))
+        return cls(*columns)
 
     def at(self, rows: Any) -> Self:
         """Some rows, by whatever NumPy takes for an index."""
-        columns = {}
-        for name in self.names():
-            columns[name] = getattr(self, name)[rows]
-        return type(self)(**columns)
+        columns = [column[rows] for column in vars(self).values()]
+        return type(self)(*columns)
 
     def put(self, rows: Any, values: Self) -> None:
         """Write other values into some rows, in place."""
-        for name in self.names():
-            getattr(self, name)[rows] = getattr(values, name)
+        for name, column in vars(self).items():
+            column[rows] = getattr(values, name)
 
     def snapshot(self) -> State:
-        return {name: getattr(self, name).copy() for name in self.names()}
+        return {name: column.copy() for name, column in vars(self).items()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         self.put(slice(None), type(self)(**snapshot))

@@ -15,24 +15,19 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from filelock import FileLock, Timeout, lock_descriptor
 from pydantic import BaseModel, ValidationError
 
 from hypogoal.core.checkpoints import ANEW, Checkpoints
-from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.errors import Complete, UserError, reason
 from hypogoal.core.files import read_json, replace_text, sync
-from hypogoal.core.processes import peak_memory
 
-FORMAT = 3
 MANIFEST = "manifest.json"
 LOG = "metrics.jsonl"
 TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
-DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
-# How a file of a kind begins, and what its first bytes have, even if the rest is cut off: others' files stay.
-SIGNATURES = {DATA: (b"\x89HDF\r\n\x1a\n", b"sub_goals"), ARRAYS: (b"PK\3\4", b"observations")}
-FRONT = 1 << 16  # bytes of a file that are looked at for its kind
+DATA = "data"  # the kind of outputs that are HDF5 files
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers",)  # settings that change no result
 AGAIN = "Make the artefact again."
@@ -56,14 +51,19 @@ class Manifest(BaseModel):
     """What made an artefact, and what it holds."""
 
     kind: str
-    format: int = FORMAT
+    format: Literal[3] = 3
     config: dict[str, Any]
     seed: int
     inputs: list[Input] = []
     files: dict[str, str] = {}  # path within the folder -> sha256
     versions: dict[str, str] = {}
     command: list[str] = []
-    took: dict[str, Any] = {}  # seconds and bytes of memory, in which alone two runs of a command differ
+    took: dict[str, Any] = {}  # seconds, in which alone two runs of a command differ
+
+    def text(self, *left_out: str) -> str:
+        """As JSON, without some fields."""
+        content = self.model_dump(exclude={*left_out})
+        return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
 class Settings(dict[str, Any]):
@@ -135,15 +135,11 @@ def _fault(path: Path, digest: str) -> str:
 
 def _read_manifest(path: Path, do: str) -> Manifest:
     content = read_json(path, "the manifest is", do)
-    version = content.get("format") if isinstance(content, dict) else None
-    if version != FORMAT:
-        fault = f"this hypogoal reads manifests of format {FORMAT}, this is {version}"
-        raise UserError(fault, path, "Use the hypogoal that wrote it, or make it again.")
     try:
         return Manifest.model_validate(content)
     except ValidationError as error:
-        place = ".".join(map(str, error.errors()[0]["loc"]))
-        raise UserError(f"the manifest's {place!r} is missing or malformed", path, do) from None
+        fault = f"the manifest is damaged, or of another version ({reason(error)})"
+        raise UserError(fault, path, do) from None
 
 
 def open_artefact(path: Path, *kinds: str) -> Artefact:
@@ -162,16 +158,11 @@ def open_artefact(path: Path, *kinds: str) -> Artefact:
 
 def sha256_of(path: Path) -> str:
     """The sha256 of a file; of an artefact that of what its manifest says, without white space and ``took``."""
-    if not path.is_dir():
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    content = read_json(path / MANIFEST, "the manifest is", AGAIN)
-    content.pop("took", None)
-    return hashlib.sha256(_text_of(content).encode()).hexdigest()
-
-
-def _text_of(manifest: Mapping[str, Any]) -> str:
-    return json.dumps(manifest, indent=1, allow_nan=False) + "\n"
+    if path.is_dir():
+        text = Artefact(path).manifest.text("took")
+        return hashlib.sha256(text.encode()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -223,7 +214,6 @@ class Draft:
         At the end a draft is removed that has neither a checkpoint nor a finished output.
         """
         lock = FileLock(self.lock, timeout=PATIENCE_SECONDS)
-        missing = [folder for folder in self.folder.parents if not folder.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire()
@@ -236,16 +226,13 @@ class Draft:
             if not self.is_resumable and not (self.files / MANIFEST).is_file():
                 self._clear()
                 shutil.rmtree(self.folder, ignore_errors=True)  # the lock last
-                with contextlib.suppress(OSError):
-                    for folder in missing:
-                        folder.rmdir()
             lock.release()
 
     def begin(self, wanted: Manifest) -> None:
         """Remove what an earlier process left, and begin anew."""
         self._clear()
         self.files.mkdir()
-        replace_text(self.begun, _text_of(wanted.model_dump()))
+        replace_text(self.begun, wanted.text())
 
     def _clear(self) -> None:
         self.begun.unlink(missing_ok=True)  # first: what is left then is not resumed
@@ -267,8 +254,8 @@ def create(
     """A draft to fill; when the block ends, its manifest is written and it takes its place at ``out``.
 
     ``config`` determines the output, beside ``seed``, ``inputs`` (artefacts and files) and versions; keys added in the
-    block are in the manifest. Of the kinds ``DATA`` and ``ARRAYS`` the output is the one file in ``draft.files``,
-    without a manifest. If the block raises, ``out`` stays as it was, and the draft stays if it has a checkpoint.
+    block are in the manifest. Of the kind ``DATA`` the output is the one file in ``draft.files``, without a manifest.
+    If the block raises, ``out`` stays as it was, and the draft stays if it has a checkpoint.
 
     Raises:
         UserError: ``out`` exists and ``force`` is not given, is of another kind or none of hypogoal's, would replace an
@@ -293,7 +280,7 @@ def create(
         try:
             yield draft
             wanted.config = dict(config)
-            wanted.took = {"seconds": round(time.monotonic() - started, 1), "memory": peak_memory()}
+            wanted.took = {"seconds": round(time.monotonic() - started, 1)}
             _finish(draft, wanted)
         except BaseException as error:
             if draft.is_resumable:
@@ -320,40 +307,45 @@ def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> 
     """Whether the draft is continued, rather than begun anew. May I write here? If not, a ``UserError``."""
     out, kind = draft.out, kind_of(draft.out)
     if kind not in (None, wanted.kind):
-        raise UserError(f"what is there is not of kind {wanted.kind!r}", out, AWAY)
+        do = "Move it away, or choose another --out."
+        raise UserError(f"what is there is not of kind {wanted.kind!r}, or damaged", out, do)
     if draft.is_resumable and resume:
-        _refuse_other(_read_manifest(draft.begun, ANEW), wanted, "the unfinished output was begun", out)
+        begun = _read_manifest(draft.begun, ANEW)
+        _refuse_other(begun, wanted, "the unfinished output was begun")
         return True
     if draft.is_resumable and not force:
         raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
     if kind and resume:
-        _refuse_other(_made(out), wanted, "the complete output was made", out)
+        if kind != DATA:
+            open_artefact(out)  # refuses changed files
+        made = _manifest_of(out).model_copy(update={"versions": {}})  # nothing is continued with others
+        _refuse_other(made, wanted, "the complete output was made")
         raise Complete(out)
     if kind and not force:
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
     return False
 
 
-def _refuse_other(before: Manifest, now: Manifest, subject: str, out: Path) -> None:
+def _refuse_other(before: Manifest, now: Manifest, subject: str) -> None:
     """Refuse (``UserError``) what differs in a setting that both have, in seed, inputs or versions."""
     old, new = _identity(before), _identity(now)
     for key, value in old.items():
         if key in new and json.dumps(value) != json.dumps(new[key]):
             other = "other inputs" if key == "inputs" else f"{key}={value}, not {new[key]}"
-            raise UserError(f"{subject} with {other}", out, ANEW)
+            raise UserError(f"{subject} with {other}", None, ANEW)
 
 
 def _identity(manifest: Manifest) -> dict[str, Any]:
     """All that determines an output, by name."""
     inputs = [entry.sha256 for entry in manifest.inputs]
-    identity = {"kind": manifest.kind, "seed": manifest.seed, "inputs": inputs, **manifest.versions, **manifest.config}
+    identity = {"seed": manifest.seed, "inputs": inputs, **manifest.versions, **manifest.config}
     return {key: value for key, value in identity.items() if key not in NO_RESULT}
 
 
-def _made(out: Path) -> Manifest:
-    """What made a complete output, a folder or an HDF5 file; without versions, since nothing is continued."""
+def _manifest_of(out: Path) -> Manifest:
+    """What made an output: a folder or an HDF5 file."""
     if out.is_dir():
-        return open_artefact(out).manifest.model_copy(update={"versions": {}})
+        return Artefact(out).manifest
     import h5py
 
     try:
@@ -367,19 +359,13 @@ def _made(out: Path) -> Manifest:
 
 
 def kind_of(out: Path) -> str | None:
-    """The kind of an output, whole or damaged; empty if it is none of hypogoal's, None if nothing is there."""
+    """The kind of an output; empty if it is damaged or none of hypogoal's, None if nothing is there."""
     if not out.exists() or (out.is_dir() and not os.listdir(out)):
         return None
-    if out.is_dir():
-        with contextlib.suppress(UserError, TypeError, KeyError):
-            return str(read_json(out / MANIFEST, "the manifest is", AGAIN)["kind"])
+    try:
+        return _manifest_of(out).kind
+    except UserError:
         return ""
-    with out.open("rb") as file:
-        front = file.read(FRONT)
-    for kind, (begin, part) in SIGNATURES.items():
-        if front.startswith(begin) and part in front:
-            return kind
-    return ""
 
 
 def _finish(draft: Draft, manifest: Manifest) -> None:
@@ -388,13 +374,13 @@ def _finish(draft: Draft, manifest: Manifest) -> None:
     for path in files:
         sync(path)
         manifest.files[path.relative_to(draft.files).as_posix()] = sha256_of(path)
-    if manifest.kind in SIGNATURES:
+    if manifest.kind == DATA:
         [data] = files
         data.replace(draft.out)
         sync(draft.out.parent)
         shutil.rmtree(draft.checkpoint, ignore_errors=True)
     else:
-        replace_text(draft.files / MANIFEST, _text_of(manifest.model_dump()))
+        replace_text(draft.files / MANIFEST, manifest.text())
         _put_in_place(draft)
 
 

@@ -1,5 +1,7 @@
 """Errors for users: one line that says what is wrong, where and what to do (Spec G2, G3)."""
 
+from typing import Any
+
 
 class UserError(Exception):
     """A mistake that the user can fix. The command line prints it as one line and exits with code 2.
@@ -40,3 +42,12 @@ def printable(text: str) -> str:
     line = " ".join(text.split())
     signs = [sign if sign.isprintable() else "?" for sign in line]
     return "".join(signs)
+
+
+def reason(error: Any) -> str:
+    """What is wrong, in one line; of a pydantic ``ValidationError`` the first fault and its place."""
+    if not hasattr(error, "errors"):
+        return str(error)
+    fault = error.errors()[0]
+    place = ".".join(map(str, fault["loc"]))
+    return f"{place}: {fault['msg']}"

@@ -117,16 +117,6 @@ def _terminate(processes: Iterable[BaseProcess]) -> None:
         left[0].join(RESEND_SECONDS)
 
 
-def peak_memory() -> int:
-    """The most bytes of memory that this process or one of its children has held; 0 where the system does not say."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0
-    kilobytes = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return 1024 * max(kilobytes)
-
-
 def prepare(device: str = "auto") -> str:
     """Use one torch thread without denormal numbers; returns ``cpu`` or ``cuda`` (``auto`` is the CPU, decision 26).
 

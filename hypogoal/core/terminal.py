@@ -7,12 +7,6 @@ import sys
 from typing import Any
 
 
-def amount(count: int, noun: str) -> str:
-    """``1 cell``, ``2 cells``."""
-    ending = "" if count == 1 else "s"
-    return f"{count:,} {noun}{ending}"
-
-
 def say(text: object, *, err: bool = False) -> None:
     """Print a text on standard output or error."""
     stream = sys.stderr if err else sys.stdout

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import command
 from hypogoal.data import SPLITS, States, open_dataset
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.plots import PALETTE
@@ -148,8 +147,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
         actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
-        do = f"Read them as arrays: {command('export', path, '--out', path.stem + '.npz')}"
-        raise UserError("the states are not pictures", actual, do)
+        raise UserError("the states are not pictures", actual, "Read them with h5py, see docs/formats.md.")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []

@@ -1,4 +1,4 @@
-"""Spec B6, I6: states, an agent's episodes or an ensemble, written for other software."""
+"""Spec B6, I6: an agent's episodes or an ensemble, written for other software."""
 
 import inspect
 import json
@@ -10,15 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.artefacts import ARRAYS, Artefact, create, open_artefact
+from hypogoal.core.artefacts import Artefact, create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
-from hypogoal.core.terminal import amount
-from hypogoal.data import open_dataset
-from hypogoal.importing.arrays import write_arrays
 from hypogoal.observations import PICTURE, fields_of
 
-HUB, EPISODES = "hub", "episodes"  # kinds of exports, beside arrays
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # of a Minari dataset
 CARD = """---
 library_name: hypogoal
@@ -41,42 +37,29 @@ Positive above the `thresholds` in the file of weights.
 """
 
 
-def export(source: Path, out: Path, *, episodes: int, seed: int, force: bool, quiet: bool) -> str:
-    """Write ``source`` for other software; returns a line that says how much, empty where there is nothing to say.
+def export(source: Path, out: Path, *, episodes: int, seed: int, force: bool, quiet: bool) -> None:
+    """Write an artefact for other software.
 
-    A data file becomes ``.npz``, which ``import`` reads, an ensemble artefact a folder that torch and safetensors load
-    without hypogoal, a meta artefact a Minari dataset of so many ``episodes``. ``seed`` is of its agent's choices.
+    An ensemble becomes a folder that torch and safetensors load without hypogoal, a meta artefact a Minari dataset of
+    so many ``episodes``. ``seed`` is of its agent's choices.
     """
-    config = {}
-    if not source.is_dir():
-        kind = ARRAYS
-        if out.suffix != ".npz":
-            raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
-    elif open_artefact(source, "meta", "ensemble").kind == "ensemble":
-        kind = HUB
-    else:
-        kind = EPISODES
-        config["episodes"] = episodes
-        if not NAME.fullmatch(out.name):
-            raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
+    artefact = open_artefact(source, "meta", "ensemble")
+    is_ensemble = artefact.kind == "ensemble"
+    if not (is_ensemble or NAME.fullmatch(out.name)):
+        raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
     with create(
         out,
-        kind=kind,
-        config=config,
+        kind="hub" if is_ensemble else "episodes",
+        config={} if is_ensemble else {"episodes": episodes},
         seed=seed,
         inputs=[source],
         force=force,
     ) as draft:
-        if kind == ARRAYS:
-            write_arrays(draft.files / out.name, open_dataset(source))
-            return ""
-        artefact = Artefact(source)
-        if kind == HUB:
+        if is_ensemble:
             write_hub(artefact, draft.files)
-            return ""
+            return
         with Progress("export", total=episodes, quiet=quiet) as progress:
-            steps = write_episodes(artefact, draft.files / "data", out, seed, progress)
-        return f"{amount(episodes, 'episode')}, {amount(steps, 'step')}"
+            write_episodes(artefact, draft.files / "data", out, seed, progress)
 
 
 def write_hub(artefact: Artefact, folder: Path) -> None:
@@ -142,8 +125,8 @@ def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
     return rows
 
 
-def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress: Progress) -> int:
-    """Let the agent of a meta artefact play as a Minari dataset of the name ``out``; returns the number of steps.
+def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress: Progress) -> None:
+    """Let the agent of a meta artefact play as a Minari dataset of the name ``out``.
 
     ``infos/option`` is the option that led to each state, -1 at the start.
     """
@@ -179,7 +162,6 @@ def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress:
     }
     storage.update_metadata(description)
     storage.update_episodes(_buffers(play_episodes(loop, progress.total), progress))
-    return int(storage.total_steps)
 
 
 def _buffers(episodes: Iterable[Any], progress: Progress) -> Iterator[Any]:

@@ -23,6 +23,8 @@ import time
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
+
 from hypogoal.core.artefacts import Artefact, Draft
 from hypogoal.core.checkpoints import PACE
 from hypogoal.core.processes import CORES
@@ -53,11 +55,10 @@ COMMANDS = {
     " --set random_episodes=5 --out run/ppo",
     "run/evaluation": "evaluate run",
     "run/report": "report run",
-    "own.npz": "export run/data.h5 --out own.npz",
     "own.h5": "import own.npz --out own.h5",
     "sweep": "run toy.toml --out sweep",
 }
-WITHOUT_RESUME = ("own.npz", "own.h5")
+WITHOUT_RESUME = ("own.h5",)
 SAVING = ("run/ensemble", "run/options", "run/meta", "run/ppo", "sweep")  # with checkpoints
 
 
@@ -168,6 +169,8 @@ def main() -> int:
     whole = root / "whole"
     whole.mkdir()
     (whole / "toy.toml").write_text(TOY, encoding="utf-8")
+    states = np.arange(40 * 8 * 8 * 3, dtype=np.uint8).reshape(40, 8, 8, 3)
+    np.savez(whole / "own.npz", observations=states, labels=np.arange(40) < 20, unlabelled=states[::-1])
     last = max([*COMMANDS].index(out) for out in given.commands)
     faults: list[str] = []
     print(f"{'output':16s} {'kills':>6s} {'after a checkpoint':>19s} {'ended':>6s} {'faults':>7s}")

@@ -51,7 +51,7 @@ def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
     assert (artefact.kind, artefact.config, artefact.seed) == ("meta", ABOUT["config"], 7)
     assert artefact.input("ensemble") == source and artefact.manifest.files.keys() == {"whole.csv"}
     assert {"python", "torch", "numpy"} <= artefact.manifest.versions.keys()
-    assert 0 <= artefact.manifest.took["seconds"] < 60 and 1e7 < artefact.manifest.took["memory"] < 1e12
+    assert 0 <= artefact.manifest.took["seconds"] < 60
     assert artefact.faults() == [] and find_artefacts(tmp_path, "meta")[0].path == out
 
 
@@ -73,10 +73,9 @@ def test_white_space_and_took_are_no_change(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": 4}, "reads manifests of format 3, this is 4"),
-        ({"format": 2}, "this is 2: .*manifest.json. Use the hypogoal that wrote it, or make it again."),
-        ({"seed": "x"}, "'seed' is missing or malformed"),
-        ({"inputs": [{"kind": "data"}]}, "'inputs.0.path' is missing or malformed"),
+        ({"format": 2}, r"damaged, or of another version \(format: Input should be 3\): .*manifest.json. Make"),
+        ({"seed": "x"}, r"\(seed: Input should be a valid integer"),
+        ({"inputs": [{"kind": "data"}]}, r"\(inputs.0.path: Field required"),
     ],
 )
 def test_manifests_that_are_refused(tmp_path: Path, change: dict[str, Any], words: str) -> None:
@@ -182,7 +181,7 @@ def test_other_versions_and_damaged_drafts_are_not_continued(tmp_path: Path, mon
         with pytest.raises(UserError, match="begun with torch="):
             finish(out, resume=True)
     begun = Draft(out).begun.read_text()
-    for text, words in (("{", "not valid JSON"), ('{"identity": {}}', "format 3, this is None")):
+    for text, words in (("{", "not valid JSON"), ('{"identity": {}}', "kind: Field required")):
         Draft(out).begun.write_text(text)
         with pytest.raises(UserError, match=words):
             finish(out, resume=True)
@@ -219,7 +218,7 @@ def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path) -> None:
         (tmp_path / name).write_text("precious")
     before = contents(tmp_path)
     for name in ("ensemble", "unreadable", "mine", "foreign.h5"):
-        for kind in {"meta", DATA} if name != "unreadable" else {"meta"}:
+        for kind in ("meta", DATA):
             with pytest.raises(UserError, match="what is there is not of kind"):
                 finish(tmp_path / name, kind=kind, force=True)
     for out, path in (("ensemble", "link"), ("link", "ensemble"), (".", "ensemble")):
@@ -227,10 +226,7 @@ def test_force_replaces_only_what_a_stage_made_there(tmp_path: Path) -> None:
             finish(tmp_path / out, kind="ensemble", inputs=[tmp_path / path], force=True)
     assert contents(tmp_path) == before
     (tmp_path / "empty").mkdir()
-    finish(tmp_path / "empty")
-    reseal(tmp_path / "empty", seed="damaged")
-    finish(tmp_path / "empty", force=True)
-    assert open_artefact(tmp_path / "empty").seed == 7
+    assert finish(tmp_path / "empty") == 0
 
 
 def test_a_data_file_is_renamed_when_whole(tmp_path: Path) -> None:
@@ -246,7 +242,7 @@ def test_a_data_file_is_renamed_when_whole(tmp_path: Path) -> None:
 
     with pytest.raises(KeyError):
         write(fails=True)
-    assert os.listdir(tmp_path) == []
+    assert os.listdir(out.parent) == []
     write()
     before = out.read_bytes()
     with pytest.raises(Complete):

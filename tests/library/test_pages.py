@@ -66,7 +66,6 @@ def test_the_page_of_own_data(demo: Path, tmp_path: Path, monkeypatch: pytest.Mo
         short = ["--episodes", "2"] if "--episodes" in words else short
         assert main([*words[1:], *short]) == 0, words
     assert open_dataset(tmp_path / "runs/own/data.h5").sub_goals == ("square-seen",)
-    assert (tmp_path / "states-again.npz").is_file()
     assert (tmp_path / "minari" / "solved-v0" / "data" / "main_data.hdf5").is_file()
 
 

@@ -1,6 +1,5 @@
 """Episodes to and from the real minari package (Spec B6)."""
 
-import re
 from collections import Counter
 from pathlib import Path
 
@@ -28,10 +27,9 @@ def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_an_agents_episodes_are_a_minari_dataset(tiny_run: Path, there: Path) -> None:
     """Spec B6: minari reads them, and so do we; played again, their actions lead to the same observations."""
     out = there / "toy-v0"
-    said = run("export", tiny_run / "meta", "--out", out, "--episodes", EPISODES).out
+    run("export", tiny_run / "meta", "--out", out, "--episodes", EPISODES)
     dataset = minari.load_dataset("toy-v0")
     assert dataset.total_episodes == EPISODES
-    assert re.search(rf"{EPISODES} episodes, {dataset.total_steps} steps", said)
     env = gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=LAYOUT)
     assert dataset.observation_space == env.observation_space
     assert dataset.action_space == env.action_space
