@@ -30,7 +30,7 @@ from hypogoal.cli import main as hypogoal  # noqa: E402
 
 LAYOUT = 100
 WANTED = {"train-meta": 15.0}
-HALF = "update_interval=16"  # the default of other domains
+HALF = "update_interval=16"  # half as often as the default
 WANTED_SHARE = 0.1  # of verdicts, at most
 RESTORE_EVERY = 40  # steps of the emulator alone
 CLIMBING = "train-options at a ladder"

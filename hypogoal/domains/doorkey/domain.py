@@ -5,7 +5,6 @@ See also ``env`` (the Gymnasium environment and the sub-goals) and ``engine`` (m
 
 import itertools
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,6 @@ from hypogoal.data import Collected, States, joined, leave_out, require_classes
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey import env
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-
-# So that options behind other options learn in time.
-LEARNING: Mapping[str, Any] = MappingProxyType({"epsilon_steps": 2_000, "update_interval": 8})
 
 
 class DoorKeyConfig(Config):
@@ -85,8 +81,6 @@ class DoorKeyDomain(Domain):
     engine_settings = ("door_label", "wrong_key")
     env_id = "hypogoal.envs:hypogoal/DoorKey-8x8-v0"
     many_layouts = True
-    defaults = MappingProxyType({"train-options": LEARNING, "train-meta": LEARNING})
-    sources = MappingProxyType(dict.fromkeys(defaults, "ours: docs/results/history.md"))
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """Spec B3: labelled, unlabelled and held-out states, each with its origin.

@@ -37,6 +37,7 @@ LEARNING: Mapping[str, Any] = {
     "option_batch": 32,
     "n_step": 10,
     "exploration": "persistent",
+    "update_interval": 16,
     "epsilon_steps": 10_000,
     "epsilon_final": 0.01,
     "random_episodes": 0,
