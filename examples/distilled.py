@@ -222,7 +222,7 @@ class Learner(LightLearner):
 def play(layout_seed: int) -> list[str]:
     """Each option once, without an engine."""
     options = hypogoal.load_options("runs/far/options")
-    env = hypogoal.OptionEnv(options.make_env(layout_seed=layout_seed), options, masked="run")
+    env = hypogoal.OptionEnv(options.make_env(layout_seed=layout_seed), options)
     lines = []
     for option in range(options.count):
         env.reset(seed=0)

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from hypogoal.api import compare, load_ensemble, load_options
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium.domain import GymnasiumDomain
-    from hypogoal.hypotheses.wrappers import SubgoalReward
     from hypogoal.made import Made
     from hypogoal.options.env import OptionEnv
+    from hypogoal.options.reward import SubgoalReward
     from hypogoal.stages.collect import collect
     from hypogoal.stages.evaluate import evaluate
     from hypogoal.stages.report import report
@@ -29,7 +29,7 @@ _HOMES = {  # where each name is imported from on first use
     "GymnasiumDomain": "domains.gymnasium.domain",
     "Made": "made",
     "OptionEnv": "options.env",
-    "SubgoalReward": "hypotheses.wrappers",
+    "SubgoalReward": "options.reward",
     "UserError": "core.errors",
     "collect": "stages.collect",
     "compare": "api",

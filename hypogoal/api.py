@@ -11,10 +11,10 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.processes import own_settings
 from hypogoal.core.tensors import load_tensors
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.hypotheses.wrappers import ensemble_at
 from hypogoal.made import Made
 from hypogoal.options.env import Options
 from hypogoal.options.learner import make_policies
+from hypogoal.options.reward import ensemble_at
 from hypogoal.options.termination import saved_terminations
 from hypogoal.stages import Place
 

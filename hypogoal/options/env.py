@@ -13,14 +13,14 @@ from gymnasium.utils import RecordConstructorArgs
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.observations import Observations
 from hypogoal.options.learner import Policies
 from hypogoal.options.loop import offered_options
 from hypogoal.options.parts import Flags, Floats
+from hypogoal.options.reward import require_observations
 from hypogoal.options.termination import Terminations
 
-MASKED = ("warn", "run", "raise")  # what OptionEnv does when it is given an option that is masked
+MASKED = "a masked option runs: choose by action_masks(), or have warnings of this ignored"
 
 
 @dataclass(frozen=True, repr=False)
@@ -94,18 +94,16 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     reached, ``info["option"]`` its name.
 
     sb3-contrib's MaskablePPO calls ``action_masks()``; for a ``gymnasium.vector.SyncVectorEnv``, use
-    ``envs.call("action_masks")``. A masked option runs all the same, for agents without masks; ``info["masked"]`` says
-    so.
+    ``envs.call("action_masks")``. A masked option runs all the same, for agents without masks, with a ``UserWarning``
+    before anything is played; ``info["masked"]`` says so.
 
     Args:
         env: an environment with the observations that the options were trained on.
         options: from :func:`hypogoal.load_options`.
         gamma: discount per environment step inside an option; 1 for the plain sum.
-        masked: what else a masked option does: ``warn``, a ``UserWarning`` at the first one; ``run``, nothing;
-            ``raise``, a ``UserError`` before anything is played, for agents that are to respect the masks.
 
     Raises:
-        UserError: the environment has other observations, or ``masked`` is none of these.
+        UserError: the environment has other observations.
 
     >>> import gymnasium, hypogoal
     >>> options = hypogoal.load_options("runs/demo/meta")
@@ -125,80 +123,55 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: gymnasium.Env[Any, Any],
         options: Options,
         gamma: float = 1.0,
-        masked: str = MASKED[0],
     ):
-        RecordConstructorArgs.__init__(
-            self,
-            _disable_deepcopy=True,
-            options=options,
-            gamma=gamma,
-            masked=masked,
-        )
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma)
         gymnasium.Wrapper.__init__(self, env)
-        if masked not in MASKED:
-            raise UserError("what should a masked option do?", f"masked={masked!r}", f"Choose of {', '.join(MASKED)}.")
-        self.options, self.gamma, self.masked = options, gamma, masked
+        self.options, self.gamma = options, gamma
         self.ends = copy.deepcopy(options.ends)
         self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._image: Observations | None = None
-        self._warned = False
         self._masks: Flags | None = None  # of the current observation, once they were asked for
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Like the environment's own."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        observation, info = self.env.reset(**kwargs)
         self._image, self._masks = self._look.read(observation), None
         return observation, info
 
     def action_masks(self) -> Flags:
         """Spec D6: which options may start here, bool (G*K,)."""
-        image = self._current()
         if self._masks is None:
-            self._masks = self.options.offered(image)
+            self._masks = self.options.offered(self._current())
         return self._masks.copy()
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Run option ``action`` to its end, though it be masked (see ``masked``).
+        """Run option ``action`` to its end, though it be masked.
 
         Raises:
-            UserError: there is no such option, the environment was not reset, or the option is masked and ``masked`` is
-                ``raise``.
+            UserError: there is no such option, or the environment was not reset.
         """
-        chosen = np.asarray(action)  # other libraries' agents give arrays of one
-        option = int(chosen.item()) if chosen.size == 1 and chosen.dtype.kind in "iu" else -1
-        if not 0 <= option < self.options.count:
+        if not self.action_space.contains(action):
             raise UserError("no such option", repr(action), f"They are 0 to {self.options.count - 1}.")
+        option = int(action)
         masked = not self.action_masks()[option]
-        if masked and self.masked != "run":
-            self._refuse(option)
+        if masked:
+            warnings.warn(MASKED, UserWarning, stacklevel=2)
         act = self.options.policies(option)
         running = np.array([option])
-        total, duration, reached, ended = 0.0, 0, False, False
-        image, observation = self._current(), None
-        terminated = truncated = False
-        info: dict[str, Any] = {}
+        total, duration, ended = 0.0, 0, False
+        image = self._current()
         while not ended:
             observation, reward, terminated, truncated, info = self.env.step(act(image))
             image = self._look.read(observation)
             total += self.gamma**duration * float(reward)
-            reached = bool(self.ends.reached(self.options.log_odds(option, image), running, np.array([duration]))[0])
+            log_odds = self.options.log_odds(option, image)
+            [reached] = self.ends.reached(log_odds, running, np.array([duration])).tolist()
             duration += 1
             ended = reached or terminated or truncated or duration >= self.options.timeout
         self._image, self._masks = image, None
         info = info | {"duration": duration, "reached": reached, "option": self.options.name(option), "masked": masked}
         return observation, total, terminated, truncated, info
-
-    def _refuse(self, option: int) -> None:
-        """Raise, or warn once, since this option is masked."""
-        fault, do = f"option {option} ({self.options.name(option)}) is masked here", "Choose by action_masks()"
-        if self.masked == "raise":
-            raise UserError(fault, None, f"{do}, as MaskablePPO does, or give OptionEnv masked='run'.")
-        if self._warned:
-            return
-        self._warned = True
-        text = f"{fault} and runs all the same. {do}, or give OptionEnv masked='run' to hear no more of it, or 'raise'."
-        warnings.warn(text, UserWarning, stacklevel=3)
 
     def _current(self) -> Observations:
         if self._image is None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from hypogoal.options.learner import Learner, Policies, SavedOptions, Transition
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.recording import Recorder
+from hypogoal.options.reward import SubgoalReward
 from hypogoal.options.tables import Choices
 from hypogoal.options.termination import Terminations, learned_terminations, saved_terminations
 
@@ -177,9 +180,25 @@ def ensembles_on(engine: DoorKeyEngine) -> list[Ensemble]:
     return ensembles
 
 
+class Watched(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """It notes the actions that are played."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], played: list[int]):
+        super().__init__(env)
+        self.played = played
+
+    def step(self, action: int) -> Any:
+        self.played.append(action)
+        return self.env.step(action)
+
+
+def door_key() -> gymnasium.Env[Any, Any]:
+    return gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=100)
+
+
 @pytest.mark.parametrize("rule", ["learned", f"{__name__}:AtLeast:2", f"{__name__}:Never"])
 def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec D1, H4: execution by execution, one's own learner and chooser in the loop and in ``OptionEnv``."""
+    """Spec D1, H4: step by step, one's own learner and chooser in the loop, in ``OptionEnv`` and as a reward."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     network, timeout = f"{__name__}:Straight", 6
     engine = DoorKeyEngine(100, 1)
@@ -189,23 +208,35 @@ def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest
     learner = load_learner(network)(engine, ends, config, 0)
     chooser = load_chooser(f"{__name__}:FirstOffered").create(engine, 4, config, 0, "cpu")
     loop = OptionLoop(engine, ends, learner, chooser, Recorder(4, engine), config, gamma=0.9)
-    for _ in range(150):
-        loop.advance(learning=False)
-    wanted = sorted(
-        (execution for runs in loop.recorder.executions for execution in runs), key=lambda execution: execution.step
-    )
+    steps = [loop.advance(learning=False) for _ in range(150)]
+    executions = sorted(itertools.chain(*loop.recorder.executions), key=lambda execution: execution.step)
 
     weights = learner.state() | ends.state()
     named = config.model_dump() | {"sub_goals": ["a", "b"], "members": 2}
     policies = make_policies(named, weights, {"observation_shape": engine.observation_shape})
     options = Options(("a", "b"), 2, ensembles, policies, saved_terminations(rule, weights, 4), timeout)
-    env = OptionEnv(gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=100), options)
+    played: list[int] = []
+    env = OptionEnv(Watched(door_key(), played), options)
     env.reset(seed=0)
-    for execution in wanted:
+    for execution in executions:
         option = chooser.choose(np.zeros(1, np.int64), np.zeros(1, np.int64), env.action_masks()[None])[0]
         *_, terminated, truncated, info = env.step(option)
         assert (option, info["duration"], info["reached"]) == (execution.option, execution.duration, execution.reached)
         if terminated or truncated:
             env.reset(seed=0)
-    reached = [execution.reached for execution in wanted]
+    assert played == [int(moved.actions[0]) for moved in steps[: len(played)]]
+
+    alone = replace(options, mask_reached=False, timeout=30)
+    for option in range(4):
+        env = OptionEnv(door_key(), alone)
+        env.reset(seed=0)
+        info = env.step(option)[4]
+        rewarded = SubgoalReward(ensembles[option // 2], by=option % 2, termination=rule).wrap(door_key())
+        observation, _ = rewarded.reset(seed=0)
+        act, held = policies(option), []
+        while len(held) < info["duration"]:
+            observation, *_, paid = rewarded.step(act(observation))
+            held.append(paid["subgoal"])
+        assert held == [False] * (len(held) - 1) + [info["reached"]]
+    reached = [execution.reached for execution in executions]
     assert any(reached) == (rule != f"{__name__}:Never") and (rule == "learned" or not all(reached))

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import operator
+import copy
 import os
 from pathlib import Path
-from typing import (
-    Any,
-    SupportsFloat,
-    SupportsIndex,
-    TypeAlias,
-)
+from typing import Any, SupportsFloat, TypeAlias
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
+from hypogoal.options.parts import Flags, Floats
+from hypogoal.options.termination import rule_of
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
-By: TypeAlias = str | SupportsIndex
-RULES = ("any", "vote", "all", "mean")
 
 
 def require_observations(env: Env, ensemble: Ensemble) -> Reader:
@@ -33,11 +27,7 @@ def require_observations(env: Env, ensemble: Ensemble) -> Reader:
     if (reader.shape, reader.dtype) != (shape, dtype):
         mismatch = f"{reader.dtype} {reader.shape}, not {dtype} {shape}"
         do = "Use the environment they were trained on, with its wrappers."
-        raise UserError(
-            "these members were trained on other observations",
-            mismatch,
-            do,
-        )
+        raise UserError("these members were trained on other observations", mismatch, do)
     return reader
 
 
@@ -45,11 +35,9 @@ def ensemble_at(path: Path, sub_goal: str) -> Ensemble:
     """One sub-goal's ensemble in an artefact; without a name its only one."""
     artefact = open_artefact(path, "ensemble")
     goals = artefact.config["sub_goals"]
-    return read_ensemble(
-        artefact.path,
-        artefact.config,
-        sub_goal or (goals[0] if len(goals) == 1 else ""),
-    )
+    if not sub_goal and len(goals) == 1:
+        [sub_goal] = goals
+    return read_ensemble(artefact.path, artefact.config, sub_goal)
 
 
 class SubgoalReward:
@@ -58,11 +46,14 @@ class SubgoalReward:
     Args:
         source: an ensemble artefact's folder, or an ensemble from :func:`hypogoal.load_ensemble`.
         sub_goal: which of the artefact's; may be left out where there is one.
-        by: who decides: ``any`` member, more than half of them (``vote``), ``all``, which is the strictest, their
-            ``mean`` probability above 0.5, or one member by its number.
+        by: who decides: ``any`` member, more than half of them (``vote``), ``all``, which is the strictest, or one
+            member by its number.
+        termination: when a member says so: ``learned``, where its prediction is positive; or a rule of one's own, as in
+            training, which :meth:`wrap` asks at every step.
 
     ``reward(observations)`` are rewards float32 (N,), 1 where the sub-goal holds, of observations as
-    :meth:`Ensemble.predict` takes them; ``reward.holds(observations)`` the same as bool (N,).
+    :meth:`Ensemble.predict` takes them; ``reward.holds(observations)`` the same as bool (N,). Each observation stands
+    alone there, so that predictions decide, whatever the rule.
 
     Raises:
         UserError: no such ensemble, sub-goal, member or rule.
@@ -72,32 +63,33 @@ class SubgoalReward:
         self,
         source: str | os.PathLike[str] | Ensemble,
         sub_goal: str = "",
-        by: By = "vote",
+        by: str | int = "vote",
+        termination: str = "learned",
     ):
         self.ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
-        self.by = by if isinstance(by, str) else _member(by)
-        if self.by not in RULES and self.by not in range(len(self.ensemble)):
-            do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(self.ensemble) - 1}."
-            raise UserError(
-                "unknown rule for whether the sub-goal holds",
-                f"by={by!r}",
-                do,
-            )
+        count = len(self.ensemble)
+        self.by = by
+        self.least = {"any": 1, "vote": count // 2 + 1, "all": count}  # members that have to say so
+        if by not in self.least and by not in range(count):
+            do = f"Choose one of {', '.join(self.least)}, or a member, 0 to {count - 1}."
+            raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
+        rule, length = rule_of(termination)
+        thresholds = self.ensemble.thresholds_as_log_odds()
+        self.ends = rule(None, count, thresholds=thresholds, environments=count, length=length)
 
     def __call__(self, observations: Any) -> Floats:
         """The rewards (N,) of observations."""
         return self.holds(observations).astype(np.float32)
 
-    def holds(self, observations: Any) -> Bools:
+    def holds(self, observations: Any) -> Flags:
         """Whether the sub-goal holds in observations: bool (N,)."""
-        if self.by == "mean":
-            return np.asarray(self.ensemble.predict(observations).mean(1) > 0.5)
-        predictions = self.ensemble.predictions(observations)
-        if not isinstance(self.by, str):
-            return np.asarray(predictions[:, self.by])
-        members = len(self.ensemble)
-        least = {"any": 1, "vote": members // 2 + 1, "all": members}[self.by]
-        return np.asarray(predictions.sum(1) >= least)
+        return self.decide(self.ends.positive(self.ensemble.log_odds(observations)))
+
+    def decide(self, members: Flags) -> Flags:
+        """Whether the sub-goal holds where members say so: bool (N, K) to (N,)."""
+        if self.by in self.least:
+            return np.asarray(members.sum(1) >= self.least[self.by])
+        return members[:, self.by]
 
     def wrap(
         self,
@@ -113,42 +105,37 @@ class SubgoalReward:
         an agent can stay where it is rewarded. ``info["subgoal"]`` is whether the sub-goal holds. An environment with
         other observations than those of training is a ``UserError``.
         """
-        return RewardedEnv(env, self, scale=scale, add=add, ends=ends)
-
-
-def _member(by: Any) -> int | None:
-    """The number of a member, from Python or any array library; None for anything else."""
-    try:
-        return None if isinstance(by, bool) else operator.index(by)
-    except TypeError:
-        return None
+        return RewardedEnv(env, self, scale, add, ends)
 
 
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """See :meth:`SubgoalReward.wrap`."""
+    """See :meth:`SubgoalReward.wrap`: an episode is to each member an execution of its option."""
 
-    def __init__(
-        self,
-        env: Env,
-        reward: SubgoalReward,
-        *,
-        scale: float = 1.0,
-        add: bool = False,
-        ends: bool = True,
-    ):
+    def __init__(self, env: Env, reward: SubgoalReward, scale: float, add: bool, ends: bool):
         kept = {"reward": reward, "scale": scale, "add": add, "ends": ends}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
         gymnasium.Wrapper.__init__(self, env)
         self._reader = require_observations(env, reward.ensemble)
         self.reward, self.scale, self.add, self.ends = reward, scale, add, ends
+        self._rule = copy.deepcopy(reward.ends)
+        self._age = 0
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Like the environment's own."""
+        self._age = 0
+        return self.env.reset(**kwargs)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step with reward and end changed."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         seen = self._reader.read(observation)[None]
-        holds = bool(self.reward.holds(seen)[0])
-        terminated = bool(terminated) or (holds and self.ends)
+        [log_odds] = self.reward.ensemble.log_odds(seen)
+        members = np.arange(len(log_odds))
+        reached = self._rule.reached(log_odds, members, np.full_like(members, self._age))
+        self._age += 1
+        [holds] = self.reward.decide(reached[None]).tolist()
         paid = self.scale if holds else 0.0
         if self.add:
             paid += float(reward)
+        terminated = bool(terminated) or (holds and self.ends)
         return observation, paid, terminated, truncated, info | {"subgoal": holds}
