@@ -245,9 +245,9 @@ def show(
     details = look.describe(path)
     echo(details, as_json, [*look.outcome(details), *look.lines(details)])
     if pictures is not None:
-        from hypogoal.evaluation.pictures import write_contact_sheets
+        from hypogoal.evaluation.sheets import write_sheets
 
-        for sheet in write_contact_sheets(path, pictures):
+        for sheet in write_sheets(path, pictures):
             say(sheet, err=as_json)
 
 

@@ -19,7 +19,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import COLUMNS, TABLE, option_numbers
-from hypogoal.evaluation.pictures import episode_gif
+from hypogoal.evaluation.films import episode_gif
 from hypogoal.evaluation.selection import states_met
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
 from hypogoal.hypotheses.scores import member_scores

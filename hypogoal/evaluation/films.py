@@ -1,108 +1,70 @@
-"""Films of a run's agents, played from their saved weights (Spec E1, F7)."""
+"""Films of a run's agent, played from its saved weights (Spec E1, F7)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
+
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.page import source
+from hypogoal.evaluation.pictures import coloured
+from hypogoal.evaluation.plots import GREY, INK, PALETTE
 from hypogoal.evaluation.run import find_artefacts
 from hypogoal.observations import PICTURE
 
 if TYPE_CHECKING:
     from hypogoal.meta.episodes import Frame
-    from hypogoal.options.loop import OptionLoop
 
-MOST_FRAMES = 200  # played for the page's film, till an episode has members that differ
 NEEDED = "Videos need a meta artefact with learned terminations: train-meta."
+MOST_FRAMES = 200  # played for the page's film, till an episode has members that differ
+SIDE = 336  # pixels that a moving state is enlarged to, or a little less
+LINE, MARGIN, BAR, FONT = 18, 8, 8, 13  # pixels below it
+STEP, PAUSE, END, LAST = 140, 500, 600, 1_500  # milliseconds: a step, members differ, an option's end, the last frame
+SHADES = 64  # colours of a film
 
 
-class Film(NamedTuple):
-    """An episode of an agent, the ``number``-th that it played."""
+@dataclass(frozen=True)
+class Film:
+    """An episode of an agent."""
 
-    agent: Artefact
-    path: str  # the agent's, within the run
-    number: int
+    name: str  # of its file
     gif: bytes
-    steps: int
-    options: int  # executions
-
-    @property
-    def name(self) -> str:
-        """Its file."""
-        return f"{self.path.replace('/', '-')}-episode-{self.number}.gif"
-
-    def told(self) -> dict[str, Any]:
-        """What the page says of it, and the film itself."""
-        facts = {"path": self.path, "number": self.number, "steps": self.steps, "options": self.options}
-        config = self.agent.config
-        return {
-            **facts,
-            "layout": config["layout_seed"],
-            "members": config["members"],
-            "source": source(self.gif, "gif"),
-        }
+    about: dict[str, Any]  # what the page says of it
 
 
-def agents_of(run: Path) -> list[Artefact]:
-    """The run's agents that learned to choose among members' options."""
-    return [
-        artefact
-        for artefact in find_artefacts(run, "meta")
-        if artefact.config["chooser"] != "random" and artefact.config["termination"] != "oracle"
-    ]
+def agent_to_film(run: Path) -> Artefact | None:
+    """The run's first agent that learned to choose among members' options."""
+    for artefact in find_artefacts(run, "meta"):
+        if artefact.config["chooser"] != "random" and artefact.config["termination"] != "oracle":
+            return artefact
+    return None
 
 
-def films_of(agents: Sequence[Artefact], run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
-    """So many ``videos`` of the agents in turn; None: one where there can be one, and a line where it cannot be.
+def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
+    """Spec E1: the first ``count`` episodes of an agent, whose ``path`` in the run names them.
 
-    A ``UserError`` where films were asked for and there is no agent that sees pictures.
-    """
-    if videos == 0 or (videos is None and not agents):
-        return [], []
-    if not agents:
-        raise UserError("no agent to make videos of", run, NEEDED)
-    try:
-        return [*play_films(agents, run, videos)], []
-    except UserError as error:
-        if videos:
-            raise
-        return [], [f"no film of an episode: {error}"]
-
-
-def play_films(agents: Sequence[Artefact], run: Path, count: int | None) -> Iterator[Film]:
-    """Spec E1: ``count`` episodes of the agents in turn, played from their saved weights.
-
-    None: one of the first agent, the first that :func:`_tells` within ``MOST_FRAMES``, else the first of all.
+    None: one, the first that :func:`_tells` within ``MOST_FRAMES``, else the first of all. Without pictures a
+    ``UserError``.
     """
     from hypogoal.meta.episodes import agent_of, play_episode
 
-    loops = [agent_of(artefact, seed=0) for artefact in agents[: count or 1]]
-    for artefact, loop in zip(agents, loops, strict=False):
-        if loop.engine.observation_dtype != PICTURE:
-            raise UserError("videos need an agent that sees pictures", artefact.path, "Leave --videos out.")
-    if count is None:
-        yield _telling(agents[0], run, loops[0])
-        return
-    for index in range(count):
-        number, which = divmod(index, len(agents))
-        frames = play_episode(loops[which], agents[which].config["members"])
-        yield _film(agents[which], run, number, frames)
-
-
-def _telling(agent: Artefact, run: Path, loop: OptionLoop) -> Film:
-    from hypogoal.meta.episodes import play_episode
-
+    loop = agent_of(agent, seed=0)
+    if loop.engine.observation_dtype != PICTURE:
+        raise UserError("videos need an agent that sees pictures", agent.path, "Leave --videos out.")
     members = agent.config["members"]
+    if count is not None:
+        return [_film(agent, path, number, play_episode(loop, members)) for number in range(count)]
     played: list[Sequence[Frame]] = []
     while sum(map(len, played)) < MOST_FRAMES:
         played.append(play_episode(loop, members))
         if _tells(played[-1], members):
-            return _film(agent, run, len(played) - 1, played[-1])
-    return _film(agent, run, 0, played[0])
+            return [_film(agent, path, len(played) - 1, played[-1])]
+    return [_film(agent, path, 0, played[0])]
 
 
 def _tells(frames: Sequence[Frame], members: int) -> bool:
@@ -114,10 +76,67 @@ def _tells(frames: Sequence[Frame], members: int) -> bool:
     return right and any(len(set(frame.predictions)) > 1 for frame in frames)
 
 
-def _film(artefact: Artefact, run: Path, number: int, frames: Sequence[Frame]) -> Film:
-    from hypogoal.evaluation.pictures import episode_gif
-
-    path, config = artefact.path.relative_to(run).as_posix(), artefact.config
+def _film(agent: Artefact, path: str, number: int, frames: Sequence[Frame]) -> Film:
+    config = agent.config
+    about = {
+        "path": path,
+        "number": number,
+        "steps": frames[-1].step,
+        "options": sum(bool(frame.ended) for frame in frames),
+        "layout": config["layout_seed"],
+        "members": config["members"],
+    }
     gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
-    options = sum(bool(frame.ended) for frame in frames)
-    return Film(artefact, path, number, gif, frames[-1].step, options)
+    return Film(f"{path.replace('/', '-')}-episode-{number}.gif", gif, about)
+
+
+def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
+    """What is written below a frame: the option that runs, each member's prediction, and why the option ended."""
+    running = frame.option % members
+    lines = [f"option: {sub_goals[frame.option // members]}"]
+    for member, positive in enumerate(frame.predictions):
+        name = f"member {member}" if members > 1 else "its classifier"
+        mark = ">" if member == running else " "
+        lines.append(f"{mark} {name}: {'positive' if positive else 'negative'}")
+    lines.append(f"step {frame.step}" + (f", ends: {frame.ended}" if frame.ended else ""))
+    return lines
+
+
+def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> Image.Image:
+    """A frame enlarged; a bar is as long as the steps that are left to the option, of ``timeout``.
+
+    Option g*K + k is member k of sub-goal g, whose colour the bar has; positive predictions are written in white.
+    """
+    state = Image.fromarray(coloured(frame.observation))
+    state = ImageOps.scale(state, max(1, SIDE // max(state.size)), Image.Resampling.NEAREST)
+    width, height = state.size
+    lines = frame_lines(frame, sub_goals, members)
+    picture = ImageOps.expand(state, (0, 0, 0, BAR + 2 * MARGIN + LINE * len(lines)), INK)
+    draw = ImageDraw.Draw(picture)
+    colour = PALETTE[frame.option // members % len(PALETTE)]
+    draw.rectangle((0, height, width * frame.left / timeout, height + BAR), colour)
+    font = ImageFont.load_default(FONT)
+    for number, line in enumerate(lines):
+        place = (MARGIN, height + BAR + MARGIN + number * LINE)
+        draw.text(place, line, GREY if line.endswith("negative") else "white", font)
+    return picture
+
+
+def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int, timeout: int) -> bytes:
+    """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1.
+
+    It pauses where an option ends, and where its member comes to differ from others of its sub-goal.
+    """
+    pictures, times = [], []
+    before: tuple[bool, ...] = ()
+    for frame in frames:
+        picture = draw_frame(frame, sub_goals, members, timeout)
+        pictures.append(picture.quantize(SHADES, dither=Image.Dither.NONE))
+        differ = len(set(frame.predictions)) > 1 and before != frame.predictions
+        times.append(END if frame.ended else PAUSE if differ else STEP)
+        before = frame.predictions
+    times[-1] = LAST
+    first, *rest = pictures
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=times, loop=0, optimize=False)
+    return buffer.getvalue()

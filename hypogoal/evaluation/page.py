@@ -21,7 +21,7 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import versions
 from hypogoal.evaluation.house import STUDENT
-from hypogoal.evaluation.pictures import image_png, reduced
+from hypogoal.evaluation.pictures import encoded
 from hypogoal.evaluation.plots import to_file
 
 WIDTH = 80  # of tables in a terminal
@@ -206,10 +206,8 @@ def spans(numbers: Iterable[int]) -> str:
 
 
 def picture(image: NDArray[np.uint8]) -> str:
-    """An observation as the source of an ``img``, see :func:`reduced`; of a stack of grey frames the last."""
-    if image.ndim == 3 and image.shape[2] != 3:
-        image = image[..., -1]
-    return source(image_png(reduced(image)), "png")
+    """An observation as the source of an ``img``; of a stack of grey frames the last."""
+    return source(encoded(image), "webp")
 
 
 def source(data: bytes, kind: str) -> str:

@@ -12,6 +12,8 @@ import matplotlib
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -70,6 +72,26 @@ def show_picture(place: Axes, image: NDArray[np.uint8], title: str) -> None:
         image = image[..., -1]
     place.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     place.set_title(title, fontsize=9, loc="center")
+
+
+def panels(
+    shown: Sequence[tuple[NDArray[np.uint8], str]],
+    columns: int,
+    signed: Colormap,
+) -> Figure:
+    """Pictures with titles, row by row; below them what the colours of attributions mean.
+
+    Each picture has a scale of its own, so the key has no numbers.
+    """
+    with styled():
+        figure, places = pictures(-(-len(shown) // columns), columns)
+        for place, (image, title) in zip(places, shown, strict=False):
+            show_picture(place, image, title)
+        key = ScalarMappable(Normalize(-1, 1), signed)
+        bar = figure.colorbar(key, ax=places, location="bottom", fraction=0.05, shrink=0.6, aspect=40)
+        bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
+        bar.set_label("attribution in log-odds, each picture on its own scale")
+    return figure
 
 
 def slug(text: str) -> str:

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 
 from hypogoal.data import States
 from hypogoal.domains.observations import resized_picture
-from hypogoal.evaluation.pictures import coloured, reduced
+from hypogoal.evaluation.pictures import coloured
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.observations import PICTURE, Observations, fields_of, numbers_of, spread_rows, standard_of, standardised
 
@@ -148,7 +148,7 @@ def picture_of(state: Observations, turned: Turned | None = None) -> NDArray[np.
                 inside = picture[top:bottom, left:right]
                 for edge in (inside[:width], inside[-width:], inside[:, :width], inside[:, -width:]):
                     edge[:] = FRAME
-            parts.append(reduced(picture))
+            parts.append(picture)
     if not parts:
         return None
     height = max(len(part) for part in parts)

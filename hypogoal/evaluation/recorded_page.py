@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from PIL import Image
 
 from hypogoal.core.artefacts import TO_FILL_IN, Artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.data import States, joined, open_dataset
 from hypogoal.evaluation import recorded
-from hypogoal.evaluation.page import draw_page, fixed, percent, section, source, templates
-from hypogoal.evaluation.pictures import image_png
+from hypogoal.evaluation.page import draw_page, fixed, percent, picture, section, templates
 from hypogoal.evaluation.plots import slug
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.observations import Observations, digest, spread_rows
@@ -111,10 +111,10 @@ def write_next(
     folder.mkdir(parents=True)
     lines = []
     for number, state in enumerate(states):
-        picture = recorded.picture_of(state)
-        name = "" if picture is None else f"{number + 1:03d}.png"
-        if picture is not None:
-            (folder / name).write_bytes(image_png(picture))
+        shown = recorded.picture_of(state)
+        name = "" if shown is None else f"{number + 1:03d}.png"
+        if shown is not None:
+            Image.fromarray(shown).save(folder / name)
         lines.append([name, "", int(rows[number]), digest(state).hex(), round(float(disputed[number]), 4)])
     write_table(folder / TO_FILL_IN, columns, lines)
 
@@ -123,13 +123,13 @@ def _card(
     look: Look, title: str, state: Any, scores: NDArray[np.float32], turned: recorded.Turned | None = None
 ) -> dict[str, Any] | None:
     """A state and its scores (K,); None of states without pictures."""
-    picture = recorded.picture_of(state, turned)
-    if picture is None:
+    shown = recorded.picture_of(state, turned)
+    if shown is None:
         return None
     lines = []
     for member, (score, threshold) in enumerate(zip(scores, look.thresholds, strict=True)):
         lines.append({"positive": bool(score > threshold), "text": f"member {member}: {score:.2f}"})
-    return {"source": source(image_png(picture), "png"), "title": title, "lines": lines}
+    return {"source": picture(shown), "title": title, "lines": lines}
 
 
 def _drawn_to(look: Look, member: int) -> Iterator[dict[str, Any] | None]:

@@ -37,22 +37,30 @@ def report(
     if format != "svg":
         raise UserError("--format is for --figures", format, "Give --figures DIR too, or leave it out.")
 
-    from hypogoal.evaluation.films import agents_of, films_of
+    from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
+    from hypogoal.evaluation.page import source
     from hypogoal.evaluation.plots import to_file
     from hypogoal.evaluation.questions import all_figures, render
     from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation, with_missing
 
     evaluation = evaluation_of(run)
-    agents = agents_of(run)[: 1 if videos is None else videos]
-    config = {"videos": len(agents) if videos is None else videos}
-    inputs = [evaluation.path, *(agent.path for agent in agents)]
-    with call.draft("report", config, inputs) as draft:
+    agent = None if videos == 0 else agent_to_film(run)
+    if agent is None and videos:
+        raise UserError("no agent to make videos of", run, NEEDED)
+    inputs = [evaluation.path] if agent is None else [evaluation.path, agent.path]
+    with call.draft("report", {"videos": len(inputs) - 1 if videos is None else videos}, inputs) as draft:
         results = read_evaluation(run)
-        films, missing = films_of(agents, run, videos)
-        results = with_missing(results, missing)
+        films: list[Film] = []
+        try:
+            films = films_of(agent, agent.path.relative_to(run).as_posix(), videos) if agent else []
+        except UserError as error:
+            if videos:
+                raise
+            results = with_missing(results, [f"no film of an episode: {error}"])
         with fitting(evaluation.path):
             every = all_figures(results)
-            shown = [film.told() for film in films[:1] if len(film.gif) <= MOST_BYTES]
+            small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
+            shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
             page = render(results, every, shown)
         (draft.files / "index.html").write_text(page, encoding="utf-8")
         (draft.files / "figures").mkdir()

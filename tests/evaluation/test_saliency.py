@@ -9,7 +9,6 @@ from torch import nn
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.evaluation.house import joined
 from hypogoal.evaluation.judging import Case, Judged, Judgement, Work
-from hypogoal.evaluation.pictures import attribution_image, image_png
 from hypogoal.evaluation.run import Contents
 from hypogoal.evaluation.saliency import look, pick_to_explain
 from hypogoal.hypotheses.deep_lift import (
@@ -211,10 +210,9 @@ def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
         monkeypatch.setattr(Work, "place_of", lambda work, judgement: {"artefact": "ensemble"})
         rows = joined(look(work, Judgement(0, here, split, observations[2:], None, judged)))
         group = arrays["saliency/down"]
-        assert group["observations"].shape == (2, 1, 3, 1)
-        assert group["seen"].shape == (2, 1, 2, 1)
-        np.testing.assert_allclose(group["attributions"][:, 0, 0, :, 0], [[0, 2], [1, 0]])
-        assert arrays["gallery/down/attributions"].shape == (3, 1, 1, 2)
+        assert group["observations"].shape == (3, 1, 3, 1)
+        assert group["seen"].shape == (3, 1, 2, 1)
+        np.testing.assert_allclose(group["attributions"][:, 0, 0, :, 0], [[0, 2], [1, 0], [0, 0]])
     assert work.facts["looked_at"]["sub_goals"]["down"]["kinds"] == ["true positive", "false positive"]
     errors = rows[rows["quantity"] == "completeness_error"]
     assert (
@@ -227,26 +225,10 @@ def test_the_states_that_are_explained():
     probabilities = np.array([[0.9, 0.1], [0.8, 0.9], [0.7, 0.2], [0.6, 0.8], [0.1, 0.1]], np.float32)
     labels = np.array([True, True, False, False, False])
     verdicts = probabilities > 0.5
-    assert pick_to_explain(probabilities, verdicts, labels) == [
-        (1, "true positive"), (0, "disagree"), (3, "false positive"),
-    ]  # fmt: skip
-    assert pick_to_explain(probabilities, np.zeros_like(verdicts), labels) == []
-    alone = pick_to_explain(probabilities[:, :1], verdicts[:, :1], labels)
-    assert alone == [(0, "true positive"), (2, "false positive")]
-
-
-def test_the_picture_tells_signs_apart():
-    """Figures 2 and 9: orange speaks for, blue against, white is nothing; the state shows through in grey."""
-    import io
-
-    from matplotlib.image import imread
-
-    values = np.array([[1.0, -1.0, 0.0, 0.0]])
-    image = imread(io.BytesIO(image_png(attribution_image(values, np.array([[0, 0, 0, 1.0]])))))[0, :, :3]
-    red, green, blue = image.T
-    assert red[0] > blue[0]
-    assert blue[1] > red[1]
-    assert image[2].tolist() == [1, 1, 1]
-    assert red[3] == green[3] == blue[3]
-    assert 0.6 < red[3] < 0.9
-    assert image_png(attribution_image(np.zeros((2, 2)), np.zeros((2, 2)))).startswith(b"\x89PNG")
+    everywhere = np.ones_like(labels)
+    picked = pick_to_explain(probabilities, verdicts, labels, everywhere)
+    assert picked == {"true positive": 1, "disagree": 0, "false positive": 3}
+    assert pick_to_explain(probabilities, np.zeros_like(verdicts), labels, everywhere) == {}
+    alone = pick_to_explain(probabilities[:, :1], verdicts[:, :1], labels, everywhere)
+    assert alone == {"true positive": 0, "false positive": 2}
+    assert pick_to_explain(probabilities, verdicts, labels, labels) == {"true positive": 1, "disagree": 0}

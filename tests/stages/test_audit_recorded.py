@@ -48,7 +48,7 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     assert sorted(places) == list(range(20)) and places == part["next"]
     assert all(digest(data.unlabelled()[place]).hex() == row["digest"] for place, row in zip(places, rows, strict=True))
     page = (audit / "index.html").read_text()
-    assert "To label next" in page and page.count("data:image/png") >= 20
+    assert "To label next" in page and page.count("data:image/webp") >= 20
     assert "Content-Security-Policy" in page and "http" not in page.replace("http-equiv", "")
 
 

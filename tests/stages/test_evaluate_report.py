@@ -225,7 +225,7 @@ def test_the_page_is_whole_and_needs_nothing_else(tiny_run):
     assert found.stack == []
     assert len(found.ids) == len(set(found.ids))
     inside = {f"#{identity}" for identity in found.ids}
-    drawn = tuple(f"data:image/{kind};base64," for kind in ("png", "gif", "svg+xml"))
+    drawn = tuple(f"data:image/{kind};base64," for kind in ("webp", "gif", "svg+xml"))
     assert all(link.startswith(drawn) or link in inside for link in found.links)
     assert not {"link", "iframe", "object"} & set(found.tags)
     assert not re.search(r"fetch\(|XMLHttpRequest|import\(|https?://(?!www\.w3\.org/)", "".join(found.scripts))
@@ -296,6 +296,8 @@ def test_what_cannot_be_evaluated_is_one_line(tiny_copy, tmp_path):
     """Spec G2: nothing there, or a damaged file, which is named; no half-written evaluation is left."""
     refuses("nothing to evaluate", "evaluate", tmp_path / "tiny" / "report" / "figures")
     refuses("was not evaluated", "report", tiny_copy / "report")
+    shutil.copytree(tiny_copy / "evaluation", tmp_path / "bare" / "evaluation")
+    refuses("Videos need a meta artefact", "report", tmp_path / "bare", "--videos", "1")
     path = tiny_copy / "meta" / "terminations.h5"
     path.write_bytes(path.read_bytes()[:-40])
     refuses("terminations.h5", "evaluate", tiny_copy, "--out", tiny_copy / "again", "-q")

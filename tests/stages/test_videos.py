@@ -12,8 +12,7 @@ from PIL import Image
 from hypogoal.core.artefacts import Artefact, create, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
-from hypogoal.evaluation.films import agents_of, films_of, play_films
-from hypogoal.evaluation.pictures import BAR, BOX, LINE, MARGIN, draw_frame, episode_gif, frame_lines
+from hypogoal.evaluation.films import agent_to_film, draw_frame, episode_gif, films_of, frame_lines
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
 
@@ -59,10 +58,10 @@ def test_predictions_are_those_of_the_sub_goals_members(tiny_run, frames):
 
 def test_videos_are_of_the_agents_that_choose(tiny_run):
     """Spec E1, F7: of the one that learned to choose, not of the random chooser; a frame for each of the episode's."""
-    agents = agents_of(tiny_run)
-    assert [artefact.path.name for artefact in agents] == ["meta"]
-    films = [*play_films(agents, tiny_run, 2)]
-    assert [film.name for film in films] == ["meta-episode-0.gif", "meta-episode-1.gif"]
+    agent = agent_to_film(tiny_run)
+    assert agent.path.name == "meta"
+    films = films_of(agent, "agents/meta", 2)
+    assert [film.name for film in films] == ["agents-meta-episode-0.gif", "agents-meta-episode-1.gif"]
     with Image.open(io.BytesIO(films[0].gif)) as video:
         assert video.format == "GIF"
         assert 2 < video.n_frames <= 2 * CAP + 1
@@ -79,13 +78,10 @@ def test_weights_of_another_policy_are_one_line(tiny_run, tmp_path):
         agent_of(Artefact(copied), seed=0)
 
 
-def test_a_run_without_such_an_agent_is_one_line(tmp_path):
-    """Spec G2: what is missing is named."""
+def test_a_run_without_such_an_agent_has_no_film(tmp_path):
     with create(tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0):
         pass
-    assert films_of(agents_of(tmp_path), tmp_path, None) == ([], [])
-    with pytest.raises(UserError, match="Videos need a meta artefact with learned terminations"):
-        films_of(agents_of(tmp_path), tmp_path, 1)
+    assert agent_to_film(tmp_path) is None
 
 
 def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch):
@@ -97,29 +93,26 @@ def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch
     wrong = [replace(frame, ended="the episode, unsolved"), replace(frame, predictions=(False, True))]
     plays = [[frame], *([differ, last] for last in wrong), [differ, frame], [frame]]
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: plays.pop(0))
-    (film,) = play_films(agents_of(tiny_run), tiny_run, None)
+    agent = agent_to_film(tiny_run)
+    (film,) = films_of(agent, "meta", None)
     assert film.name == "meta-episode-3.gif" and len(plays) == 1
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
-    (film,) = play_films(agents_of(tiny_run), tiny_run, None)
+    (film,) = films_of(agent, "meta", None)
     assert film.name == "meta-episode-0.gif"
 
 
 def test_what_is_drawn_of_a_frame():
-    """Spec F7: option, member, predictions and steps left in words; the bar is as long as the steps that are left."""
+    """Spec F7: option, members and predictions in words; the bar is as long as the steps that are left."""
     stack = np.zeros((84, 84, 4), np.uint8)
     stack[..., 3] = 200
     frame = Frame(stack, 12, 3, (True, False), 5, "")
-    assert frame_lines(frame, ["red", "door"], 2, 10) == ["option: door, member 1", "5 of 10 steps left", "step 12"]
+    lines = frame_lines(frame, ["red", "door"], 2)
+    assert lines == ["option: door", "  member 0: positive", "> member 1: negative", "step 12"]
     ended = replace(frame, ended="its time is up")
-    assert frame_lines(ended, ["red", "door"], 2, 10)[2] == "step 12, ends: its time is up"
-    picture = draw_frame(frame, ["red", "door"], 2, timeout=10)
+    assert frame_lines(ended, ["red", "door"], 2)[-1] == "step 12, ends: its time is up"
+    picture = np.asarray(draw_frame(frame, ["red", "door"], 2, timeout=10))
     assert picture.shape[1] == 336 and (picture[:336] == 200).all()
-    bar = picture[336 + MARGIN + LINE + BAR, MARGIN : 336 // 2]
-    assert (bar[:80] == bar[0]).all() and (bar[82:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
-    boxes = picture[336 + MARGIN + 2 * LINE + BAR // 2 + BOX // 2]
-    framed = [(boxes[MARGIN + member * 164] == bar[0]).all() for member in (0, 1)]
-    assert framed == [False, True], "the box of the member that runs has the colour of the bar"
-    differ = draw_frame(replace(frame, predictions=(False, False)), ["red", "door"], 2, timeout=10) != picture
-    assert differ[:, :168].any() and not differ[:, 168:].any(), "the other member's box alone"
+    bar = picture[336]
+    assert (bar[:168] == bar[0]).all() and (bar[170:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
     video = Image.open(io.BytesIO(episode_gif([frame, replace(frame, left=0, ended="x")], ["red", "door"], 2, 10)))
     assert video.n_frames == 2
