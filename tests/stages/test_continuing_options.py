@@ -8,8 +8,9 @@ from command_line import refuses, run, settings
 from toy_data import reseal
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.evaluation.curves import read_run
+from hypogoal.evaluation.curves import budget_of
 from hypogoal.learners import episodes
+from hypogoal.options.tables import Episodes
 
 FEW = [*settings("environments=4", "warm_up=50", "steps=200"), "-q"]
 
@@ -62,6 +63,7 @@ def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(
 
     out = tmp_path / "meta"
     run("train-meta", corridor_run / "ensemble", "--options", tmp_path / "early", "--out", out, *FEW)
-    agent = read_run(open_artefact(out), "meta")
-    assert agent.config["options_ended_at"] == early["ended_at"] and agent.budget == early["ended_at"] + 200
-    assert early["ended_at"] < agent.episodes.step[-1] <= agent.budget
+    agent = open_artefact(out)
+    budget = budget_of(agent.config)
+    assert agent.config["options_ended_at"] == early["ended_at"] and budget == early["ended_at"] + 200
+    assert early["ended_at"] < Episodes.read(out / "episodes.csv").step[-1] <= budget
