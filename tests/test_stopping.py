@@ -12,6 +12,7 @@ import pytest
 from command_line import fails
 
 from hypogoal.core.artefacts import Draft
+from hypogoal.core.checkpoints import PACE
 
 ROOT = Path(__file__).resolve().parents[1]
 WAIT_SECONDS = 300.0
@@ -52,7 +53,7 @@ def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
-def test_ctrl_c_and_sigterm_save_and_say_how_to_continue(tmp_path: Path) -> None:
+def test_ctrl_c_and_sigterm_say_how_to_continue(tmp_path: Path) -> None:
     """One line and 128 + the signal; then neither flag, or another seed, is refused in one line."""
     out = tmp_path / "ppo"
     words = ["train-baseline", "doorkey", "--out", str(out), "--set", "random_episodes=5", "-q"]
@@ -60,7 +61,8 @@ def test_ctrl_c_and_sigterm_save_and_say_how_to_continue(tmp_path: Path) -> None
         log = Draft(out).files / "metrics.jsonl"
         before = log.stat().st_size if log.exists() else 0
         command = [sys.executable, "-m", "hypogoal", *words, *resume]
-        with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        paced = {**os.environ, PACE: "0.1"}
+        with subprocess.Popen(command, cwd=ROOT, env=paced, stderr=subprocess.PIPE, text=True) as process:
             wait_for(lambda log=log, before=before: log.exists() and log.stat().st_size > before, process)  # type: ignore[misc]
             process.send_signal(number)
             _, told = process.communicate()

@@ -6,17 +6,14 @@ it back with ``restore(snapshot)``. One state is one safetensors file with its J
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import json
 import os
-import signal
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +21,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replacing
-from hypogoal.core.processes import SIGNALS
 
 State = dict[str, Any]
 
@@ -39,50 +35,22 @@ ANEW = "Give --force and no --resume to begin anew."
 class Checkpoints:
     """One state on disk, replaced from time to time; the old file stays until the new one is whole.
 
-    As a context, Ctrl-C and SIGTERM wait for the next :meth:`offer`, which saves and raises ``KeyboardInterrupt`` with
-    the signal's number. With ``path`` None nothing is ever saved.
+    With ``path`` None nothing is ever saved.
     """
 
     def __init__(self, path: Path | None):
         self.path = path
         self._fewest = float(os.environ.get(PACE, FEWEST_SECONDS))
         self._next = time.monotonic() + self._fewest
-        self._signal: int | None = None
-        self._handlers: dict[int, Any] = {}
-
-    def __enter__(self) -> Checkpoints:
-        self._signal, self._handlers = None, {}
-        with contextlib.suppress(ValueError):  # only the main thread can set handlers
-            for number in SIGNALS:
-                if signal.getsignal(number) is not signal.SIG_IGN:
-                    self._handlers[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
-        if self._signal is not None and kind is None:
-            raise KeyboardInterrupt(self._signal)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self._signal = number
-
-    @property
-    def saved(self) -> bool:
-        """Whether a checkpoint exists."""
-        return self.path is not None and self.path.is_file()
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Save ``state()`` if it is due or a signal came; after a signal raise ``KeyboardInterrupt``."""
+        """Save ``state()`` if it is due."""
         begun = time.monotonic()
-        if self._signal is None and begun < self._next:
+        if self.path is None or begun < self._next:
             return
-        if self.path is not None:
-            self.save(state())
+        self.save(state())
         now = time.monotonic()
         self._next = now + self._fewest * max(1.0, WAIT_PER_COST * (now - begun))
-        if self._signal is not None:
-            raise KeyboardInterrupt(self._signal)
 
     def save(self, state: State) -> None:
         """Write ``state``. If that fails, a ``UserError``; the previous checkpoint stays.
@@ -113,7 +81,7 @@ class Checkpoints:
         from safetensors import SafetensorError
         from safetensors.numpy import load_file
 
-        if self.path is None or not self.saved:
+        if self.path is None or not self.path.is_file():
             return None
         try:
             arrays = load_file(self.path)

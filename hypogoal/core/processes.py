@@ -4,12 +4,10 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing.process import BaseProcess
 from types import FrameType
 from typing import TypeVar
 
@@ -20,20 +18,15 @@ T = TypeVar("T")
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use
 DEVICES = ("auto", "cpu", "cuda")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
-TOGETHER = 0.5  # seconds within which signals count as one: a second one would interrupt the clean-up
-RESEND_SECONDS = 1.0
 
-_stopped_at = float("-inf")
 _turn = threading.RLock()  # a stage may call another one
 
 
 def stop(number: int, _frame: FrameType | None) -> None:
-    """A handler of signals: wherever Python is, ``KeyboardInterrupt`` with the signal's number as its argument."""
-    global _stopped_at
-    now = time.monotonic()
-    if now - _stopped_at > TOGETHER:
-        _stopped_at = now
-        raise KeyboardInterrupt(number)
+    """A handler of signals: ``KeyboardInterrupt`` wherever Python is, with the signal's number as its argument."""
+    for each in SIGNALS:  # another one would interrupt the clean-up
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt(number)
 
 
 def cores() -> int:
@@ -52,8 +45,7 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     """Run tasks, ``workers`` at once; ``done`` gets each task's number and result.
 
     One at once runs in this process, and so do all in a process that may not have others, as those of a ``Pool``. In
-    other processes tasks and results must be picklable. If a task fails, or at Ctrl-C, running ones get SIGTERM and are
-    waited for, so that they can save a checkpoint.
+    other processes tasks and results must be picklable. If a task fails, or at Ctrl-C, running ones are ended.
     """
     if min(workers, len(tasks)) <= 1 or multiprocessing.current_process().daemon:
         for number, task in enumerate(tasks):
@@ -72,7 +64,8 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         do = "Run fewer at once: --set workers=1. In a script call hypogoal below 'if __name__ == \"__main__\":'."
         raise UserError(fault, None, do) from None
     except BaseException:
-        _terminate(set(multiprocessing.active_children()) - others)
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -81,7 +74,7 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
 def _begin(environment: Mapping[str, str]) -> None:
     """What a process does first."""
     os.environ.update(environment)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C; it sends SIGTERM
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C, and ends this process
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -96,25 +89,11 @@ def _end_with_parent() -> None:
 def _run(task: Callable[[], T]) -> T:
     try:
         return task()
-    except KeyboardInterrupt:  # the pool would give this process the next task
-        os._exit(128 + signal.SIGTERM)
     except BaseException as error:
         user_error = own_code.of_user(error)  # its place is only known here: tracebacks are not sent to the parent
         if user_error is None:
             raise
         raise user_error from error
-
-
-def _terminate(processes: Iterable[BaseProcess]) -> None:
-    """Repeated until none is left.
-
-    A process that fails holds the first signal back for a checkpoint that never comes, and then waits for the next task
-    behind a lock that a killed process may hold.
-    """
-    while left := [process for process in processes if process.is_alive()]:
-        for process in left:
-            process.terminate()
-        left[0].join(RESEND_SECONDS)
 
 
 def prepare(device: str = "auto") -> str:

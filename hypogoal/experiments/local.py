@@ -85,7 +85,7 @@ def run_local(
 
 @contextmanager
 def _stopped_at_the_end(run: Path) -> Iterator[list[_Attempt]]:
-    """Attempts; those that still run at the end get SIGTERM, so that they save."""
+    """Attempts; those that still run at the end get SIGTERM."""
     running: list[_Attempt] = []
     try:
         yield running

@@ -20,7 +20,7 @@ from hypogoal.experiments.local import surroundings
 
 JOBS = "slurm/jobs"  # the numbers of the jobs last submitted, the last of them first: scancel $(cat ...)
 
-# A line of the file of cells is a cell's log, its checkpoints and its command. Two minutes before its limit it saves.
+# A line of the file of cells: a cell's log, its checkpoints, its command. It is stopped two minutes before its limit.
 SCRIPT = """#!/bin/sh
 #SBATCH --open-mode=append --requeue --signal=B:USR2@120
 cd {here} || exit 1

@@ -83,7 +83,7 @@ def train_sub_goal(
         return {"training": training.snapshot(), "log": log.snapshot()}
 
     steps = config.steps * len(training.rounds)
-    with contextlib.closing(log), Progress(f"train-ensemble {sub_goal}", steps, quiet) as progress, checkpoints:
+    with contextlib.closing(log), Progress(f"train-ensemble {sub_goal}", steps, quiet) as progress:
         progress.resume(training.step)
         for step, losses in training.steps():
             if training.due:

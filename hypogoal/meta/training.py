@@ -87,15 +87,14 @@ def train(
     else:
         log.restore(0)
     solved = recorder.episodes.solved(until)
-    with checkpoints:
-        while recorder.steps - begin < steps and not solved:
-            training.numbers |= loop.step()
-            done, solved = recorder.steps - begin, recorder.episodes.solved(until)
-            shown = {}
-            if recorder.steps - training.logged >= LOG_INTERVAL or done >= steps or solved:
-                shown = training.write(**{"until_reached": solved} if until else {})
-            progress.update(min(done, steps), **shown)
-            checkpoints.offer(training.snapshot)
+    while recorder.steps - begin < steps and not solved:
+        training.numbers |= loop.step()
+        done, solved = recorder.steps - begin, recorder.episodes.solved(until)
+        shown = {}
+        if recorder.steps - training.logged >= LOG_INTERVAL or done >= steps or solved:
+            shown = training.write(**{"until_reached": solved} if until else {})
+        progress.update(min(done, steps), **shown)
+        checkpoints.offer(training.snapshot)
     return solved
 
 

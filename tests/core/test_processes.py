@@ -4,12 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import CORES, allowed, cores, in_processes
 
@@ -44,18 +44,14 @@ def fail_after(begun: Path) -> None:
     raise ValueError("first")
 
 
-def fail_when_told_to_stop(begun: Path) -> None:
-    """Its own error is what ends it: the SIGTERM was for the next checkpoint, of which there is none."""
-    with Checkpoints(None) as checkpoints:
-        begun.touch()
-        while checkpoints._signal is None:
-            os.sched_yield()
-        raise ValueError("second")
+def sleep(begun: Path) -> None:
+    begun.touch()
+    time.sleep(600)
 
 
-def test_processes_that_fail_at_once_are_not_waited_for_for_ever(tmp_path: Path) -> None:
-    """The first error is told, with its line in user code, though the others fail of their own as they are stopped."""
-    tasks = [partial(fail, tmp_path / "begun") for fail in (fail_after, fail_when_told_to_stop)]
+def test_what_fails_ends_the_others(tmp_path: Path) -> None:
+    """At once, with the place of its error in user code."""
+    tasks = [partial(each, tmp_path / "begun") for each in (fail_after, sleep)]
     with pytest.raises(UserError, match=r"your code raised ValueError: first: test_processes.py, line \d+"):
         in_processes(tasks, 2, ignore)
 

@@ -124,4 +124,4 @@ def test_an_engine_without_snapshots_begins_anew(tmp_path: Path, monkeypatch: py
     monkeypatch.setitem(CASES, "plain", (Plain, "light", {}, "random"))
     checkpoints = Breaking(tmp_path / "checkpoint.safetensors", 6, saves=(1,))
     assert run("plain", tmp_path, checkpoints).recorder.steps == STEPS
-    assert not checkpoints.saved and checkpoints.steps == 0
+    assert checkpoints.load() is None and checkpoints.steps == 0

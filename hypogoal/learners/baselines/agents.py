@@ -198,7 +198,7 @@ def train(
         log,
         progress or Progress("", steps, quiet=True),
     )
-    with own_randomness(), checkpoints:
+    with own_randomness():
         agent = make_agent(env, chosen, seed, device)
         if isinstance(agent, ExploringDQN) and isinstance(chosen, DQNSettings):
             agent.exploration_schedule = lambda _: epsilon(
