@@ -18,8 +18,7 @@ Then `python -m examples.distilled` plays each option once in one more layout. A
         --set network=examples.distilled:Learner --set embedding=examples.distilled:Deep
 
 Agents that learn in many layouts need `--set meta_network=examples.distilled:Grid`, too, and permission for it. `Grid`
-in place of `Deep` takes a third of the time and carries over less. Measured: docs/results/distilled.md and
-distilled-agents.md.
+in place of `Deep` takes a third of the time and carries over less. Measured: docs/results/options.md and agents.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 ``view``: a window around the agent, which a network finds that learned it from labelled states' positions and from
 unlabelled ones' actions; in training batches most windows get other surroundings, all are moved and get other shades;
 positives come equally often from each ladder. ``network`` and ``threshold``: for these windows. ``termination``: of an
-option that hardly ever arrives. Commands: ``one_room.toml``. Results: ``docs/results/options-that-hold.md``.
+option that hardly ever arrives. Commands: ``one_room.toml``. Results: ``docs/results/options.md``.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class EnsembleConfig(Config):
         150,
         "gradient steps (for each member if sequential)",
         unit="batches",
-        source="own choice, the paper has none: docs/results/hypotheses-doorkey.md",
+        source="own choice, the paper has none: docs/results/hypotheses.md",
         low=1,
         high=10_000_000,
     )

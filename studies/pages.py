@@ -1,0 +1,61 @@
+"""The tables of the result pages, from the cells.
+
+    python -m studies.pages
+
+A page says with ``<!-- NAME N -->`` where table N (from 0) of those stands that the study of the CSV ``NAME`` prints;
+what follows the mark is written anew.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby
+from pathlib import Path
+
+from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders, one_room
+
+RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
+    "choosing-doorkey": choosing.tables,
+    "distilled": distilled.tables,
+    "distilled-agents": distilled.tables_of_agents,
+    "figure2-ladders": attention.tables,
+    "figure3-ladders": ladders.tables,
+    "figure4-ladders": ladder_options.tables,
+    "figure5-ladders": ladder_stops.tables,
+    "figure6-doorkey": figure6.tables,
+    "hypotheses-doorkey": hypotheses.tables,
+    "options-that-hold": one_room.tables,
+    "preference-doorkey": choosing.tables,
+    "rooms": choosing.rooms,
+}
+MARKED = re.compile(r"<!-- ([\w-]+) (\d+) -->\n(?:\|.*\n)*")
+
+
+def tables_in(lines: Iterable[str]) -> list[list[str]]:
+    """The tables among lines of Markdown, each as its lines."""
+    blocks = groupby(lines, key=lambda line: line.startswith("|"))
+    return [list(block) for is_table, block in blocks if is_table]
+
+
+def drawn(page: str) -> str:
+    """A page with its tables as the cells have them."""
+
+    def with_table(mark: re.Match[str]) -> str:
+        name, number = mark.groups()
+        tables = tables_in(TABLES[name](RESULTS / f"{name}.csv"))
+        return "\n".join([f"<!-- {name} {number} -->", *tables[int(number)], ""])
+
+    return MARKED.sub(with_table, page)
+
+
+def main() -> None:
+    """Write the tables of every page that has marks."""
+    for path in sorted(RESULTS.glob("*.md")):
+        page = path.read_text(encoding="utf-8")
+        path.write_text(drawn(page), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
