@@ -222,3 +222,18 @@ def test_formats_are_readable_without_hypogoal(
     (ensemble / "open-red-door.safetensors").write_bytes(b"changed")
     with pytest.raises(AssertionError, match="open-red-door"):
         exec(compile(snippets[1], "docs/formats.md", "exec"), {})
+
+
+def test_the_changelog_is_short() -> None:
+    """A line a change, of at most twenty words, under one of four headings; three lines a version up to 0.15."""
+    text = text_of("CHANGELOG.md")
+    assert len(text.split()) <= 2000
+    headings = ["Added", "Changed", "Fixed", "Removed"]
+    for version in text.split("\n## ")[1:]:
+        number, *lines = version.splitlines()
+        changes = [line for line in lines if line.startswith("- ")]
+        assert changes and all(len(line.split()) <= 21 for line in changes), number
+        used = re.findall(r"^### (\w+)$", version, re.M)
+        assert used == [heading for heading in headings if heading in used], number
+        early = tuple(map(int, number.split("."))) < (0, 16, 0)
+        assert (not used and len(changes) == 3) if early else used, number
