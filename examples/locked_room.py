@@ -28,10 +28,13 @@ def found(world, kind: str, colour: str | None = None):
     return next(((cell, at) for cell, at in cells if cell.type == kind and colour in (None, cell.color)), None)
 
 
-def labels(env) -> dict[str, bool]:
-    world = env.unwrapped
-    doors = {f"open-{colour}-door": found(world, "door", colour)[0].is_open for colour in COLOR_NAMES}
-    return {**doors, "hold-key": world.carrying is not None}
+def is_open(colour: str):
+    """A label: whether the door of a colour is open."""
+    return lambda env: found(env.unwrapped, "door", colour)[0].is_open
+
+
+def holds_key(env) -> bool:
+    return env.unwrapped.carrying is not None
 
 
 def towards(world, target, at_target: int) -> int:
@@ -70,6 +73,7 @@ def reach(colour: str | None):
     return policy
 
 
-SUB_GOALS = {**{f"open-{colour}-door": reach(colour) for colour in COLOR_NAMES}, "hold-key": reach(None)}
+SUB_GOALS = {**{f"open-{colour}-door": is_open(colour) for colour in COLOR_NAMES}, "hold-key": holds_key}
+POLICIES = {**{f"open-{colour}-door": reach(colour) for colour in COLOR_NAMES}, "hold-key": reach(None)}
 DEFAULTS = {"train-options": {"option_timeout": 80}, "train-meta": {"option_timeout": 80}}
-DOMAIN = GymnasiumDomain(make, tuple(SUB_GOALS), labels=labels, policy=SUB_GOALS, defaults=DEFAULTS)
+DOMAIN = GymnasiumDomain(make, SUB_GOALS, policy=POLICIES, defaults=DEFAULTS)

@@ -48,11 +48,6 @@ def at_right(env: gymnasium.Env) -> bool:
     return env.unwrapped.cell == LENGTH - 1  # type: ignore[attr-defined]
 
 
-def all_labels(env: gymnasium.Env) -> dict[str, bool]:
-    """Both in one, the other way round."""
-    return {"right-end": at_right(env), "left-end": at_left(env)}
-
-
 SUB_GOALS = {"left-end": at_left, "right-end": at_right}
 DOMAIN = GymnasiumDomain(CorridorEnv, SUB_GOALS)
 
@@ -151,15 +146,6 @@ class Stacked(CorridorEnv):
     observation_space = spaces.Box(0, 255, (4, *SHAPE[:2]), np.uint8)
 
 
-class Scaled(CorridorEnv):
-    """Its images are floats in 0..1."""
-
-    observation_space = spaces.Box(0, 1, SHAPE)
-
-    def image(self) -> np.ndarray:
-        return (super().image() / 255).astype(np.float32)
-
-
 class Turned(CorridorEnv):
     """As many bytes as its space says, in another order."""
 
@@ -172,7 +158,6 @@ def carries(env: gymnasium.Env) -> bool:
 
 GREY, STACKED, TURNED = (GymnasiumDomain(env, SUB_GOALS) for env in (Grey, Stacked, Turned))
 FRAMES = GymnasiumDomain(lambda: gymnasium.wrappers.FrameStackObservation(CorridorEnv(), 4), SUB_GOALS)
-SCALED = GymnasiumDomain(Scaled, SUB_GOALS)
 RAISING = GymnasiumDomain(CorridorEnv, {"key": carries})
 NAMELESS = GymnasiumDomain(CorridorEnv, {"rooms/low": at_left})
 TWICE = GymnasiumDomain(CorridorEnv, {"End": at_left, "end": at_right})

@@ -51,10 +51,6 @@ def labelling(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "odd": lambda env: value})
 
 
-def labelling_all(value: Any) -> GymnasiumDomain:
-    return GymnasiumDomain(CorridorEnv, ("left-end", "odd"), labels=lambda env: value)
-
-
 STEP = "the environment's step gave something else than Gymnasium says"
 FITS_NOT = "an observation that does not fit its space"
 MALFORMED: list[tuple[Any, str]] = [
@@ -67,8 +63,6 @@ MALFORMED: list[tuple[Any, str]] = [
     (with_methods(reset=lambda self, **_: (1, {})), FITS_NOT),
     (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none of Gymnasium's: NoneType"),  # type: ignore[arg-type, return-value]
     *((labelling(value), "the label of odd is no truth value") for value in ("no", NAN)),
-    (labelling_all({"left-end": True, "odd": None}), "the label of odd is no truth value"),
-    (labelling_all({"left-end": True}), "the function of all labels gave"),
 ]
 
 

@@ -74,8 +74,6 @@ class _Played:
             "images(ids, out) does not fill out",
             "Write the images into it.",
         )
-        if self.domain.doubt:
-            warnings.warn(self.domain.doubt, stacklevel=1)
         return f"{images.dtype} {images.shape[1:]}"
 
     def steps(self) -> None:
@@ -135,13 +133,13 @@ class _Played:
     def collect(self) -> str:
         """Can be stored, fits the domain, the same file for the same seed, of both classes."""
         domain, goals = self.domain, tuple(self.domain.usual_sub_goals)
-        config, progress = domain.small(self.config), Progress("check", total=1, quiet=True)
+        progress = Progress("check", total=1, quiet=True)
         files = []
         with TemporaryDirectory() as folder:
             place = Path(folder, "data.h5")
             for _ in range(2):
                 try:
-                    found = domain.collect(config, self.seed, progress)
+                    found = domain.collect(self.config, self.seed, progress)
                 except Unmet as error:
                     warnings.warn(str(error), stacklevel=1)
                     return "not looked at: play did not reach the states"

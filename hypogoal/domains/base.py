@@ -17,7 +17,6 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
-from hypogoal.domains.observations import reading_of
 from hypogoal.observations import PICTURE, Observations, Standard
 
 if TYPE_CHECKING:
@@ -303,7 +302,6 @@ class Domain(ABC):
         many_starts: ``start`` may also be several names, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
         measures: it has :meth:`distance_to`; near: the distance up to which a state counts as near a true sub-goal.
-        reading: a sentence for people on how to read its observations.
         labels_stand_in: for people, where the domain's author adds a sub-goal.
         pictures: it has :meth:`picture` and :meth:`pixel`.
     """
@@ -319,7 +317,6 @@ class Domain(ABC):
     starts: tuple[str, ...] = ()
     many_starts: bool = False
     many_layouts = False
-    reading = ""
     labels_stand_in = "its sub_goals and what its engine's labels() return"
     measures = pictures = False
     near = 0
@@ -337,11 +334,6 @@ class Domain(ABC):
     def observation_dtype(self) -> np.dtype[Any]:
         """uint8 for pictures, float32 for other observations."""
         return PICTURE
-
-    @property
-    def doubt(self) -> str:
-        """A warning if its observations are read as numbers but look like pictures; else empty."""
-        return reading_of(tuple(self.observation_shape), self.observation_dtype).doubt
 
     @abstractmethod
     def collect(self, config: Any, seed: int, progress: Any) -> Collected:
@@ -384,10 +376,6 @@ class Domain(ABC):
     def scenes(self, world: Mapping[str, Any]) -> Sequence[Scene]:
         """Pictures for a report's first screens, of what competes in the task; none where its film shows it."""
         return ()
-
-    def small(self, config: Any) -> Any:
-        """The settings with which ``check`` collects: ``config`` with fewer states."""
-        return config
 
     def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
         """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""

@@ -1,6 +1,6 @@
 """How an observation is read, by its shape and type (the table in docs/own-domain.md), and how pictures are resized.
 
-Environments and imported arrays share these rules. An ambiguous observation is refused, or comes with a warning.
+Environments and imported arrays share these rules. An ambiguous observation is refused.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ class Reading(NamedTuple):
         dtype: PICTURE or NUMBERS.
         shape: what it becomes, (H, W, C) of a picture.
         fault: why it is refused; empty if it is not.
-        doubt: a warning; empty if there is none.
         axes: of a picture, its height and width, then those that become channels: frames, and colours last. Empty if
             that is unclear.
     """
@@ -34,7 +33,6 @@ class Reading(NamedTuple):
     dtype: DType
     shape: Shape
     fault: str = ""
-    doubt: str = ""
     axes: Shape = ()
 
     def arranged(self, values: Bytes) -> Bytes:
@@ -50,12 +48,8 @@ def reading_of(shape: Shape, dtype: DType) -> Reading:
     if dtype == PICTURE:
         axes, target = _arrangement(shape)
         return Reading(PICTURE, target, _byte_fault(shape), axes=axes)
-    long_pairs = [pair for pair in pairwise(shape) if min(pair) > MOST_CHANNELS]
-    if not long_pairs:  # not shaped like a picture
-        return Reading(NUMBERS, shape)
-    if dtype.kind == "f":
-        return Reading(NUMBERS, shape, doubt=f"{dtype} {shape} is taken for numbers: give pictures as uint8 (H, W, C)")
-    return Reading(NUMBERS, shape, "could be pictures or numbers")
+    like_a_picture = any(min(pair) > MOST_CHANNELS for pair in pairwise(shape))
+    return Reading(NUMBERS, shape, "could be pictures or numbers" if like_a_picture else "")
 
 
 def _byte_fault(shape: Shape) -> str:
@@ -103,18 +97,13 @@ def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
 
 
 def shrunk_picture(picture: Bytes, longest: int) -> Bytes:
-    """A picture uint8 (H, W, C) scaled down so that its longer side has at most ``longest`` pixels."""
-    return resized_picture(picture, *shrunk_sides(picture.shape, longest))
-
-
-def shrunk_sides(shape: Shape, longest: int) -> tuple[int, int]:
-    """Height and width of a picture scaled down so that the longer side has at most ``longest`` pixels; 0: as it is."""
-    height, width = shape[:2]
+    """A picture uint8 (H, W, C) scaled down so that its longer side has at most ``longest`` pixels; 0: as it is."""
+    height, width = picture.shape[:2]
     longer = max(height, width)
     scale = min(1.0, (longest or longer) / longer)
     small_height = max(1, round(height * scale))
     small_width = max(1, round(width * scale))
-    return small_height, small_width
+    return resized_picture(picture, small_height, small_width)
 
 
 def resized_picture(picture: Bytes, height: int, width: int) -> Bytes:

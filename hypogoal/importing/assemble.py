@@ -8,7 +8,6 @@ import numpy as np
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, Integers, Labels, States, doubts_of, require_classes
-from hypogoal.domains.observations import reading_of
 from hypogoal.importing.episodes import ROLES, Array
 from hypogoal.importing.files import reading
 from hypogoal.importing.states import Frame
@@ -44,16 +43,13 @@ def assemble(
             fault = "episodes have different observations"
             raise UserError(fault, f"{first.name}, {frame.name}", "Choose some by --key.")
     parts, channels, remarks = {}, {}, []
-    for key, state in first.seen.items():
+    for key in first.seen:
         states = [frame.seen[key] for frame in frames]
         short = key.replace("/", ".") if len(first.seen) > 1 else ""
         parts[short] = together(states, names, key or "the observations")
-        doubt = reading_of(state.shape, state.dtype).doubt
         stack = first.channels[key]
         if stack:
             channels[short] = stack
-        if doubt:
-            remarks.append(doubt)
     with reading(source, "Give keys that can be file names."):
         observations = parts[""] if "" in parts else packed(parts)
     count = observations[0].size

@@ -29,8 +29,6 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     config = call.settings(name)
     settings = config.model_dump(mode="json")
     with call.draft(DATA, settings | {"domain": name}) as draft:
-        if played.doubt:
-            say(f"hypogoal: {played.doubt}", err=True)
         with Progress(f"collect {name}", total=1, quiet=call.quiet) as progress:
             collected = played.collect(config, call.seed, progress)
         write_dataset(

@@ -14,7 +14,7 @@ import pytest
 import torch
 from command_line import fails, refuses, run, settings
 from corridor import Corridor
-from corridor_env import NEVER, SUB_GOALS, CorridorEnv, all_labels, swift
+from corridor_env import NEVER, SUB_GOALS, CorridorEnv, swift
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -126,7 +126,7 @@ def test_domains_that_keep_the_contract_pass() -> None:
     laws = ["settings", "observations", "steps", "labels", "two engines", "restore", "collect"]
     assert [verdict.name for verdict in found] == laws
     assert not any(verdict.warnings for verdict in found)
-    both = GymnasiumDomain(CorridorEnv, ("left-end", "right-end"), labels=all_labels, success=swift)
+    both = GymnasiumDomain(CorridorEnv, SUB_GOALS, success=swift)
     require(check_domain(both, SMALL))
 
 

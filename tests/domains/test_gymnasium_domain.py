@@ -8,7 +8,7 @@ import corridor_env
 import gymnasium
 import numpy as np
 import pytest
-from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
+from corridor_env import DOMAIN, LENGTH, CorridorEnv
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
@@ -37,31 +37,6 @@ def test_collection_has_each_picture_once_with_its_labels() -> None:
     assert set(found.heldout.origins["layout_seed"].tolist()) <= {4, 5}
     known = {image.tobytes() for states in (found.labelled, found.unlabelled) for image in states.observations}
     assert not known & {image.tobytes() for image in found.heldout.observations}
-
-
-def test_one_function_may_say_all_labels() -> None:
-    """Spec B6: what it says goes by name, in collection and in the engine; names alone need no environment."""
-    domain = GymnasiumDomain(CorridorEnv, tuple(SUB_GOALS), labels=corridor_env.all_labels)
-    assert domain.sub_goals == DOMAIN.sub_goals
-    for one, other in zip(collected(domain).labelled.labels, collected().labelled.labels, strict=True):
-        np.testing.assert_array_equal(one, other)
-    engine, other_engine = domain.make_engine(0, 2, 30), DOMAIN.make_engine(0, 2, 30)
-    for _ in range(3):
-        for each in (engine, other_engine):
-            each.step(np.array([0, 1]))
-    np.testing.assert_array_equal(engine.labels(engine.ids), [[True, False], [False, False]])
-    for each in (engine.labels(engine.ids), other_engine.labels_now()):
-        np.testing.assert_array_equal(each, engine.labels_now())
-    assert GymnasiumDomain(lambda: 1 // 0, "won", labels=lambda env: {"won": True}).sub_goals == ("won",)  # type: ignore[arg-type, return-value]
-
-
-@pytest.mark.parametrize(("sub_goals", "labels"), [(("a", "b"), None), (SUB_GOALS, corridor_env.all_labels)])
-def test_labels_come_from_functions_or_from_one(sub_goals: Any, labels: Any) -> None:
-    """Spec G2."""
-    with pytest.raises(
-        UserError, match=r"(nothing says where sub-goals hold: a, b|and labels= too: left).* Give \{name"
-    ):
-        GymnasiumDomain(CorridorEnv, sub_goals, labels=labels)
 
 
 class Stairs(gymnasium.Env[np.ndarray, int]):
@@ -217,18 +192,3 @@ def test_the_engine_forgets_but_not_what_a_replay_holds() -> None:
     for _ in range(50):
         action = rng.integers(2, size=1)
         assert restored.step(action).next_ids == engine.step(action).next_ids
-
-
-def test_pictures_are_resized() -> None:
-    """Spec B6: for all that is made of a domain; areas are averaged, and a dictionary's picture is taken out of it."""
-    engine = corridor_env.DOMAIN.make_engine(0, 1, 30)
-    [full] = engine.images(engine.ids)
-    for env in (CorridorEnv, corridor_env.Framed, corridor_env.Grey):
-        seen = full[..., : 1 if env is corridor_env.Grey else 3]
-        for side, wanted in ((24, seen.reshape(24, 2, 24, 2, -1).mean((1, 3))), (96, seen.repeat(2, 0).repeat(2, 1))):
-            domain = GymnasiumDomain(env, SUB_GOALS, resize=side)
-            assert domain.observation_shape == domain.make_env().observation_space.shape == (side, *wanted.shape[1:])
-            engine = domain.make_engine(0, 1, 30)
-            assert np.abs(engine.images(engine.ids)[0] - wanted).max() <= 0.5
-    with pytest.raises(UserError, match=r"only pictures can be resized: .*place.* Leave out resize\."):
-        GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, resize=84).make_env()

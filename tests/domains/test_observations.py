@@ -14,12 +14,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from command_line import run, settings
 from gymnasium import spaces
 from test_numbers import Says
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import open_dataset
 from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.importing.taken import take
 from hypogoal.observations import PICTURE
@@ -60,7 +58,7 @@ def drawn_observation(rng: random.Random) -> tuple[tuple[int, ...], str]:
 
 
 def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
-    """What such an observation is taken for: ``picture``, ``numbers``, ``doubtful`` numbers, or ``refused``.
+    """What such an observation is taken for: ``picture``, ``numbers``, or ``refused``.
 
     An ``AssertionError`` where environment and array differ, or it was guessed.
     """
@@ -69,7 +67,7 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
     of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: take(state, "the state"))
     assert bool(of_env) == bool(of_array), (of_env, of_array)
     if of_env:
-        assert dtype == "uint8" or (wide and "float" not in dtype), of_env
+        assert dtype == "uint8" or wide, of_env
         return "refused"
     look, (taken, _) = reader_of(env), take(state, "the state")
     assert taken.shape == look.shape and (taken.dtype == look.dtype or look.dtype != PICTURE)
@@ -77,8 +75,8 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
     if look.dtype == PICTURE:
         assert dtype == "uint8" and len(shape) in (2, 3)
         return "picture"
-    assert bool(look.doubt) == wide and ("float" in dtype or not wide)
-    return "doubtful" if look.doubt else "numbers"
+    assert not wide
+    return "numbers"
 
 
 def _refusal(call: Callable[[], object]) -> str:
@@ -93,7 +91,7 @@ def _refusal(call: Callable[[], object]) -> str:
 @pytest.mark.parametrize(("dtype", "shape", "outcome"), CASES)
 def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outcome: str) -> None:
     """Spec B6: each of its examples, in an environment and in an array."""
-    words = {"picture": "a picture", "doubtful": "numbers, with a warning"}
+    words = {"picture": "a picture"}
     found = outcome_of(shape, dtype)
     assert words.get(found, found) == outcome.removesuffix(", `(H, W, 1)`")
     if outcome.endswith("`(H, W, 1)`"):
@@ -103,7 +101,7 @@ def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outco
 def test_the_table_has_all_types_and_every_outcome() -> None:
     assert {case.values[0] for case in CASES} >= set(DTYPES)
     assert {case.values[2] for case in CASES} == {
-        "a picture", "a picture, `(H, W, 1)`", "numbers", "numbers, with a warning", "refused",
+        "a picture", "a picture, `(H, W, 1)`", "numbers", "refused",
     }  # fmt: skip
 
 
@@ -111,7 +109,7 @@ def test_whatever_the_shape_nothing_is_guessed() -> None:
     """Spec B6, G2: environments and arrays agree."""
     rng = random.Random(0)
     outcomes = Counter(outcome_of(*drawn_observation(rng)) for _ in range(200))
-    assert min(outcomes[name] for name in ("picture", "numbers", "doubtful", "refused")) >= 10
+    assert min(outcomes[name] for name in ("picture", "numbers", "refused")) >= 10
 
 
 def test_frames_and_colours_are_stacked_in_their_order() -> None:
@@ -128,26 +126,10 @@ def test_frames_and_colours_are_stacked_in_their_order() -> None:
 def test_a_dictionary_hides_no_picture() -> None:
     """Spec B6: stacks, floats and integers in the shape of pictures are no more guessed in there than alone."""
     speed = spaces.Box(0, 1, (2,))
-    for shape, dtype in (((4, 48, 48, 3), np.uint8), ((48, 48), np.int64), ((3, 48, 48), np.uint8)):
+    for shape, dtype in (((4, 48, 48, 3), np.uint8), ((48, 48), np.int64), ((48, 48, 3), np.float32)):
         space = spaces.Dict(a=speed, b=spaces.Box(0, 1, shape, dtype))
-        with pytest.raises(UserError, match=r"observations .*: b, u?int.* Give pictures as uint8 \(H, W, C\), "):
+        with pytest.raises(UserError, match=r"observations .*: b, (u?int|float).* Give pictures as uint8 \(H"):
             reader_of(Says(space, None))
         alone = Says(spaces.Dict(b=space["b"]), {"b": np.ones(shape, dtype)})
-        with pytest.raises(UserError, match=r"observations .*: b, u?int"):
+        with pytest.raises(UserError, match=r"observations .*: b, (u?int|float)"):
             reader_of(alone)
-    space = spaces.Dict(a=speed, b=spaces.Box(0, 1, (48, 48, 3)))
-    assert "float32 (48, 48, 3) is taken for numbers: give pictures as uint8" in reader_of(Says(space, None)).doubt
-
-
-def test_floats_that_may_be_pictures_are_warned_of(tmp_path: Path) -> None:
-    """Spec B6: when they are collected, checked or imported, with what pictures are."""
-    few = settings("steps=60", "heldout_seeds=4")
-    doubt = "float32 (48, 48, 3) is taken for numbers: give pictures as uint8 (H, W, C)"
-    assert doubt in run("collect", "corridor_env:SCALED", "--out", tmp_path / "data.h5", *few, "-q").err
-    assert doubt in " ".join(run("check", "corridor_env:SCALED", *few).out.split())
-    dataset = open_dataset(tmp_path / "data.h5")
-    labelled, others = dataset.labelled("left-end"), dataset.unlabelled()
-    arrays = {"observations": labelled.observations, "labels": labelled.labels, "unlabelled": others[:1]}
-    arrays |= {"heldout_observations": others[1:], "heldout_labels": np.arange(len(others) - 1) % 2}
-    np.savez(tmp_path / "states.npz", **arrays)
-    assert doubt in run("import", tmp_path / "states.npz", "--out", tmp_path / "again.h5", "-q").err

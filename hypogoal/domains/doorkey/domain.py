@@ -74,7 +74,6 @@ class DoorKeyDomain(Domain):
     """Spec B6: three-key DoorKey."""
 
     name = "doorkey"
-    reading = "The triangle is the agent; a key that it carries has left the grid."
     sub_goals = env.SUB_GOALS
     observation_shape = env.OBSERVATION_SHAPE
     config_class = DoorKeyConfig

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import gymnasium
+from gymnasium import spaces
 
 from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain
-from hypogoal.domains.gymnasium import engine as engines
-from hypogoal.domains.gymnasium.engine import GymnasiumEngine, Labels, make_checked
+from hypogoal.domains.gymnasium.engine import MEMORY, GymnasiumEngine, Label, Success
 from hypogoal.domains.gymnasium.play import Policy, collect
-from hypogoal.domains.gymnasium.reader import Reader, reader_of, resized
+from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.observations import DType, Shape
 
 
@@ -51,8 +51,7 @@ class GymnasiumDomain(Domain):
             shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of ``reset`` sets the layout: the same
             seed and actions give the same episode. Its arguments are the domain's own settings, see ``config_class``.
         sub_goals: by name, a function of the environment that returns whether the sub-goal holds in its current state,
-            whatever came before; or names alone, with ``labels``.
-        labels: with names alone, one function from the environment to ``{name: bool}`` for all of them.
+            whatever came before.
         success: called at the end of each training episode, returns whether it was a success: a function of the
             environment, the last step's info, the episode's sum of rewards, and whether it terminated. None: an episode
             succeeds when it terminates with a sum above 0.
@@ -61,7 +60,6 @@ class GymnasiumDomain(Domain):
         defaults: by stage, settings that suit this domain: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: the number of distinct states whose observations training keeps, see ``GymnasiumEngine``.
         features: names of the numbers in observations other than pictures; default: those of a ``Dict``, or x0, x1, ...
-        resize: the side in pixels to which pictures are resized; 0: no resizing.
         name: for messages; artefacts use the name that the user passed to ``collect``.
         config_class: a class derived from ``GymnasiumConfig`` that adds settings; ``make`` gets them in collection,
             training, baselines and evaluation.
@@ -76,45 +74,40 @@ class GymnasiumDomain(Domain):
 
     def __init__(
         self,
-        make: engines.MakeEnv,
-        sub_goals: Mapping[str, engines.Label] | Sequence[str],
+        make: Callable[..., gymnasium.Env],
+        sub_goals: Mapping[str, Label],
         *,
-        labels: engines.LabelAll | None = None,
-        success: engines.Success | None = None,
+        success: Success | None = None,
         policy: Policy | Mapping[str, Policy | None] | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
-        memory: int = engines.MEMORY,
+        memory: int = MEMORY,
         features: Sequence[str] = (),
-        resize: int = 0,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
-        self.make, self.memory, self.name = make, memory, name
-        self.success, self._named, self.resize = success, tuple(features), resize
+        self.make, self.success, self.memory, self.name = make, success, memory, name
+        self.label_functions, self.sub_goals = sub_goals, tuple(sub_goals)
+        self.defaults = defaults or {}
+        self._features = tuple(features)
         self.config_class = config_class
-        shared = GymnasiumConfig.model_fields
-        self.engine_settings = tuple(name for name in config_class.model_fields if name not in shared)
-        self.labels = Labels(sub_goals, labels)
-        self.sub_goals = self.labels.names
-        self.defaults = dict(defaults or {})
-        by_goal = policy if isinstance(policy, Mapping) else {}
-        self.policies: tuple[Policy | None, ...] = tuple(by_goal.values())
-        if not by_goal:
-            self.policies = (None if isinstance(policy, Mapping) else policy,)
-        if not by_goal.keys() <= {*self.sub_goals}:
-            do = f"These are {', '.join(self.sub_goals)}."
-            raise UserError("policies are given by sub-goal", ", ".join(by_goal), do)
+        own = config_class.model_fields.keys() - GymnasiumConfig.model_fields
+        self.engine_settings = tuple(name for name in config_class.model_fields if name in own)
+        policies = policy if isinstance(policy, Mapping) else {"": policy}
+        self.policies = tuple(policies.values())
+        if isinstance(policy, Mapping) and not policy.keys() <= sub_goals.keys():
+            do = f"These are {', '.join(sub_goals)}."
+            raise UserError("policies are given by sub-goal", ", ".join(policy), do)
 
     @cached_property
     def reader(self) -> Reader:
         """Reads its observations."""
-        env = make_checked(self.make_env)
+        env = self.make_env()
         reader = reader_of(env)
         env.close()
-        if self._named and len(self._named) != len(reader.features):
-            counts = f"{len(self._named)} for {len(reader.features)}"
+        if self._features and len(self._features) != len(reader.features):
+            counts = f"{len(self._features)} for {len(reader.features)}"
             raise UserError("the number of feature names is wrong", counts, "Give one for each.")
-        return replace(reader, features=self._named or reader.features)
+        return replace(reader, features=self._features or reader.features)
 
     @property
     def observation_shape(self) -> Shape:
@@ -125,36 +118,29 @@ class GymnasiumDomain(Domain):
         return self.reader.dtype
 
     @property
-    def doubt(self) -> str:
-        return self.reader.doubt
-
-    @property
     def has_env(self) -> bool:
         return True
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """An environment; ``arguments``: the domain's own settings, defaults for those left out."""
+        """An environment; ``arguments``: the domain's own settings, defaults for those left out.
+
+        One that is none of Gymnasium's, or whose actions are not ``Discrete``, is a ``UserError``.
+        """
         fields = self.config_class.model_fields
         defaults = {name: fields[name].default for name in self.engine_settings}
-        env = self.make(**{**defaults, **arguments})
-        return resized(env, self.resize) if self.resize else env
+        env: Any = self.make(**{**defaults, **arguments})
+        if not isinstance(env, gymnasium.Env):
+            do = "Give a function that returns a gymnasium.Env."
+            raise UserError("the environment is none of Gymnasium's", type(env).__name__, do)
+        actions = env.action_space
+        if not isinstance(actions, spaces.Discrete) or actions.start != 0:
+            raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
+        return env
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
         """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory`` and the domain's own settings."""
-        memory = arguments.pop("memory", self.memory)
         layouts = arguments.pop("layouts", layout_seed)
-        return GymnasiumEngine(
-            partial(self.make_env, **arguments),
-            self.labels,
-            layouts,
-            count,
-            max_steps=max_steps,
-            memory=memory,
-            success=self.success,
-        )
-
-    def small(self, config: GymnasiumConfig) -> GymnasiumConfig:
-        return config.model_copy(update={"states": min(config.states, 200)})
+        return GymnasiumEngine(self, layouts, count, max_steps=max_steps, **{"memory": self.memory, **arguments})
 
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
         return collect(self, config, seed, progress)

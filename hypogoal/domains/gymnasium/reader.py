@@ -14,9 +14,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hypogoal.core.arrays import Bytes
 from hypogoal.core.errors import UserError
-from hypogoal.domains.observations import CLEARLY, Reading, reading_of, resized_picture
+from hypogoal.domains.observations import CLEARLY, reading_of
 from hypogoal.observations import NUMBERS, PICTURE, DType, Shape, mixed_type
 
 UNREADABLE = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
@@ -29,7 +28,6 @@ class Reader:
 
     Attributes:
         features: the names of numbers, those of a ``Dict`` by its keys.
-        doubt: a warning that numbers may be meant as a picture; empty if there is none.
         key: of a ``Dict`` that holds nothing but a picture, the picture's.
         parts: by key, the readers of a ``Dict`` of pictures and numbers.
     """
@@ -38,7 +36,6 @@ class Reader:
     shape: Shape
     dtype: DType
     features: tuple[str, ...] = ()
-    doubt: str = ""
     key: str = ""
     parts: Mapping[str, Reader] = field(default_factory=dict)
 
@@ -77,26 +74,23 @@ def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
     """A reader of a space, or of what a ``Dict`` has under ``key``."""
     if isinstance(space, spaces.Dict) and any(map(_is_picture, space.values())):
         return _by_key(space)
-    if isinstance(space, spaces.Box):
-        reading = _reading(space)
-        if reading.fault:
-            received = f"{space.dtype} {space.shape}"
-            where = f"{key}, {received}" if key else received
-            raise UserError(f"observations {reading.fault}", where, CLEARLY)
-        if reading.dtype == PICTURE:
-            return Reader(space, reading.shape, PICTURE)
+    if not isinstance(space, spaces.Box):
+        return _numbers(space)
+    reading = reading_of(space.shape, space.dtype)
+    if reading.fault:
+        received = f"{space.dtype} {space.shape}"
+        where = f"{key}, {received}" if key else received
+        raise UserError(f"observations {reading.fault}", where, CLEARLY)
+    if reading.dtype == PICTURE:
+        return Reader(space, reading.shape, PICTURE)
     return _numbers(space)
-
-
-def _reading(space: spaces.Box) -> Reading:
-    return reading_of(space.shape, space.dtype)
 
 
 def _is_picture(space: spaces.Space[Any]) -> bool:
     """Whether this is a picture, or refused because it may be."""
     if not isinstance(space, spaces.Box):
         return False
-    reading = _reading(space)
+    reading = reading_of(space.shape, space.dtype)
     return reading.dtype == PICTURE or bool(reading.fault)
 
 
@@ -112,26 +106,22 @@ def _by_key(space: spaces.Dict) -> Reader:
     except (ValueError, KeyError, TypeError):
         do = "Give a Dict of pictures and numbers, with keys that can be file names."
         raise UserError("the entries of the observations cannot be read by their keys", space, do) from None
-    doubt = max(part.doubt for part in parts.values())
-    return Reader(space, (), dtype, doubt=doubt, parts=parts)
+    return Reader(space, (), dtype, parts=parts)
 
 
 def _numbers(space: spaces.Space[Any]) -> Reader:
     """A reader of a space without pictures, which Gymnasium flattens."""
     features: list[str] = []
-    doubts = [""]
-    for name, part in _leaves(space):
+    leaves = list(_leaves(space))
+    for name, part in leaves:
         if _is_picture(part):
-            names = [leaf for leaf, _ in _leaves(space)]
             do = "Give a Dict with each picture under a key of its own, beside those of numbers."
-            raise UserError(MIXED, ", ".join(names), do)
-        if isinstance(part, spaces.Box):
-            doubts.append(_reading(part).doubt)
+            raise UserError(MIXED, ", ".join(name for name, _ in leaves), do)
         features += _names(name, part)
     shape: Shape = (len(features),)
     if isinstance(space, spaces.Box) and space.shape:
         shape = space.shape
-    return Reader(space, shape, NUMBERS, tuple(features), max(doubts))
+    return Reader(space, shape, NUMBERS, tuple(features))
 
 
 def _leaves(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -157,17 +147,3 @@ def _names(name: str, space: spaces.Space[Any]) -> list[str]:
     if size == 1:
         return [name]
     return [f"{name}[{place}]" for place in range(size)]
-
-
-def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
-    """The environment with pictures of side x side pixels, means over areas; ``UserError`` without pictures."""
-    reader = reader_of(env)
-    if reader.dtype != PICTURE:
-        raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
-
-    def small(observation: Any) -> Bytes:
-        return resized_picture(reader.read(observation), side, side)
-
-    channels = reader.shape[-1]
-    space = spaces.Box(0, 255, (side, side, channels), np.uint8)
-    return gymnasium.wrappers.TransformObservation(env, small, space)
