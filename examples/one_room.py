@@ -20,7 +20,7 @@ from hypogoal.core.config import Config, setting
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
-from hypogoal.domains.montezuma.emulator import observed_pixel
+from hypogoal.domains.montezuma.emulator import SCREEN, SIDE, pixel
 from hypogoal.hypotheses.networks import folded
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
 from hypogoal.options.termination import Terminations
@@ -57,6 +57,13 @@ class AgentViewSettings(Config):
 
     jitter: int = setting(3, "the most by which a window of a training batch is moved", unit="pixels", low=0, high=20)
     localiser_steps: int = setting(1500, "gradient steps of the network that finds the agent", low=1, high=1_000_000)
+
+
+def observed_pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The agent's middle in an 84x84 observation, the resized picture: row, column (n, 2), for room, x, y (n, 3)."""
+    scale = np.array([SIDE, SIDE]) / SCREEN
+    rows_and_columns = pixel(positions)[:, ::-1]
+    return (rows_and_columns + 0.5) * scale - 0.5
 
 
 class AgentView(View):

@@ -28,7 +28,7 @@ BUILT_IN = {
     "rooms": "hypogoal.domains.rooms.domain:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
-STEP_KINDS = (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b"))
+STEP_KINDS = {"next_ids": "iu", "rewards": "iuf", "terminated": "b", "truncated": "b", "succeeded": "b"}
 REGISTERED: dict[str, Domain] = {}  # domains that the running program defined, by name
 IMPORTED = "imported"  # the domain of states that 'hypogoal import' got without --domain
 
@@ -50,14 +50,6 @@ class Step(NamedTuple):
     terminated: Bools
     truncated: Bools
     succeeded: Bools | None = None
-
-
-class Scene(NamedTuple):
-    """A picture, uint8 (H, W, 3), its title, and whether each feature that it is about holds in it."""
-
-    picture: Bytes
-    title: str
-    features: Mapping[str, bool]
 
 
 class Plan(NamedTuple):
@@ -302,7 +294,6 @@ class Domain(ABC):
         many_starts: ``start`` may also be several names, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
         measures: it has :meth:`distance_to`; near: the distance up to which a state counts as near a true sub-goal.
-        labels_stand_in: for people, where the domain's author adds a sub-goal.
         pictures: it has :meth:`picture` and :meth:`pixel`.
     """
 
@@ -317,7 +308,6 @@ class Domain(ABC):
     starts: tuple[str, ...] = ()
     many_starts: bool = False
     many_layouts = False
-    labels_stand_in = "its sub_goals and what its engine's labels() return"
     measures = pictures = False
     near = 0
 
@@ -373,10 +363,6 @@ class Domain(ABC):
         """
         return f"The reward and the end of an episode are those of the domain '{self.name}'."
 
-    def scenes(self, world: Mapping[str, Any]) -> Sequence[Scene]:
-        """Pictures for a report's first screens, of what competes in the task; none where its film shows it."""
-        return ()
-
     def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
         """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
         raise NotImplementedError
@@ -397,13 +383,11 @@ class Domain(ABC):
 def check_step(engine: Engine, step: Any) -> None:
     """Refuse (``UserError``) a malformed step of an engine; loops call it for the first one."""
     where = type(engine).__name__
-    do = f"Give a Step of arrays of length {engine.count}, of the types in hypogoal.domains.base.Step."
-    if not isinstance(step, Step):
-        raise UserError(f"the engine's step gave a {type(step).__name__}, not a Step", where, do)
-    kinds = STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b"))
-    for name, letters in kinds:
-        values = getattr(step, name)
-        if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in letters:
+    for name, letters in STEP_KINDS.items():
+        values = np.asarray(getattr(step, name, None))
+        missing = name == "succeeded" and values.dtype == object  # None
+        if not missing and (values.shape != (engine.count,) or values.dtype.kind not in letters):
+            do = f"Give a Step of arrays of length {engine.count}, of the types in hypogoal.domains.base.Step."
             raise UserError(f"the engine's step gave {name} {values!r}", where, do)
     if not np.isfinite(step.rewards).all():
         raise UserError(f"the engine's step gave the rewards {step.rewards}", where, "Give finite numbers.")
@@ -468,5 +452,5 @@ def settings_of(
     ``inherited`` are of the options that the stage continues. What is unknown or not allowed is a ``UserError``.
     """
     model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
-    *defaults, of_preset = [values for values, _ in layers_of(stage, domain, preset_name)]
-    return resolve(model, *defaults, of_preset, inherited or {}, typed or {}, stage=stage)
+    layers = [values for values, _ in layers_of(stage, domain, preset_name)]
+    return resolve(model, *layers, inherited or {}, typed or {}, stage=stage)

@@ -132,7 +132,7 @@ def missing(work: Work) -> list[str]:
         do = "import them under one of these names, if it is one of them"
         for sub_goal in artefact.config["sub_goals"]:
             if sub_goal not in domain.sub_goals:
-                do = do if name in BUILT_IN else f"add {sub_goal} to {domain.labels_stand_in}"
+                do = do if name in BUILT_IN else f"add {sub_goal} to the domain's sub_goals"
                 has = f"{name} has {listed(domain.sub_goals)}"
                 lines.append(f"no truth of {sub_goal} to match members with: {has}; {do}, then evaluate again")
     return list(dict.fromkeys(lines))

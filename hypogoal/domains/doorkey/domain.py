@@ -3,8 +3,8 @@
 See also ``env`` (the Gymnasium environment and the sub-goals) and ``engine`` (many environments, fast).
 """
 
-import itertools
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,18 +43,22 @@ class DoorKeyConfig(Config):
     )
 
 
+def _grid_of(layout_seed: int) -> env.Layout:
+    """A layout without its agent: those with the same grid have the same states."""
+    return replace(env.layout_of(layout_seed), start=0, direction=0)
+
+
 def _heldout_seeds(config: DoorKeyConfig) -> list[int]:
     """The first layout seeds from ``heldout_first`` on whose grids are new."""
-    training = (config.labelled_seed, *config.unlabelled_seeds)
-    grids = {env.layout_of(layout_seed).grid for layout_seed in training}
+    grids = set(map(_grid_of, (config.labelled_seed, *config.unlabelled_seeds)))
     chosen: list[int] = []
-    for layout_seed in itertools.count(config.heldout_first):
-        if len(chosen) == config.heldout_layouts:
-            break
-        grid = env.layout_of(layout_seed).grid
+    layout_seed = config.heldout_first
+    while len(chosen) < config.heldout_layouts:
+        grid = _grid_of(layout_seed)
         if grid not in grids:
             grids.add(grid)
             chosen.append(layout_seed)
+        layout_seed += 1
     return chosen
 
 

@@ -29,7 +29,6 @@ from hypogoal.domains.doorkey.env import (
     OBSERVATION_SHAPE,
     SIZE,
     TILE,
-    Layout,
     layout_of,
     sub_goals_reached,
 )
@@ -149,7 +148,6 @@ class DoorKeyEngine(Engine):
         self.door_label = door_label
         self.harsh = wrong_key == "ends"
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
-        self.known: dict[int, Layout] = {}  # layouts played, by seed
         self.changes: dict[int, int] = {}  # computed next configurations, by configuration, cell, action
         # For each configuration: its layout's seed; the door's cell; its state and the keys' places; its cell codes
         # without the agent; ids by pose.
@@ -185,18 +183,13 @@ class DoorKeyEngine(Engine):
 
     def _start(self, seed: int) -> int:
         """The start state of a layout."""
-        layout = self._layout(seed)
+        layout = layout_of(seed)
         configuration = self._number_of((seed, LOCKED, *layout.keys))
         pose = layout.start * 4 + layout.direction
         return self._id_of(configuration * POSES + pose)
 
     def _starts_of(self, seeds: Sequence[int]) -> Ints:
         return np.array([self._start(seed) for seed in seeds])
-
-    def _layout(self, seed: int) -> Layout:
-        if seed not in self.known:
-            self.known[seed] = layout_of(seed)
-        return self.known[seed]
 
     def step(self, actions: Ints) -> Step:
         following = self.follow(self.ids, actions)
@@ -416,7 +409,7 @@ class DoorKeyEngine(Engine):
             return state
         new = self.n_states
         if new == len(self._site):
-            self._make_room(*PER_STATE)
+            self._double(PER_STATE)
             self._code_bytes = self._codes.data.cast("B")
         configuration, pose = divmod(site, POSES)
         cell, direction = divmod(pose, 4)
@@ -425,17 +418,13 @@ class DoorKeyEngine(Engine):
         self._code_bytes[new * CELLS : (new + 1) * CELLS] = row
         self._site[new] = site
         self._ahead[new] = configuration * CELLS + _AHEAD[pose]
-        layout = self.known[self._seeds[configuration]]
-        at_goal = cell == layout.goal
+        at_goal = cell == layout_of(self._seeds[configuration]).goal
         self._on_goal[new] = at_goal
-        self._final[new] = at_goal or (self.harsh and self._holds_wrong_key(configuration))
+        holds_wrong_key = self._places[configuration, 1:3].max() >= HELD
+        self._final[new] = at_goal or (self.harsh and holds_wrong_key)
         self._id_at[configuration, pose] = new
         self.n_states += 1
         return new
-
-    def _holds_wrong_key(self, configuration: int) -> bool:
-        blue_and_green = self._places[configuration, 1:3]
-        return bool((blue_and_green >= HELD).any())
 
     def _number_of(self, configuration: Configuration) -> int:
         """The number of a configuration, a new one if it has none."""
@@ -444,9 +433,9 @@ class DoorKeyEngine(Engine):
             return number
         new = self._numbers[configuration] = len(self._seeds)
         if new == len(self._places):
-            self._make_room(*PER_CONFIGURATION)
+            self._double(PER_CONFIGURATION)
         seed, door, *keys = configuration
-        layout = self._layout(seed)
+        layout = layout_of(seed)
         row = bytearray(CELLS)  # faster than an array
         for cell in layout.walls:
             row[cell] = WALL
@@ -461,7 +450,7 @@ class DoorKeyEngine(Engine):
         self._places[new] = door, *keys
         return new
 
-    def _make_room(self, *names: str) -> None:
+    def _double(self, names: Sequence[str]) -> None:
         """Double the rows of these tables."""
         for name in names:
             setattr(self, name, _doubled(getattr(self, name)))

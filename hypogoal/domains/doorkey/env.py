@@ -4,6 +4,7 @@ This is the reference: the fast engine (``engine.py``) is tested to be pixel- an
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -58,10 +59,11 @@ class Layout:
     direction: int  # 0 right, 1 down, 2 left, 3 up
     keys: tuple[int, int, int]  # the cells of the blue, the green and the red key
 
-    @property
-    def grid(self) -> tuple[frozenset[int], int, int, tuple[int, int, int]]:
-        """All but the agent: layouts with the same grid have the same states."""
-        return self.walls, self.door, self.goal, self.keys
+
+def cell_of(place: Any) -> int:
+    """The cell at a place x, y."""
+    x, y = place
+    return int(y) * SIZE + int(x)
 
 
 class _RingDoor(Door):
@@ -98,10 +100,9 @@ class DoorKeyGrid(MiniGridEnv):
         wrong_key: str = "harmless",
         render_mode: str | None = None,
     ):
-        if door_label not in DOOR_LABELS:
-            raise ValueError(f"door_label must be one of {DOOR_LABELS}, not {door_label!r}")
-        if wrong_key not in WRONG_KEYS:
-            raise ValueError(f"wrong_key must be one of {WRONG_KEYS}, not {wrong_key!r}")
+        for value, known in ((door_label, DOOR_LABELS), (wrong_key, WRONG_KEYS)):
+            if value not in known:
+                raise ValueError(f"{value!r} is none of {known}")
         self.layout_seed = layout_seed
         self.door_label, self.wrong_key = door_label, wrong_key
         self.ring: list[Key] = []
@@ -125,14 +126,25 @@ class DoorKeyGrid(MiniGridEnv):
         self.ring = []
         self.grid = Grid(width, height)
         self.grid.wall_rect(0, 0, width, height)
-        self.put_obj(Goal(), width - 2, height - 2)
+        goal = (width - 2, height - 2)
+        self.put_obj(Goal(), *goal)
         split = self._rand_int(2, width - 2)
         self.grid.vert_wall(split, 0)
         self.place_agent(size=(split, height))
         self.door = _RingDoor(DOOR_COLOUR, is_locked=True)
-        self.put_obj(self.door, split, self._rand_int(1, width - 2))
+        door = (split, self._rand_int(1, width - 2))
+        self.put_obj(self.door, *door)
+        keys = {}
         for colour in PLACING_ORDER:
-            self.place_obj(Key(colour), top=(0, 0), size=(split, height))
+            keys[colour] = cell_of(self.place_obj(Key(colour), top=(0, 0), size=(split, height)))
+        self.layout = Layout(
+            walls=frozenset(cell for cell, content in enumerate(self.grid.grid) if isinstance(content, Wall)),
+            door=cell_of(door),
+            goal=cell_of(goal),
+            start=cell_of(self.agent_pos),
+            direction=int(self.agent_dir),
+            keys=(keys["blue"], keys["green"], keys["red"]),
+        )
         self.mission = MISSION
         self._np_random = episode_rng
 
@@ -176,26 +188,6 @@ class DoorKeyGrid(MiniGridEnv):
     def _named_labels(self) -> dict[str, bool]:
         return dict(zip(SUB_GOALS, self.labels().tolist(), strict=True))
 
-    def layout(self) -> Layout:
-        """The layout of the current episode, read off the grid; valid only right after ``reset``."""
-        x, y = self.agent_pos
-        where: dict[Any, int] = {}
-        walls = set()
-        for cell, content in enumerate(self.grid.grid):
-            if isinstance(content, Wall):
-                walls.add(cell)
-            elif content is not None:
-                where[content.color if isinstance(content, Key) else type(content)] = cell
-        return Layout(
-            walls=frozenset(walls),
-            door=where[_RingDoor],
-            goal=where[Goal],
-            start=int(y) * SIZE + int(x),
-            direction=int(self.agent_dir),
-            keys=(where["blue"], where["green"], where["red"]),
-        )
-
-
 class DoorKeyEnv(DoorKeyGrid):
     """Spec B1: three-key DoorKey, observed as the full RGB image, uint8 (64, 64, 3), without a view cone.
 
@@ -213,8 +205,9 @@ class DoorKeyEnv(DoorKeyGrid):
         return self.grid.render(TILE, (x, y), self.agent_dir)
 
 
+@cache
 def layout_of(layout_seed: int) -> Layout:
     """The layout of ``DoorKeyEnv(layout_seed=layout_seed)``."""
     env = DoorKeyGrid(layout_seed=layout_seed)
     env.reset()
-    return env.layout()
+    return env.layout

@@ -70,7 +70,6 @@ class GymnasiumDomain(Domain):
     """
 
     many_layouts = True
-    labels_stand_in = "the sub-goals of its GymnasiumDomain, with a function that says where it holds"
 
     def __init__(
         self,

@@ -29,15 +29,17 @@ def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, di
     result = env.step(action)
     try:
         observation, reward, terminated, truncated, info = result
-        reward = float(reward)
-        fits = math.isfinite(reward) and isinstance(info, dict)
-        fits = fits and is_truth(terminated) and is_truth(truncated)
+        earned = float(reward)
+        fits = math.isfinite(earned)
+        fits = fits and is_truth(terminated)
+        fits = fits and is_truth(truncated)
+        fits = fits and isinstance(info, dict)
     except (TypeError, ValueError):
         fits = False
     if not fits:
         do = "Give (observation, reward, terminated, truncated, info): a finite number, True or False twice, a dict."
         raise UserError("the environment's step gave something else than Gymnasium says", f"{result!r:.200}", do)
-    return observation, reward, bool(terminated), bool(truncated), info
+    return observation, earned, bool(terminated), bool(truncated), info
 
 
 def is_truth(value: Any) -> bool:

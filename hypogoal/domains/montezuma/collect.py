@@ -49,9 +49,8 @@ def chosen(config: MontezumaConfig) -> list[SubGoal]:
 
 def labelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
     """The rooms of the first N groups of each sub-goal."""
-    rooms: list[int] = []
-    for sub_goal in chosen(config):
-        rooms += chain.from_iterable(sub_goal.groups[: config.groups])
+    groups = [sub_goal.groups[: config.groups] for sub_goal in chosen(config)]
+    rooms = chain.from_iterable(chain.from_iterable(groups))
     return tuple(dict.fromkeys(rooms))
 
 
@@ -63,9 +62,8 @@ def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
     """
     first = chosen(config)[0]
     left = [room for room in first.unlabelled if room not in labelled_rooms(config)]
-    if not left:
-        return first.others
-    return left[0], first.others[0]
+    first_choice, second_choice = first.others
+    return (left[0], first_choice) if left else (first_choice, second_choice)
 
 
 def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
@@ -89,41 +87,39 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         "unlabelled": (unlabelled, config.unlabelled_per_room),
         "heldout": (range(game.ROOMS), config.heldout_per_room),
     }
-    jobs: list[Callable[[], States]] = []
-    belongs: list[str] = []  # the set of each job
-    progress.total = 0
+    jobs: dict[tuple[str, int], Callable[[], States]] = {}  # by set and room
     for name, (rooms, wanted) in sets.items():
         held_out = name == "heldout"
         stream: tuple[str | int, ...] = ("montezuma", name)
         if held_out:
             stream = (*stream, config.heldout_seed)
-        unclear = name == "unlabelled"
-        draw = partial(gather, sub_goals=sub_goals, held_out=held_out, unclear=unclear)
         for room in rooms:
-            jobs.append(partial(draw, room, wanted, seed, stream))
-            belongs.append(name)
-            progress.total += wanted
+            jobs[name, room] = partial(
+                gather,
+                room,
+                wanted,
+                seed,
+                stream,
+                sub_goals=sub_goals,
+                held_out=held_out,
+                unclear=name == "unlabelled",
+            )
+    progress.total = sum(wanted * len(rooms) for rooms, wanted in sets.values())
     gathered: dict[int, States] = {}
 
     def done(number: int, states: States) -> None:
         gathered[number] = states
         progress.advance(len(states.labels))
 
-    in_processes(jobs, allowed(config.workers), done)
+    in_processes([*jobs.values()], allowed(config.workers), done)
     by_set: dict[str, list[States]] = {name: [] for name in sets}
-    for number, name in enumerate(belongs):
+    for number, (name, _) in enumerate(jobs):
         by_set[name].append(gathered.pop(number))
-    heldout = joined(by_set["heldout"])
+    for_labels, without_labels, heldout = map(joined, by_set.values())
     room_numbers = heldout.origins["room"]
     seen = np.full(len(room_numbers), SEEN_NOWHERE)
     seen[np.isin(room_numbers, unlabelled)] = SEEN_UNLABELLED
     seen[np.isin(room_numbers, labelled)] = SEEN_LABELLED
     heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
     names = tuple(sub_goal.name for sub_goal in sub_goals)
-    return Collected(
-        game.OBSERVATION_SHAPE,
-        names,
-        joined(by_set["labelled"]),
-        joined(by_set["unlabelled"]),
-        heldout,
-    )
+    return Collected(game.OBSERVATION_SHAPE, names, for_labels, without_labels, heldout)

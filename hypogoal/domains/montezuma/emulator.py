@@ -89,9 +89,9 @@ class Snapshot:
         return stack_frames(self.seen)
 
 
-def row_of(room: int) -> int:
-    """The pyramid's row (0 the top one) of a room 0..23."""
-    return max(row for row, first in enumerate(FIRST_ROOM_OF_ROW) if room >= first)
+def row_of(rooms: Any) -> Any:
+    """The pyramid's row (0 the top one) of a room 0..23, or of an array of them."""
+    return np.searchsorted(FIRST_ROOM_OF_ROW, rooms, side="right") - 1
 
 
 def load_ale(seed: int) -> Any:
@@ -250,7 +250,7 @@ class Emulator:
             if not 0 <= neighbour < ROOMS:
                 continue
             self._to_first_room()
-            self.write("row", row_of(room))
+            self.write("row", int(row_of(room)))
             self.write("inventory", self.read("inventory") | TORCH)
             self.write("room", neighbour)
             self.write("x", x)
@@ -269,16 +269,6 @@ def pixel(positions: Ints) -> NDArray[np.float64]:
     columns = x + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2
     rows = SPRITE_TOP - y + (SPRITE_HEIGHT - 1) / 2
     return np.stack([columns, rows], axis=1)
-
-
-def observed_pixel(positions: Ints) -> NDArray[np.float64]:
-    """The agent's middle in an 84x84 observation, the resized picture: row, column (n, 2).
-
-    A test compares it with the emulator.
-    """
-    scale = np.array([SIDE, SIDE]) / SCREEN
-    rows_and_columns = pixel(positions)[:, ::-1]
-    return (rows_and_columns + 0.5) * scale - 0.5
 
 
 def picture(emulator: Emulator, room: int) -> Bytes:

@@ -5,6 +5,7 @@ the frames of older ones are forgotten.
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from operator import itemgetter
 from typing import Any
 
@@ -96,47 +97,31 @@ class MontezumaEngine(TurnEngine):
 
     def _facts(self, ids: Ints) -> Ints:
         """``KNOWN`` of states, int64 (n, KNOWN), position first and life last, also of forgotten ones."""
-        table = np.frombuffer(self._known_bytes, np.uint8)
-        rows = table.reshape(-1, KNOWN)[ids]
-        return rows.astype(np.int64)
+        table = np.frombuffer(self._known_bytes, np.uint8).reshape(-1, KNOWN)
+        return table[ids].astype(np.int64)
 
     def positions(self, ids: Ints) -> Ints:
         return self._facts(ids)[:, : len(self.position_names)]
 
     def labels(self, ids: Ints) -> Bools:
         rows = self._facts(ids)
-        facts = rows[:, :-1]
-        alive = rows[:, -1] == 1
-        return labels_of(facts, alive, SUB_GOALS.values())
+        return labels_of(rows[:, :-1], rows[:, -1] == 1, SUB_GOALS.values())
 
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs. Nearly all of it is the frames in memory, 7 kB per state."""
         saved = [emulator.save() for emulator in self._emulators]
-        stacks = list(self._ring)
-        states = []
-        screens = []
-        for each in saved:
-            stacks.append(each.seen)
-            states.append(np.frombuffer(each.state.serialize(), np.uint8))
-            screens.append(each.screen)
-        frames: list[Bytes] = []
-        row: dict[int, int] = {}  # in ``frames``, by a frame's address
-        rows = []
-        for seen in stacks:
-            for frame in seen:
-                if id(frame) not in row:
-                    row[id(frame)] = len(frames)
-                    frames.append(frame)
-                rows.append(row[id(frame)])
-        row_numbers = np.array(rows, np.int32)
+        stacks = [*self._ring, *(each.seen for each in saved)]
+        frames = {id(frame): frame for frame in chain.from_iterable(stacks)}  # each once, by its address
+        row = {address: number for number, address in enumerate(frames)}
+        rows = [row[id(frame)] for frame in chain.from_iterable(stacks)]
         return {
             **super().snapshot(),
             "rng": self._rng.bit_generator.state,
             "known": np.frombuffer(self._known_bytes, np.uint8).copy(),
-            "frames": np.stack(frames),
-            "stacks": row_numbers.reshape(-1, game.STACK),
-            "states": states,
-            "screens": np.stack(screens),
+            "frames": np.stack(list(frames.values())),
+            "stacks": np.array(rows, np.int32).reshape(-1, game.STACK),
+            "states": [np.frombuffer(each.state.serialize(), np.uint8) for each in saved],
+            "screens": np.stack([each.screen for each in saved]),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -147,13 +132,8 @@ class MontezumaEngine(TurnEngine):
         self._rng.bit_generator.state = snapshot["rng"]
         self._known_bytes = bytearray(snapshot["known"].tobytes())
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
-        stacks: list[game.Frames] = []
-        for rows in snapshot["stacks"].tolist():
-            stacks.append(tuple(frames[row] for row in rows))
+        stacks = [itemgetter(*rows)(frames) for rows in snapshot["stacks"].tolist()]
         self._ring = stacks[: -self.count]
-        playing = stacks[-self.count :]
-        for number, emulator in enumerate(self._emulators):
-            saved_state = snapshot["states"][number]
-            state = ALEState(saved_state.tobytes())
-            screen = snapshot["screens"][number].copy()
-            emulator.restore(game.Snapshot(state, playing[number], screen))
+        playing = zip(self._emulators, snapshot["states"], stacks[-self.count :], snapshot["screens"], strict=True)
+        for emulator, state, seen, screen in playing:
+            emulator.restore(game.Snapshot(ALEState(state.tobytes()), seen, screen.copy()))

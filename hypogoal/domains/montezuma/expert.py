@@ -75,27 +75,20 @@ class Expert:
         self.room = room
         self.rng = rng
         self.places = standing_places(emulator, room)
-        self.spots = self._in_room(goal.spots for goal in sub_goals)
-        sides = self._in_room(goal.sides for goal in sub_goals)
-        self.in_turn = {
-            "spot": self._in_turn(self.spots),
-            "side": self._in_turn(sides),
-            "ladder": self._in_turn(climbs_in(room)),
-            "anywhere": None,
+        self.spots = _in_room(room, [goal.spots for goal in sub_goals])
+        starts: dict[str, Sequence[Any]] = {
+            "spot": self.spots,
+            "side": _in_room(room, [goal.sides for goal in sub_goals]),
+            "ladder": climbs_in(room),
         }
-        self.kinds = [kind for kind in STARTS if self.in_turn[kind] or kind == "anywhere"]
+        self.in_turn: dict[str, Iterator[Any]] = {}  # each kind's starts, in a random order, again and again
+        for kind, places in starts.items():
+            if places:
+                order = rng.permutation(len(places)).tolist()
+                self.in_turn[kind] = cycle([places[index] for index in order])
+        self.kinds = [kind for kind in STARTS if kind in self.in_turn or kind == "anywhere"]
         weights = np.array([STARTS[kind] for kind in self.kinds])
         self.chances = weights / weights.sum()
-
-    def _in_room(self, places: Iterable[Iterable[Position]]) -> list[Position]:
-        return [place for place in chain.from_iterable(places) if place.room == self.room]
-
-    def _in_turn(self, items: Sequence[Any]) -> Any:
-        """Cycles through the items in a random order; None if there are none."""
-        if not items:
-            return None
-        order = self.rng.permutation(len(items)).tolist()
-        return cycle([items[index] for index in order])
 
     def play(self) -> Iterator[Shown]:
         """Endlessly, the states of rollouts."""
@@ -164,8 +157,7 @@ class Expert:
             ram = self.emulator.ram().copy()
             following = Shown(self.emulator.stack, ram, action, shown.action)
             revived = shown.dying and not following.dying
-            outside = ram[RAM["room"]] != self.room
-            if revived or outside or self.emulator.ale.game_over():
+            if revived or ram[RAM["room"]] != self.room or self.emulator.ale.game_over():
                 return
             shown = following
             yield shown
@@ -192,13 +184,14 @@ class Expert:
         return action, int(self.rng.integers(1, LONGEST_REPEAT + 1))
 
 
+def _in_room(room: int, places: Iterable[Iterable[Position]]) -> list[Position]:
+    return [place for place in chain.from_iterable(places) if place.room == room]
+
+
 def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
     """An action that moves the agent to the nearest spot or holds it there, and its number of agent steps."""
-
-    def distance(spot: Position) -> int:
-        return abs(position.x - spot.x) + abs(position.y - spot.y)
-
-    spot = min(spots, key=distance)
+    distances = [abs(position.x - spot.x) + abs(position.y - spot.y) for spot in spots]
+    spot = spots[np.argmin(distances)]
     aside = spot.x - position.x
     if abs(aside) > CLOSE:
         steps = max(1, round(abs(aside) / STRIDE))
@@ -214,8 +207,9 @@ def climbs_in(room: int) -> list[tuple[Position, int, int]]:
     """Each climb that begins in a room: its start, its action, and the most agent steps without leaving the room."""
     climbs = []
     for ladder in LADDERS:
-        highest = SHAFT_ENTRY if ladder.joins_rooms else ladder.top.y
-        lowest = SHAFT_EXIT if ladder.joins_rooms else ladder.base.y
+        highest, lowest = ladder.top.y, ladder.base.y
+        if ladder.joins_rooms:
+            highest, lowest = SHAFT_ENTRY, SHAFT_EXIT
         up = (highest - ladder.base.y) // STRIDE - 1
         down = (ladder.top.y - lowest) // STRIDE - 1
         if ladder.base.room == room:
@@ -231,7 +225,7 @@ def standing_places(emulator: Emulator, room: int) -> Ints:
     Many places lie inside walls, where the game does not stop the agent from climbing about. So the agent's box must be
     black, with something under its feet. Room 15 has no black places; for it, the row of entry is taken.
     """
-    black = (game.picture(emulator, room) == 0).all(2)
+    black = ~game.picture(emulator, room).any(2)
     x = np.arange(game.LEFT_EDGE, game.RIGHT_EDGE + 1)
     y = np.arange(SHAFT_EXIT, SHAFT_ENTRY + 1)
     # The agent's box at each place, and below it the row under the feet.
@@ -240,9 +234,7 @@ def standing_places(emulator: Emulator, room: int) -> Ints:
     body = boxes[:, :, :-1]
     feet = body[:, :, -FEET:]
     floor = boxes[:, :, -1]
-    stands = body.mean((2, 3)) >= BLACK_SHARE
-    stands &= feet.all((2, 3))
-    stands &= floor.mean(2) <= 0.5
+    stands = (body.mean((2, 3)) >= BLACK_SHARE) & feet.all((2, 3)) & (floor.mean(2) <= 0.5)
     if room in LAVA_ROOMS:
         stands[y < LAVA_BELOW] = False
     rows, columns = np.nonzero(stands)

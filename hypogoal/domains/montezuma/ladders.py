@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hypogoal.core.arrays import Bools, Ints
-from hypogoal.domains.montezuma.emulator import FIRST_ROOM_OF_ROW, ROOMS, Position, row_of
+from hypogoal.domains.montezuma.emulator import FIRST_ROOM_OF_ROW, Position, row_of
 
 REACH = 2  # at a place: at most this far from it, in x and in y
 
@@ -39,12 +39,9 @@ class Ladder:
 
 _FILE = Path(__file__).with_name("measured.toml")
 MEASURED = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-LADDERS: list[Ladder] = []
+LADDERS = []
 for _name, _facts in MEASURED["ladders"].items():
-    _top = Position(*_facts["top"])
-    _base = Position(*_facts["base"])
-    LADDERS.append(Ladder(_name, _top, _base, _facts["steps_down"]))
-GROUPS = tuple(map(tuple, MEASURED["groups"]))
+    LADDERS.append(Ladder(_name, Position(*_facts["top"]), Position(*_facts["base"]), _facts["steps_down"]))
 BASES = tuple(ladder.base for ladder in LADDERS)
 TOPS = tuple(ladder.top for ladder in LADDERS)
 
@@ -52,8 +49,9 @@ TOPS = tuple(ladder.top for ladder in LADDERS)
 # room c of a row lies room c + 1 of the next.
 ROOM_WIDTH, ROOM_HEIGHT = 149, 121  # so that crossing, x 149 to 1, y 134 to 254, is one unit
 SHAFT_EXIT, SHAFT_ENTRY = 134, 254  # y on leaving a room through its floor, and y right after
-# Neighbours with a wall between them, tried at y 235. Doors that take a key count as open.
-WALLS = frozenset({(9, 10), (20, 21)})
+# The agent can walk between the rooms of a region, tried at y 235: from one of these to before the next. A region ends
+# with a row of the pyramid, or at a wall. Doors that take a key count as open.
+FIRST_ROOM_OF_REGION = (0, 3, 8, 10, 15, 21)
 FAR = 10**9  # longer than any path
 
 
@@ -76,25 +74,19 @@ def place_of(positions: Ints, places: Sequence[Position]) -> Ints:
 def plane(positions: Ints) -> Ints:
     """Positions (n, 3) as coordinates (n, 2) in one plane, x to the right, y upwards."""
     room, x, y = positions.T
-    firsts = np.array(FIRST_ROOM_OF_ROW)
-    row = np.searchsorted(firsts, room, side="right") - 1
-    first = firsts[row]
-    column = room - first - row
-    right = x + ROOM_WIDTH * column
-    up = y - ROOM_HEIGHT * row
-    return np.stack([right, up], axis=1)
+    row = row_of(room)
+    column = room - np.take(FIRST_ROOM_OF_ROW, row) - row
+    return np.stack([x + ROOM_WIDTH * column, y - ROOM_HEIGHT * row], axis=1)
 
 
-@cache
-def _regions() -> Ints:
-    """The region of each room, by number: the agent can walk between the rooms of a region."""
-    regions = [0]
-    for room in range(1, ROOMS):
-        same_row = row_of(room) == row_of(room - 1)
-        open_between = same_row and (room - 1, room) not in WALLS
-        last = regions[-1]
-        regions.append(last if open_between else last + 1)
-    return np.array(regions)
+def region_of(rooms: Ints) -> Ints:
+    """The numbers of rooms' regions."""
+    return np.searchsorted(FIRST_ROOM_OF_REGION, rooms, side="right")
+
+
+def _straight(positions: Ints, others: Ints) -> Ints:
+    """The Manhattan distance of each of some places in the plane (n, 2) from each of others (m, 2); int (n, m)."""
+    return np.abs(positions[:, None] - others).sum(2)
 
 
 @cache
@@ -104,19 +96,15 @@ def _landmarks(places: tuple[Position, ...]) -> tuple[Ints, Ints, Ints]:
     exits = [ladder.top._replace(y=SHAFT_EXIT) for ladder in shafts]
     entries = [ladder.base._replace(y=SHAFT_ENTRY) for ladder in shafts]
     landmarks = np.array([*places, *exits, *entries])
-    region = _regions()[landmarks[:, 0]]
+    region = region_of(landmarks[:, 0])
     at = plane(landmarks)
 
     joined = region[:, None] == region
-    numbers = np.arange(len(shafts))
-    upper = len(places) + numbers
+    upper = len(places) + np.arange(len(shafts))
     lower = upper + len(shafts)
     joined[upper, lower] = True
     joined[lower, upper] = True
-    differences = at[:, None] - at
-    straight = np.abs(differences).sum(2)
-    leg = np.where(joined, straight, FAR)
-
+    leg = np.where(joined, _straight(at, at), FAR)
     distance = np.full(len(landmarks), FAR)
     distance[: len(places)] = 0
     for _ in landmarks:  # Bellman-Ford: a shortest path has at most as many legs as there are landmarks
@@ -127,17 +115,11 @@ def _landmarks(places: tuple[Position, ...]) -> tuple[Ints, Ints, Ints]:
 def distance_to(positions: Ints, places: tuple[Position, ...]) -> Ints:
     """Spec F3: the Manhattan distance from positions (n, 3) to the nearest place, through the rooms; int (n,).
 
-    Paths go sideways from room to room within a row of the pyramid, except through ``WALLS``, freely up and down, and
+    Paths go sideways from room to room within a region, freely up and down, and
     from row to row only through the nine ladders that join rooms. Platforms and walls inside a room are ignored, so it
     is a lower bound. 0 at a place itself.
     """
     region, at, onwards = _landmarks(places)
-    agent = plane(positions)
-    differences = agent[:, None] - at
-    to_landmark = np.abs(differences).sum(2)
-    room = positions[:, 0]
-    own_region = _regions()[room]
-    reachable = own_region[:, None] == region
-    away = to_landmark + onwards
-    away[~reachable] = np.iinfo(np.int64).max
-    return away.min(1)
+    away = _straight(plane(positions), at) + onwards
+    reachable = region_of(positions[:, :1]) == region
+    return np.where(reachable, away, FAR).min(1)

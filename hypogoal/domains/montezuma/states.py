@@ -13,8 +13,8 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.data import States
 from hypogoal.domains.montezuma.emulator import ON_LADDER, RAM, Emulator, Position
 from hypogoal.domains.montezuma.expert import Expert, Shown
-from hypogoal.domains.montezuma.ladders import BASES, GROUPS, REACH, TOPS, within
-from hypogoal.domains.montezuma.sub_goals import SubGoal, facts_of, labels_of
+from hypogoal.domains.montezuma.ladders import BASES, REACH, TOPS, within
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, SubGoal, facts_of, labels_of
 from hypogoal.observations import digest
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
@@ -42,7 +42,7 @@ HELD_OUT_EACH = 3  # every third stack, by digest, is for the held-out set
 
 def kinds_of(ram: Bytes) -> Ints:
     """Each state's kind, an index into ``KINDS``, int64 (n,), from RAM (n, 128): dying, else the first that fits."""
-    positions = positions_of(ram)
+    positions = facts_of(ram)[:, :3]
     fits = {
         DYING: ram[:, RAM["dying"]] > 0,
         BASE: within(positions, BASES, REACH).any(1),
@@ -51,14 +51,7 @@ def kinds_of(ram: Bytes) -> Ints:
         TOP: within(positions, TOPS, REACH).any(1),
         JUMPING: ram[:, RAM["jump"]] != ON_GROUND,
     }
-    kinds = np.select(list(fits.values()), list(fits), default=ELSEWHERE)
-    return kinds.astype(np.int64)
-
-
-def positions_of(ram: Bytes) -> Ints:
-    """Room, x, y, int64 (n, 3), from RAM (n, 128)."""
-    columns = [RAM[name] for name in Position._fields]
-    return ram[:, columns].astype(np.int64)
+    return np.select(list(fits.values()), list(fits), default=ELSEWHERE)
 
 
 def states_of(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
@@ -70,9 +63,9 @@ def states_of(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
     """
     ram = np.stack([state.ram for state in shown])
     facts, dying = facts_of(ram), ram[:, RAM["dying"]] > 0
-    room, x, y = positions_of(ram).T
+    room, x, y, *_ = facts.T
     group = np.zeros_like(room)
-    for number, rooms in enumerate(GROUPS, start=1):
+    for number, rooms in enumerate(CLIMB_DOWN.groups, start=1):
         group[np.isin(room, rooms)] = number
     origins = {
         "room": room,
@@ -160,29 +153,26 @@ def gather(
         fault = f"room {room} does not show {wanted} different states"
         raise UserError(fault, f"{len(pool)} in {step} steps", "Ask for fewer.")
     states = states_of(pool, sub_goals)
-    origins = states.origins
-    kinds = np.where(states.labels.any(1), POSITIVE, origins["kind"])
-    positions = np.stack([origins["room"], origins["x"], origins["y"]], axis=1)
-    chosen = choose(kinds, positions, wanted, rng)
-    return states.where(chosen)
+    kinds = np.where(states.labels.any(1), POSITIVE, states.origins["kind"])
+    positions = np.stack([states.origins[name] for name in Position._fields], axis=1)
+    return states.where(choose(kinds, positions, wanted, rng))
 
 
 def choose(kinds: Ints, positions: Ints, wanted: int, rng: Generator) -> Ints:
     """Ordered indices of ``wanted`` of n states: each kind's share, spread over positions; the others at random."""
     order = rng.permutation(len(kinds))
     # Each state's rank within its kind and position: the first of each come before the second of any.
-    counts: Counter[tuple[int, ...]] = Counter()
+    counts: Counter[bytes] = Counter()
     ranks = np.empty(len(kinds), np.int64)
+    alike = np.column_stack([kinds, positions])
     for index in order.tolist():
-        same = (int(kinds[index]), *positions[index].tolist())
+        same = alike[index].tobytes()
         ranks[index] = counts[same]
         counts[same] += 1
     spread = order[np.argsort(ranks[order], kind="stable")]
-    shares = []
+    first = np.zeros(0, np.int64)
     for kind, share in KIND_SHARES.items():
         of_kind = spread[kinds[spread] == kind]
-        shares.append(of_kind[: int(share * wanted)])
-    first = np.concatenate(shares)
+        first = np.append(first, of_kind[: int(share * wanted)])
     others = order[~np.isin(order, first)]
-    left = wanted - len(first)
-    return np.sort(np.concatenate([first, others[:left]]))
+    return np.sort(np.append(first, others[: wanted - len(first)]))

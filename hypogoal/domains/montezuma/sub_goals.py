@@ -4,7 +4,7 @@ The paper has the first; the others are in its authors' repository (``monte_term
 entry of ``SUB_GOALS``. Where enemies and lasers are is in ``measured.toml``, see docs/montezuma.md.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -13,7 +13,7 @@ import numpy as np
 
 from hypogoal.core.arrays import Bools, Bytes, Ints
 from hypogoal.domains.montezuma.emulator import RAM, Position
-from hypogoal.domains.montezuma.ladders import BASES, GROUPS, MEASURED, REACH, TOPS, place_of
+from hypogoal.domains.montezuma.ladders import BASES, MEASURED, REACH, TOPS, place_of
 
 FACTS = ("room", "x", "y", "skull", "object")  # the bytes of ``RAM`` that predicates read
 FACT_BYTES = [RAM[name] for name in FACTS]
@@ -28,8 +28,7 @@ class SubGoal:
     Attributes:
         places: where it holds; the last of them, for enemies: distances are to the nearest.
         at: from facts (n, ``FACTS``) the index in ``places`` of the one at which it holds for a living agent, -1: none.
-        groups: rooms that are labelled together.
-        unlabelled, others: rooms to draw unlabelled states from, with and without such a place, the first choice first.
+        groups, unlabelled, others: rooms, see ``measured.toml``.
         spots: where the expert begins and heads for.
         sides: where it begins, too.
         unclear: indices of places whose states are labelled nowhere.
@@ -38,9 +37,9 @@ class SubGoal:
     name: str
     places: Places
     at: Callable[[Ints], Ints]
-    groups: tuple[tuple[int, ...], ...]
-    unlabelled: tuple[int, ...]
-    others: tuple[int, ...]
+    groups: Sequence[Sequence[int]]
+    unlabelled: Sequence[int]
+    others: Sequence[int]
     spots: Places
     sides: Places = ()
     unclear: frozenset[int] = frozenset()
@@ -86,7 +85,7 @@ LASER_Y = 235
 
 
 def _at(places: Places, facts: Ints) -> Ints:
-    return place_of(facts[:, [ROOM, X, Y]], places)
+    return place_of(facts[:, : len(Position._fields)], places)
 
 
 def _past(side: str, facts: Ints) -> Ints:
@@ -95,66 +94,59 @@ def _past(side: str, facts: Ints) -> Ints:
     return np.where(past.any(1), past.argmax(1), -1)
 
 
-def _climb(name: str, ends: Places, others: Places, unlabelled: tuple[int, ...]) -> SubGoal:
+def _climb(name: str, ends: Places, others: Places) -> SubGoal:
     """Be at one end of a ladder; ends that are another ladder's other end are labelled nowhere (Spec B5)."""
+    unclear = frozenset(index for index, end in enumerate(ends) if end in others)
     return SubGoal(
         name,
         places=ends,
         at=partial(_at, ends),
-        groups=GROUPS,
-        unlabelled=unlabelled,
-        others=(18, 12),
         spots=ends,
         sides=others,
-        unclear=frozenset(index for index, end in enumerate(ends) if end in others),
+        unclear=unclear,
+        **MEASURED["rooms"][name],
     )
 
 
 def _pass(side: str) -> SubGoal:
-    """Be past an enemy on a side of it, on its floor; groups by kind of enemy."""
+    """Be past an enemy on a side of it, on its floor."""
+    name = f"pass-enemy-{side}"
     places, spots = [], []
     for enemy in ENEMIES:
         first, last = enemy.ends
-        end = first if side == "left" else last
-        places.append(Position(enemy.room, end, enemy.y))
-        for x in range(first, last + 1, BETWEEN_SPOTS):
-            spots.append(Position(enemy.room, x, enemy.y))
+        places.append(Position(enemy.room, first if side == "left" else last, enemy.y))
+        spots += [Position(enemy.room, x, enemy.y) for x in range(first, last + 1, BETWEEN_SPOTS)]
     return SubGoal(
-        f"pass-enemy-{side}",
+        name,
         places=tuple(places),
         at=partial(_past, side),
-        groups=((1,), (2, 3), (4, 13, 21), (9, 11, 22), (5, 18)),
-        unlabelled=(11, 4, 2),
-        others=(0, 12),
         spots=tuple(spots),
+        **MEASURED["rooms"][name],
     )
 
 
 def _pass_lasers() -> SubGoal:
     """Stand left of a laser gate, as the authors' data do."""
+    name = "pass-lasers"
     before, behind = [], []
     for room, gates in GATES.items():
-        for left, right in gates:
-            before.append(Position(room, left, LASER_Y))
-            behind.append(Position(room, right, LASER_Y))
+        before += [Position(room, left, LASER_Y) for left, _ in gates]
+        behind += [Position(room, right, LASER_Y) for _, right in gates]
     places = tuple(before)
     return SubGoal(
-        "pass-lasers",
+        name,
         places=places,
         at=partial(_at, places),
-        groups=((0,), (7,), (12,)),
-        unlabelled=(7, 12),
-        others=(2, 18),
         spots=places,
         sides=tuple(behind),
+        **MEASURED["rooms"][name],
     )
 
 
-CLIMB_DOWN = _climb("climb-down-ladder", BASES, TOPS, (9, 21, 19, 22, 10))
-CLIMB_UP = _climb("climb-up-ladder", TOPS, BASES, (3, 14, 5, 7, 2))
+CLIMB_DOWN = _climb("climb-down-ladder", BASES, TOPS)
 ALL = (
     CLIMB_DOWN,
-    CLIMB_UP,
+    _climb("climb-up-ladder", TOPS, BASES),
     _pass("left"),
     _pass("right"),
     _pass_lasers(),
