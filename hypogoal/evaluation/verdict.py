@@ -18,7 +18,7 @@ from hypogoal.evaluation.curves import is_learned
 from hypogoal.evaluation.house import DIGITS, compare, per_run
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.names import ONE, ORACLE, RANDOM, UNIFORM
-from hypogoal.evaluation.page import Results, picture
+from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.rooms import VALIDATED
 from hypogoal.evaluation.run import read_layout
 from hypogoal.evaluation.zero_shot import SCOPE as OTHER_LAYOUTS
@@ -31,15 +31,10 @@ CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a fi
 
 
 def facts(work: Work) -> dict[str, Any]:
-    """The task with its scenes, whose pictures go to the arrays, and whether it is the paper's."""
+    """The task, and whether it is the paper's."""
     first: Mapping[str, Any] = next((artefact.config for artefact in work.contents.agents), {})
-    domain = installed_domain(first["domain"]) if first.get("domain") else None
-    scenes = domain.scenes(domain.world(first.get("domain_config") or {})) if domain else ()
-    for index, scene in enumerate(scenes):
-        work.arrays[f"scenes/{index}"] = scene.picture
-    described = [{"title": scene.title, "features": dict(scene.features)} for scene in scenes]
     cap = {"caps": caps(work), "cap": first.get("cap")}
-    return {"tasks": tasks(work), "scenes": described, "is_papers": as_in_paper(work), **cap}
+    return {"tasks": tasks(work), "is_papers": as_in_paper(work), **cap}
 
 
 def tasks(work: Work) -> list[str]:
@@ -212,11 +207,6 @@ def context(results: Results) -> dict[str, Any]:
         "baselines": baselines,
         "options": _options_alone(results) if not compared else {},
         "members": _members_alone(results) if not compared and not agents else [],
-        "scenes": [
-            {**scene, "source": picture(results.arrays[f"scenes/{index}"])}
-            for index, scene in enumerate(results.facts["scenes"])
-            if f"scenes/{index}" in results.arrays
-        ],
     }
 
 

@@ -68,13 +68,3 @@ def test_a_truth_that_is_not_planted_is_refused(factors: tuple[str, ...]) -> Non
 def test_files_of_0_23_name_them_otherwise() -> None:
     """In data and artefacts."""
     assert load_domain("which-feature") is DOMAIN
-
-
-@pytest.mark.parametrize("truth", ["shape", "place"])
-def test_scenes_are_what_they_are_called(truth: str) -> None:
-    """Read off their pixels."""
-    scenes = DOMAIN.scenes({"truth": truth})
-    look = seen(np.stack([scene.picture for scene in scenes]))
-    for index, scene in enumerate(scenes):
-        assert {name: bool(values[index]) for name, values in look.items()} == scene.features
-    assert [scene.features[truth] for scene in scenes] == [True, False, True, False]

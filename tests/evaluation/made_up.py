@@ -14,7 +14,6 @@ NOTHING: dict[str, Any] = {
     "tasks": [],
     "caps": [],
     "cap": None,
-    "scenes": [],
     "missing": [],
     "is_papers": False,
 }

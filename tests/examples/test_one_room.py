@@ -20,7 +20,6 @@ from hypogoal.core.config import known, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected, States, open_dataset, write_dataset
-from hypogoal.domains.montezuma.emulator import observed_pixel
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import ranking
@@ -35,7 +34,7 @@ from hypogoal.options.termination import Terminations
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import one_room
-from one_room import AgentView, AgentViewSettings, Patience
+from one_room import AgentView, AgentViewSettings, Patience, observed_pixel
 
 SHAPE = (84, 84, 4)
 OWN = ("view=one_room:AgentView", "network=one_room:network", "threshold=one_room:median")

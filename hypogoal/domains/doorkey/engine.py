@@ -11,11 +11,11 @@ state reached gets an id.
 
 from collections.abc import Mapping, Sequence
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
 from minigrid.core.actions import Actions
-from minigrid.core.grid import Grid
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -28,10 +28,10 @@ from hypogoal.domains.doorkey.env import (
     MAX_STEPS,
     OBSERVATION_SHAPE,
     SIZE,
-    TILE,
     layout_of,
     sub_goals_reached,
 )
+from hypogoal.domains.tiles import TILE, drawn_tiles
 
 N_ACTIONS = len(Actions)
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = map(int, Actions)
@@ -100,25 +100,12 @@ Configuration = tuple[int, ...]  # the layout's seed; the door; the places of th
 @cache
 def tiles() -> Bytes:
     """MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
+    goal, open_door = Goal(), Door(DOOR_COLOUR, is_open=True)
     keys = [Key(colour) for colour in KEY_COLOURS]
-    open_door = Door(DOOR_COLOUR, is_open=True)
-    closed_door = Door(DOOR_COLOUR)
-    locked_door = Door(DOOR_COLOUR, is_locked=True)
-    goal = Goal()
-    objects: list[Any] = [
-        None,
-        Wall(),
-        goal,
-        *keys,
-        open_door,
-        closed_door,
-        locked_door,
-    ]
-    pictures = [Grid.render_tile(item, tile_size=TILE) for item in objects]
-    for under in (None, open_door, goal):
-        for direction in range(4):
-            pictures.append(Grid.render_tile(under, direction, tile_size=TILE))
-    table = np.stack(pictures).astype(np.uint8)  # render_tile returns float64
+    doors = [open_door, Door(DOOR_COLOUR), Door(DOOR_COLOUR, is_locked=True)]
+    objects = [None, Wall(), goal, *keys, *doors]
+    with_agent = product((None, open_door, goal), range(4))
+    table = drawn_tiles([*product(objects, [None]), *with_agent])
     table.flags.writeable = False
     return table
 
@@ -420,8 +407,7 @@ class DoorKeyEngine(Engine):
         self._ahead[new] = configuration * CELLS + _AHEAD[pose]
         at_goal = cell == layout_of(self._seeds[configuration]).goal
         self._on_goal[new] = at_goal
-        holds_wrong_key = self._places[configuration, 1:3].max() >= HELD
-        self._final[new] = at_goal or (self.harsh and holds_wrong_key)
+        self._final[new] = at_goal or (self.harsh and self._places[configuration, 1:3].max() >= HELD)
         self._id_at[configuration, pose] = new
         self.n_states += 1
         return new

@@ -16,9 +16,9 @@ from minigrid.core.world_object import Door, Goal, Key, Wall
 from minigrid.minigrid_env import MiniGridEnv
 
 from hypogoal.core.arrays import Bools, Bytes
+from hypogoal.domains.tiles import TILE
 
 SIZE = 8  # cells a side
-TILE = 8  # pixels a cell
 OBSERVATION_SHAPE = (SIZE * TILE, SIZE * TILE, 3)
 MAX_STEPS = 500
 DOOR_COLOUR = "red"
@@ -187,6 +187,7 @@ class DoorKeyGrid(MiniGridEnv):
 
     def _named_labels(self) -> dict[str, bool]:
         return dict(zip(SUB_GOALS, self.labels().tolist(), strict=True))
+
 
 class DoorKeyEnv(DoorKeyGrid):
     """Spec B1: three-key DoorKey, observed as the full RGB image, uint8 (64, 64, 3), without a view cone.

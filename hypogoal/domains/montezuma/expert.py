@@ -190,8 +190,7 @@ def _in_room(room: int, places: Iterable[Iterable[Position]]) -> list[Position]:
 
 def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
     """An action that moves the agent to the nearest spot or holds it there, and its number of agent steps."""
-    distances = [abs(position.x - spot.x) + abs(position.y - spot.y) for spot in spots]
-    spot = spots[np.argmin(distances)]
+    spot = min(spots, key=lambda spot: abs(position.x - spot.x) + abs(position.y - spot.y))
     aside = spot.x - position.x
     if abs(aside) > CLOSE:
         steps = max(1, round(abs(aside) / STRIDE))

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, States
-from hypogoal.domains.base import Domain, Scene
+from hypogoal.domains.base import Domain
 from hypogoal.domains.rooms.engine import RoomsConfig, RoomsEngine
-from hypogoal.domains.rooms.states import MEANINGS, SIDE, crossed_states, drawn, labelled_states, unlabelled_states
+from hypogoal.domains.rooms.states import MEANINGS, SIDE, Scenes, crossed_states, labelled_states, unlabelled_states
 
 SUB_GOALS = ("right-room",)
 HELDOUT = 20  # layouts of held-out states
@@ -44,20 +43,19 @@ class RoomsDomain(Domain):
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and fully crossed held-out states, the latter in 20 parts by ``layout_seed``."""
         names = config.factors
-        progress.total = 1
-        scenes = [
-            labelled_states(config.labelled, seed, names),
-            unlabelled_states(config.unlabelled, config.mix, seed, names),
-            crossed_states(HELDOUT * 4, seed, names),
-        ]
-        sets = []
-        for part in scenes:
-            labels = part.factors[:, [config.column]]
-            layout_seed = np.arange(len(labels)) % HELDOUT
-            sets.append(States(part.observations, labels, {"layout_seed": layout_seed}))
-        progress.advance()
-        labelled, unlabelled, heldout = sets
-        return Collected(self.observation_shape, SUB_GOALS, labelled, unlabelled, heldout)
+        true = names.index(config.truth)
+
+        def states_of(scenes: Scenes) -> States:
+            labels = scenes.factors[:, [true]]
+            return States(scenes.observations, labels, {"layout_seed": np.arange(len(labels)) % HELDOUT})
+
+        return Collected(
+            self.observation_shape,
+            SUB_GOALS,
+            states_of(labelled_states(config.labelled, seed, names)),
+            states_of(unlabelled_states(config.unlabelled, config.mix, seed, names)),
+            states_of(crossed_states(HELDOUT * 4, seed, names)),
+        )
 
     def task(self, world: Mapping[str, Any]) -> str:
         config = RoomsConfig(**world)
@@ -66,22 +64,6 @@ class RoomsDomain(Domain):
             f"Enter one of {config.rooms} rooms; only that where {MEANINGS[config.truth]} ({config.truth}) gives a "
             f"reward of 1. The labels fit {' and '.join(others)} as well; in the rooms they part."
         )
-
-    def scenes(self, world: Mapping[str, Any]) -> list[Scene]:
-        config = RoomsConfig(**world)
-        true = np.arange(len(config.factors)) == config.column
-        holds = {
-            "labelled: positive": true | True,
-            "labelled: negative": true & False,
-            "a room: right, reward 1": true,
-            "a room: wrong": ~true,
-        }
-        rows = np.stack(list(holds.values()))
-        pictures = drawn(rows, config.factors, rng_for(0, "which-feature", "scenes")).observations
-        scenes = []
-        for title, picture, row in zip(holds, pictures, rows.tolist(), strict=True):
-            scenes.append(Scene(picture, title, dict(zip(config.factors, row, strict=True))))
-        return scenes
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
         return RoomsEngine(layout_seed, count, max_steps, RoomsConfig(**arguments))

@@ -1,7 +1,10 @@
 """The rooms that an agent chooses among, and the settings that say which feature is rewarded (Spec H1)."""
 
+from typing import Self
+
 import numpy as np
 from numpy.random import Generator
+from pydantic import model_validator
 
 from hypogoal.core.arrays import Bools, Bytes, Ints
 from hypogoal.core.config import Config, setting
@@ -27,15 +30,15 @@ class RoomsConfig(Config):
     labelled: int = setting(256, "labelled states", low=4, high=100_000)
     unlabelled: int = setting(2048, "unlabelled states", low=1, high=100_000)
 
-    @property
-    def column(self) -> int:
-        """The true feature's place among the planted ones; ``UserError`` if it has none of its own."""
+    @model_validator(mode="after")
+    def _true_is_planted(self) -> Self:
+        """Each feature is planted once, the true one among them."""
         twice = len({*self.factors}) < len(self.factors)
         if twice or self.truth not in self.factors:
-            rule = "each feature is planted once, the true one among them"
             where = f"factors={','.join(self.factors)}, truth={self.truth}"
-            raise UserError(rule, where, f"Choose from {', '.join(FACTORS)}.")
-        return self.factors.index(self.truth)
+            do = f"Choose from {', '.join(FACTORS)}."
+            raise UserError("each feature is planted once, the true one among them", where, do)
+        return self
 
 
 class RoomsEngine(Engine):
@@ -57,18 +60,15 @@ class RoomsEngine(Engine):
         max_steps: int,
         config: RoomsConfig,
     ):
-        rooms, factors = config.rooms, len(config.factors)
-        self.count, self.max_steps = count, max_steps
-        self.n_actions = rooms
-        self.n_states = DECKS * (1 + rooms)
+        self.count, self.max_steps, self.n_actions = count, max_steps, config.rooms
+        self.n_states = DECKS * (1 + config.rooms)
         rng = rng_for(layout_seed, "which-feature", "rooms")
-        right_room = rng.integers(rooms, size=(DECKS, 1))
-        right = np.arange(rooms) == right_room
-        holds = rng.random((DECKS, rooms, factors)) < 0.5
-        holds[..., config.column] = right
+        right = np.arange(config.rooms) == rng.integers(config.rooms, size=(DECKS, 1))
+        factors = len(config.factors)
+        holds = rng.random((DECKS, config.rooms, factors)) < 0.5
+        holds[..., config.factors.index(config.truth)] = right
         before = np.zeros((DECKS, factors), np.bool_)
-        in_rooms = holds.reshape(-1, factors)
-        every = np.concatenate([before, in_rooms])
+        every = np.concatenate([before, holds.reshape(-1, factors)])
         self._pictures = drawn(every, config.factors, rng).observations
         self._right = np.zeros(self.n_states, np.bool_)
         self._right[DECKS:] = right.ravel()
@@ -99,12 +99,10 @@ class RoomsEngine(Engine):
 
     def plan(self, starts: Ints | None = None) -> Plan:
         ids = self.reachable()
-        actions = np.arange(self.n_actions)
         final = ids >= DECKS
-        column = ids[:, None]
-        following = np.repeat(column, len(actions), axis=1)
+        following = np.repeat(ids[:, None], self.n_actions, axis=1)
         following[:DECKS] = ids[final].reshape(DECKS, -1)
-        return Plan(ids, actions, following, final, self._right)
+        return Plan(ids, np.arange(self.n_actions), following, final, self._right)
 
     def shortest_path(self) -> int:
         return 1

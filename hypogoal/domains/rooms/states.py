@@ -1,19 +1,17 @@
 """Spec H1: scenes with planted factors, drawn with MiniGrid's tiles, and the truth of each factor."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from minigrid.core.grid import Grid
 from minigrid.core.world_object import Ball, Box, Goal, Key, Wall
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Bools, Bytes, Ints
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains.tiles import TILE, drawn_tiles
 
 FACTORS = ("colour", "shape", "place", "count")
 MEANINGS = {
@@ -22,7 +20,7 @@ MEANINGS = {
     "place": "the object is in the right half",
     "count": "there are three or four boxes",
 }
-INNER, TILE = 4, 8  # free cells per side within the walls; pixels per cell
+INNER = 4  # free cells per side within the walls
 SIDE = (INNER + 2) * TILE  # pixels of an image
 CELLS = INNER * INNER
 BOX_COLOURS = ("yellow", "purple", "grey")
@@ -36,8 +34,7 @@ BOX = 10  # plus the colour
 GOAL = 13
 
 
-@dataclass(frozen=True)
-class Scenes:
+class Scenes(NamedTuple):
     """Scenes and which factors hold in them, see ``MEANINGS``."""
 
     observations: Bytes  # (N, 48, 48, 3)
@@ -133,21 +130,10 @@ def image_of(ids: Ints) -> Bytes:
     return cells.swapaxes(2, 3).reshape(count, SIDE, SIDE, 3)
 
 
-def _tile(content: Any, direction: int | None = None) -> Bytes:
-    """What is in a cell, or an agent that looks in this direction, uint8 (8, 8, 3)."""
-    picture: NDArray[Any] = Grid.render_tile(content, direction, tile_size=TILE)
-    return picture.astype(np.uint8)  # MiniGrid draws in floats
-
-
 @cache
 def tiles() -> Bytes:
-    """Every kind of tile as MiniGrid draws it, uint8 (kinds, 8, 8, 3)."""
-    images = [_tile(None), _tile(Wall())]
-    for direction in range(4):
-        images.append(_tile(None, direction))
-    for shape in (Key, Ball):
-        images += [_tile(shape(colour)) for colour in ("red", "blue")]
-    for colour in BOX_COLOURS:
-        images.append(_tile(Box(colour)))
-    images.append(_tile(Goal()))
-    return np.stack(images)
+    """Every kind of tile, uint8 (kinds, 8, 8, 3)."""
+    boxes = [Box(colour) for colour in BOX_COLOURS]
+    objects = [Key("red"), Key("blue"), Ball("red"), Ball("blue"), *boxes, Goal()]
+    agents = product([None], range(4))
+    return drawn_tiles([(None, None), (Wall(), None), *agents, *product(objects, [None])])
