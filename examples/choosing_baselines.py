@@ -6,32 +6,22 @@ shortest paths.
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Annotated
 
-from hypogoal.experiments.choosing import LAYOUTS
-from hypogoal.experiments.experiment import (
-    Command,
-    Layouts,
-    Names,
-    Paired,
-    Seeds,
-    agents_of,
-    experiment,
-    explained,
-)
+from hypogoal.core.config import setting
+from hypogoal.experiments.choosing import SOLVABLE
+from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
 
 
 @experiment("doorkey")
 def choosing_baselines(
     *,
-    layouts: Layouts = LAYOUTS,
-    seeds: Seeds = tuple(range(920, 930)),
-    paired: Paired = True,
-    agents: Annotated[Names, explained("agents")] = ("ppo", "dqn"),
+    layouts: Integers = setting(SOLVABLE, LAYOUTS, low=0),
+    seeds: Integers = setting(tuple(range(920, 930)), SEEDS, low=0),
+    agents: Names = setting(("ppo", "dqn"), "agents"),
 ) -> Iterator[Command]:
     """Every agent on every layout."""
     yield Command("data", "collect doorkey --set heldout_layouts=1", {"group": "data"})
-    for agent, (layout, seed) in product(agents, agents_of(layouts, seeds, paired=paired)):
+    for agent, (layout, seed) in product(agents, agents_of(layouts, seeds)):
         command = f"train-baseline doorkey --data @data --agent {agent} --seed {seed} --layout-seed {layout}"
         yield Command(
             f"baseline/agent-{agent}-layout-{layout}-seed-{seed}",

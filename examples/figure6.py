@@ -11,19 +11,9 @@ predict positive.
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Annotated
 
-from hypogoal.experiments.experiment import (
-    Command,
-    Integers,
-    Layouts,
-    Names,
-    Paired,
-    Seeds,
-    agents_of,
-    experiment,
-    explained,
-)
+from hypogoal.core.config import setting
+from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
 
 METHODS = {
     "dbat-k3": "--diversity dbat --members 3",
@@ -32,8 +22,7 @@ METHODS = {
 }
 PUBLISHED = "--set epsilon_steps=8000 --set update_interval=16"  # the page was run with these
 BASELINES = {"ppo-tuned": "--agent ppo --set setting=tuned", "dqn-tuned": "--agent dqn --set setting=tuned"}
-LAYOUTS, SEEDS = tuple(range(300, 310)), tuple(range(3000, 3010))
-FEW_LAYOUTS, FEW_SEEDS = LAYOUTS[:5], SEEDS[:5]
+PLAYED, TRAINED = tuple(range(300, 310)), tuple(range(3000, 3010))  # layouts and seeds
 STEPS, PRACTICE = 1_500_000, 40_000  # of an agent, of which its options practise so many
 PAPERS = {"ppo-paper": "--agent ppo --set setting=paper", "dqn-paper": "--agent dqn --set setting=paper"}
 
@@ -41,25 +30,18 @@ PAPERS = {"ppo-paper": "--agent ppo --set setting=paper", "dqn-paper": "--agent 
 @experiment("doorkey")
 def figure6(
     *,
-    layouts: Layouts = LAYOUTS,
-    seeds: Seeds = SEEDS,
-    paired: Paired = True,
-    methods: Annotated[Names, explained("ensembles", choices=METHODS)] = tuple(METHODS),
-    told: Annotated[Names, explained("ensembles whose options end at the true sub-goal instead: the control")] = (
-        "dbat-k3",
-    ),
-    baselines: Annotated[Names, explained("agents on the primitive actions", choices=BASELINES)] = tuple(BASELINES),
-    papers: Annotated[Names, explained("the same agents as the paper's tables have them", choices=PAPERS)] = tuple(
-        PAPERS
-    ),
-    paper_layouts: Annotated[
-        Integers, explained("layouts of these, which take five times as long", low=0)
-    ] = FEW_LAYOUTS,
-    paper_seeds: Annotated[Integers, explained("seeds of these", low=0)] = FEW_SEEDS,
+    layouts: Integers = setting(PLAYED, LAYOUTS, low=0),
+    seeds: Integers = setting(TRAINED, SEEDS, low=0),
+    methods: Names = setting(tuple(METHODS), "ensembles", choices=METHODS),
+    told: Names = setting(("dbat-k3",), "ensembles whose options end at the true sub-goal instead: the control"),
+    baselines: Names = setting(tuple(BASELINES), "agents on the primitive actions", choices=BASELINES),
+    papers: Names = setting(tuple(PAPERS), "the same agents as the paper's tables have them", choices=PAPERS),
+    paper_layouts: Integers = setting(PLAYED[:5], "layouts of these, which take five times as long", low=0),
+    paper_seeds: Integers = setting(TRAINED[:5], "seeds of these", low=0),
 ) -> Iterator[Command]:
     """For each method and seed its ensemble, options and agents; then the control and the baselines."""
-    agents = agents_of(layouts, seeds, paired=paired)
-    paper_agents = agents_of(paper_layouts, paper_seeds, paired=paired)
+    agents = agents_of(layouts, seeds)
+    paper_agents = agents_of(paper_layouts, paper_seeds)
     yield Command("data", "collect doorkey")
     for method, seed in product(methods, seeds):
         ensemble = f"ensemble/method-{method}-seed-{seed}"

@@ -7,18 +7,9 @@ its own; options are planned (exact), so nothing here is a matter of option lear
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Annotated
 
-from hypogoal.experiments.experiment import (
-    Command,
-    Layouts,
-    Names,
-    Paired,
-    Seeds,
-    agents_of,
-    experiment,
-    explained,
-)
+from hypogoal.core.config import setting
+from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
 
 METHODS = {"dbat-k3": "--diversity dbat --members 3", "none-k3": "--diversity none --members 3"}
 
@@ -26,13 +17,12 @@ METHODS = {"dbat-k3": "--diversity dbat --members 3", "none-k3": "--diversity no
 @experiment("doorkey")
 def preference(
     *,
-    layouts: Layouts = tuple(range(300, 334)),
-    seeds: Seeds = tuple(range(3000, 3034)),
-    paired: Paired = True,
-    methods: Annotated[Names, explained("ensembles", choices=METHODS)] = tuple(METHODS),
+    layouts: Integers = setting(tuple(range(300, 334)), LAYOUTS, low=0),
+    seeds: Integers = setting(tuple(range(3000, 3034)), SEEDS, low=0),
+    methods: Names = setting(tuple(METHODS), "ensembles", choices=METHODS),
 ) -> Iterator[Command]:
     """For each method and seed its ensemble, then its agents."""
-    agents = agents_of(layouts, seeds, paired=paired)
+    agents = agents_of(layouts, seeds)
     yield Command("data", "collect doorkey --set heldout_layouts=1")
     for method, seed in product(methods, seeds):
         ensemble, columns = f"ensemble/method-{method}-seed-{seed}", {"method": method, "seed": seed}

@@ -4,9 +4,6 @@ The plan is ``sweep.json``. A cell is done when its output is there, runs while 
 its last attempt did (``logs/NAME.code``). Nothing else is recorded: a run may be killed and started again anywhere.
 """
 
-import re
-import signal
-from collections import Counter
 from pathlib import Path
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
@@ -16,22 +13,22 @@ from hypogoal.core.errors import UserError, reason
 
 PLAN = "sweep.json"
 NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's folder
-OUTPUT = re.compile("(^|=)@(.+)")  # in a word an output: @data, --data=@data
+HERE = "{run}"  # in a cell's words the run's folder
 DONE, RUNNING, FAILED, WAITING = "done", "running", "failed", "waiting"
-SCOPES = ("", "labelled", "unlabelled", "heldout", "unseen", "all")  # of numbers that ``results.csv`` has
-COLUMNS = ["sub_goal", "member", "scope", "quantity", "value"]
-STOPPED = (None, 128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)  # no failures
+STOPPED = ("", "130", "143", "-2", "-15")  # exit codes that are no failure: none yet, Ctrl-C, SIGTERM
+COLUMNS = ["artefact", "sub_goal", "member", "scope", "quantity", "value"]
 
 Value = str | int | float
 
 
 class Cell(BaseModel):
-    """One command of an experiment. ``@PLACE`` in its words is a place in the run's folder."""
+    """One command of an experiment, in the folder ``run``."""
 
     name: str = Field(pattern=NAME)
     words: list[str]
-    needs: list[str] = []  # names of cells whose outputs it reads
+    needs: list[str] = []  # places of the outputs that it reads
     columns: dict[str, Value] = {}  # of ``results.csv``
+    run: Path = Field(Path(), exclude=True)  # not in the plan: the folder may be moved
 
     @property
     def stage(self) -> str:
@@ -48,51 +45,52 @@ class Cell(BaseModel):
         """Its output in the run's folder."""
         return f"{self.name}.h5" if self.stage == "collect" else self.name
 
-    def draft(self, run: Path) -> Draft:
+    @property
+    def draft(self) -> Draft:
         """The draft of its output."""
-        return Draft(run / self.place)
+        return Draft(self.run / self.place)
 
-    def is_done(self, run: Path) -> bool:
+    @property
+    def is_done(self) -> bool:
         """Whether its output is there."""
-        return (run / self.place).exists()
+        return (self.run / self.place).exists()
 
-    def command(self, run: Path) -> list[str]:
+    @property
+    def is_makeable(self) -> bool:
+        """Whether it can be made: all that it reads is there."""
+        return not self.is_done and all((self.run / need).exists() for need in self.needs)
+
+    @property
+    def command(self) -> list[str]:
         """Its words as one types them after ``hypogoal``."""
-        words = [OUTPUT.sub(lambda match: f"{match[1]}{run / match[2]}", word) for word in self.words]
-        return [*words, "--out", str(run / self.place)]
+        words = [word.replace(HERE, str(self.run)) for word in self.words]
+        return [*words, "--out", str(self.run / self.place)]
 
-    def log(self, run: Path, suffix: str = "log") -> Path:
-        """What its attempts printed; with the suffix ``code``, how the last one ended."""
-        return run / "logs" / f"{self.name}.{suffix}"
+    def log(self, suffix: str = "log") -> Path:
+        """What its attempts printed; with the suffix ``code`` how the last one ended, a signal as a negative number."""
+        return self.run / "logs" / f"{self.name}.{suffix}"
 
-    def log_lines(self, run: Path, suffix: str = "log") -> list[str]:
-        """The lines of :meth:`log`, none where there is none."""
-        path = self.log(run, suffix)
-        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    def last_line(self, suffix: str = "log") -> str:
+        """The last line of :meth:`log`, empty where there is none."""
+        path = self.log(suffix)
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+        return lines[-1] if lines else ""
 
-    def exit_code(self, run: Path) -> int | None:
-        """How its last attempt ended, a signal as a negative number; None if it was not tried or has not ended."""
-        lines = self.log_lines(run, "code")
-        return int(lines[0]) if lines else None
-
-    def state(self, run: Path) -> str:
+    @property
+    def state(self) -> str:
         """Whether it is done, runs, failed or waits."""
-        if self.is_done(run):
+        if self.is_done:
             return DONE
-        if self.draft(run).is_locked:
+        if self.draft.is_locked:
             return RUNNING
-        return WAITING if self.exit_code(run) in STOPPED else FAILED
+        return WAITING if self.last_line("code") in STOPPED else FAILED
 
-    def last_words(self, run: Path) -> str:
-        """The last line of its log, or how it ended without one; and where the log is."""
-        lines = self.log_lines(run)
-        text = lines[-1].removeprefix("hypogoal: ") if lines else ""
-        code = self.exit_code(run)
-        if code == 0:
-            text = "it ended as if all were well, but made nothing"
-        elif code and code < 0:
-            text = f"ended by signal {-code}"
-        return f"{text} ({self.log(run)})"
+    @property
+    def last_words(self) -> str:
+        """The last line of its log, or the signal that ended it; and where the log is."""
+        code = self.last_line("code")
+        text = f"ended by signal {code[1:]}" if code.startswith("-") else self.last_line()
+        return f"{text.removeprefix('hypogoal: ')} ({self.log()})"
 
 
 CELLS = TypeAdapter(list[Cell])
@@ -104,19 +102,16 @@ def read_plan(run: Path) -> list[Cell]:
     if not path.exists():
         return []
     try:
-        return CELLS.validate_json(path.read_bytes())
+        cells = CELLS.validate_json(path.read_bytes())
     except ValidationError as error:
         problem = f"the plan is damaged, or of another version ({reason(error)})"
-        raise UserError(
-            problem,
-            path,
-            "Remove it: what is complete is kept.",
-        ) from None
+        raise UserError(problem, path, "Remove it: what is complete is kept.") from None
+    return [cell.model_copy(update={"run": run}) for cell in cells]
 
 
 def unmade(run: Path) -> list[str]:
     """The names of the cells that a run was to have and has not."""
-    return [cell.name for cell in read_plan(run) if not (cell.is_derived or cell.is_done(run))]
+    return [cell.name for cell in read_plan(run) if not (cell.is_derived or cell.is_done)]
 
 
 def write_results(run: Path, evaluation: Path) -> None:
@@ -126,27 +121,27 @@ def write_results(run: Path, evaluation: Path) -> None:
     """
     import pandas
 
-    rows = []
-    for cell in read_plan(run):
-        rows.append({"cell": cell.name, "stage": cell.stage, **cell.columns, "artefact": cell.place})
-    if not rows:
+    cells = read_plan(run)
+    if not cells:
         return
-    cells = pandas.DataFrame(rows, dtype=object)
+    rows = [{"cell": cell.name, "stage": cell.stage, **cell.columns, "artefact": cell.place} for cell in cells]
     numbers = pandas.read_csv(evaluation / "numbers.csv", dtype=str, keep_default_na=False)
-    listed = numbers[(numbers["step"] == "") & numbers["scope"].isin(SCOPES)]
-    results = cells.merge(listed[["artefact", *COLUMNS]], on="artefact", suffixes=("_of_cell", ""))
+    of_ends = numbers[numbers["step"] == ""]
+    made = pandas.DataFrame(rows, dtype=object)
+    results = made.merge(of_ends[COLUMNS], on="artefact", suffixes=("_of_cell", ""))
     results.drop(columns="artefact").to_csv(evaluation / "results.csv", index=False, lineterminator="\n")
 
 
 def status_lines(run: Path) -> list[str]:
     """How far a run is: a line of numbers, then what runs or failed with the last line of its log; done: none."""
-    states = [(cell, cell.state(run)) for cell in read_plan(run)]
-    counts = Counter(state for _, state in states)
-    if counts[DONE] == len(states):
+    cells = read_plan(run)
+    states = [cell.state for cell in cells]
+    left = [state for state in (RUNNING, FAILED, WAITING) if state in states]
+    if not left:
         return []
-    numbers = ", ".join(f"{counts[state]} {state}" for state in (RUNNING, FAILED, WAITING) if counts[state])
-    lines = [f"{run}: {counts[DONE]} of {len(states)} cells done, {numbers}"]
-    for cell, state in states:
+    numbers = ", ".join(f"{states.count(state)} {state}" for state in left)
+    lines = [f"{run}: {states.count(DONE)} of {len(states)} cells done, {numbers}"]
+    for cell, state in zip(cells, states, strict=True):
         if state in (RUNNING, FAILED):
-            lines.append(f"  {state} {cell.name}: {cell.last_words(run)}")
+            lines.append(f"  {state} {cell.name}: {cell.last_words}")
     return lines

@@ -207,10 +207,10 @@ def run(
     from hypogoal.experiments import run as runs
 
     out = out or Path("runs", Path(experiment.rpartition(":")[2]).stem)
-    cells, workers = plans.plan(experiment, preset=preset, assignments=set_ or (), seeds=seed, device=device)
+    cells, workers = plans.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seed, device=device)
     if dry_run:
         for cell in runs.in_part(cells, from_, only):
-            say(shlex.join(["hypogoal", *cell.command(out)]))
+            say(shlex.join(["hypogoal", *cell.command]))
         return
     if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
         processes.prepare(device)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from examples.figure6 import LAYOUTS, SEEDS, STEPS
+from examples.figure6 import PLAYED, STEPS, TRAINED
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.processes import prepare
 from hypogoal.domains.base import Engine, Step
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("csv", type=Path, help="the file of all agents' numbers")
     arguments = parser.parse_args()
     agents = read_agents(arguments.csv)
-    for layout, seed in zip(LAYOUTS, SEEDS, strict=True):
+    for layout, seed in zip(PLAYED, TRAINED, strict=True):
         agent = (METHOD, str(layout))
         if agent in agents:
             continue

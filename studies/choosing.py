@@ -1,6 +1,6 @@
 """What choosing is worth, played by the agents of a sweep: the rows behind the result, and its tables.
 
-hypogoal run doorkey --preset choosing --out runs/choosing
+hypogoal run choosing --out runs/choosing
 python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run rooms --out runs/rooms
 python -m studies.choosing runs/rooms docs/results/rooms.csv

@@ -4,56 +4,56 @@
 """
 
 from collections.abc import Callable, Iterator
-from itertools import product
-from typing import Annotated, Any
+from dataclasses import replace
+from typing import Any
 
-from hypogoal.cells import Value
-from hypogoal.experiments.experiment import Command, Layouts, Names, Paired, Seeds, agents_of, experiment, explained
+from hypogoal.core.config import setting
+from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
 
 CONTROLS = {"random": "--set chooser=random", "oracle": "--set termination=oracle"}
 BASELINES = {
-    f"{agent}-{tuning}": f"--agent {agent} --set setting={tuning}"
-    for agent, tuning in product(("ppo", "dqn"), ("paper", "tuned"))
+    "ppo-paper": "--agent ppo --set setting=paper",
+    "ppo-tuned": "--agent ppo --set setting=tuned",
+    "dqn-paper": "--agent dqn --set setting=paper",
+    "dqn-tuned": "--agent dqn --set setting=tuned",
 }
-Pretrain = Annotated[bool, explained("train-options before train-meta; false is the paper's D5")]
-Controls = Annotated[Names, explained("controls beside the agent", source="ours: controls", choices=CONTROLS)]
-Baselines = Annotated[Names, explained("agents on primitive actions", source="paper, Figure 6", choices=BASELINES)]
+COMPARED = "agents on primitive actions"
+PRETRAIN = "train-options before train-meta; false is the paper's D5"
 
 
 @experiment("doorkey")
 def doorkey(
     stage: Callable[[str], Any],
     *,
-    layout_seeds: Layouts = (100,),
-    seeds: Seeds = (0,),
-    paired: Paired = False,
-    pretrain: Pretrain = True,
-    controls: Controls = tuple(CONTROLS),
-    baselines: Baselines = tuple(BASELINES),
+    layout_seeds: Integers = setting((100,), LAYOUTS, source="paper, Figure 6", low=0),
+    seeds: Integers = setting((0,), SEEDS, low=0),
+    pretrain: bool = setting(True, PRETRAIN),
+    controls: Names = setting(tuple(CONTROLS), "controls beside the agent", source="ours: controls", choices=CONTROLS),
+    baselines: Names = setting(tuple(BASELINES), COMPARED, source="paper, Figure 6", choices=BASELINES),
 ) -> Iterator[Command]:
-    """The options and the agent of a layout and seed, then those of the next; controls and baselines last."""
-
-    def command(agent: str, words: str, layout: int, seed: int) -> Command:
-        words = f"{words} --seed {seed} --layout-seed {layout}"
-        columns: dict[str, Value] = {"agent": agent, "seed": seed, "layout_seed": layout}
-        return Command(f"{agent}/layout-{layout}-seed-{seed}", words, columns)
-
-    agents = agents_of(layout_seeds, seeds, paired=paired)
-    yield Command("data", "collect doorkey")
-    for seed in seeds:
-        columns: dict[str, Value] = {"agent": "ensemble", "seed": seed}
-        yield Command(f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}", columns)
-    for layout, seed in agents:
-        ensemble, options = f"@ensemble/seed-{seed}", ""
-        if pretrain:
-            yield command("options", f"train-options {ensemble}", layout, seed)
-            options = f"--options @options/layout-{layout}-seed-{seed}"
-        yield command("meta", f"train-meta {ensemble} {options}", layout, seed)
+    """The ensembles of all seeds, then all of a layout and seed: options, agent, controls, baselines."""
+    agents = agents_of(layout_seeds, seeds)
+    is_one = len(agents) == 1  # then names are short: runs/demo/ensemble
     # What is compared with the agent plays as many steps as its options and it together.
     steps = stage("train-meta").steps + (stage("train-options").steps if pretrain else 0)
-    for control, (layout, seed) in product(controls, agents):
-        words = f"train-meta @ensemble/seed-{seed} {CONTROLS[control]} --set steps={steps}"
-        yield command(f"meta-{control}", words, layout, seed)
-    for baseline, (layout, seed) in product(baselines, agents):
-        words = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
-        yield command(baseline, words, layout, seed)
+    yield Command("data", "collect doorkey")
+    ensembles = {seed: "ensemble" if is_one else f"ensemble/seed-{seed}" for seed in seeds}
+    for seed, ensemble in ensembles.items():
+        yield Command(ensemble, f"train-ensemble @data --seed {seed}", {"agent": "ensemble", "seed": seed})
+    for layout, seed in agents:
+        at = "" if is_one else f"/layout-{layout}-seed-{seed}"
+        commands = {"meta": f"train-meta @{ensembles[seed]}"}
+        if pretrain:
+            options = f"train-options @{ensembles[seed]}"
+            commands = {"options": options, "meta": f"{commands['meta']} --options @options{at}"}
+        for control in controls:
+            words = f"train-meta @{ensembles[seed]} {CONTROLS[control]} --set steps={steps}"
+            commands[f"meta-{control}"] = words
+        for baseline in baselines:
+            commands[baseline] = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
+        for agent, words in commands.items():
+            columns = {"agent": agent, "seed": seed, "layout_seed": layout}
+            yield Command(f"{agent}{at}", f"{words} --seed {seed} --layout-seed {layout}", columns)
+
+
+figure6 = replace(doorkey, preset="figure6")  # at a laptop's size

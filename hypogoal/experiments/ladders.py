@@ -3,12 +3,12 @@
 ``hypogoal run montezuma-ladders --out runs/ladders --preset demo``
 """
 
-import shlex
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
-from typing import Annotated
 
-from hypogoal.experiments.experiment import Command, Integers, Names, Seeds, experiment, explained
+from hypogoal.core.config import setting
+from hypogoal.experiments.experiment import SEEDS, Command, Integers, Names, experiment
 
 METHODS = {
     "dbat": "--set diversity=dbat",
@@ -16,56 +16,39 @@ METHODS = {
     "cnn": "--set diversity=none --set members=1",
 }
 ENSEMBLES = "ensembles: D-BAT, the same without diversity, a single CNN"
-CHANGES = """changes to compare: settings of train-ensemble as key=value, several with spaces between; \
-each gives one more ensemble per method"""
 OPTION_GROUPS = "the N whose ensembles get options; they must be among 'groups'"
 OPTION_METHODS = "the ensembles that get options; they must be among 'methods'"
-SUB_GOAL = "what is labelled, a sub-goal of collect montezuma; empty: climb-down-ladder. 'ladders' are starts then"
-ORACLE = "options that end at the true sub-goal beside them, on each ladder"
 
 
 @experiment("montezuma")
 def montezuma_ladders(
     *,
-    groups: Annotated[Integers, explained("labelled ladder groups (N)", source="Figure 3", low=1, high=7)] = (
-        1,
-        2,
-        3,
-        7,
-    ),
-    seeds: Seeds = (0,),
-    methods: Annotated[Names, explained(ENSEMBLES, source="Figure 3", choices=METHODS)] = tuple(METHODS),
-    sub_goal: Annotated[str, explained(SUB_GOAL, source="authors' code")] = "",
-    variants: Annotated[Names, explained(CHANGES)] = (),
-    ladders: Annotated[Names, explained("ladders to learn options on; empty for none", source="Figure 4")] = (),
-    option_groups: Annotated[Integers, explained(OPTION_GROUPS, low=1, high=7)] = (2,),
-    option_methods: Annotated[Names, explained(OPTION_METHODS, choices=METHODS)] = tuple(METHODS),
-    oracle: Annotated[bool, explained(ORACLE, source="ours: a control")] = True,
+    groups: Integers = setting((1, 2, 3, 7), "labelled ladder groups (N)", source="Figure 3", low=1, high=7),
+    seeds: Integers = setting((0,), SEEDS, low=0),
+    methods: Names = setting(tuple(METHODS), ENSEMBLES, source="Figure 3", choices=METHODS),
+    ladders: Names = setting((), "ladders to learn options on; empty for none", source="Figure 4"),
+    option_groups: Integers = setting((2,), OPTION_GROUPS, low=1, high=7),
+    option_methods: Names = setting(tuple(METHODS), OPTION_METHODS, choices=METHODS),
 ) -> Iterator[Command]:
     """The states and ensembles of each N, then the options of each ladder and seed with their oracle."""
-    labelled = f" --set sub_goals={sub_goal}" if sub_goal else ""
     for count in groups:
-        yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}{labelled}", {"groups": count})
-        for method, variant, seed in product(methods, ("", *variants), seeds):
-            changes = variant.split()
-            sets = " ".join(f"--set {shlex.quote(change)}" for change in changes)
-            yield Command(
-                f"ensemble/{','.join([method, *changes])}/groups-{count}-seed-{seed}",
-                f"train-ensemble @data/groups-{count} {METHODS[method]} {sets} --seed {seed}",
-                {"method": method, "variant": variant, "groups": count, "seed": seed},
-            )
+        yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}", {"groups": count})
+    for count, method, seed in product(groups, methods, seeds):
+        words = f"train-ensemble @data/groups-{count} {METHODS[method]} --seed {seed}"
+        columns = {"method": method, "groups": count, "seed": seed}
+        yield Command(f"ensemble/{method}/groups-{count}-seed-{seed}", words, columns)
     for ladder, seed in product(ladders, seeds):
-        ensembles = list(product(option_groups, option_methods))
-        for count, method in ensembles:
-            yield Command(
-                f"options/{method}/groups-{count}-ladder-{ladder}-seed-{seed}",
-                f"train-options @ensemble/{method}/groups-{count}-seed-{seed} --set start={ladder} --seed {seed}",
-                {"method": method, "groups": count, "ladder": ladder, "seed": seed},
-            )
-        for count, method in ensembles[:1] if oracle else ():  # any will do: what these options end at is not learned
-            yield Command(
-                f"options/oracle/ladder-{ladder}-seed-{seed}",
-                f"train-options @ensemble/{method}/groups-{count}-seed-{seed} --set start={ladder}"
-                f" --set termination=oracle --seed {seed}",
-                {"method": "oracle", "ladder": ladder, "seed": seed},
-            )
+        for count, method in product(option_groups, option_methods):
+            ensemble = f"@ensemble/{method}/groups-{count}-seed-{seed}"
+            words = f"train-options {ensemble} --set start={ladder} --seed {seed}"
+            place = f"options/{method}/groups-{count}-ladder-{ladder}-seed-{seed}"
+            yield Command(place, words, {"method": method, "groups": count, "ladder": ladder, "seed": seed})
+        if option_groups and option_methods:  # any ensemble will do: what these options end at is not learned
+            place = f"options/oracle/ladder-{ladder}-seed-{seed}"
+            words = f"{words} --set termination=oracle"
+            yield Command(place, words, {"method": "oracle", "ladder": ladder, "seed": seed})
+
+
+# At a laptop's size; the first without options.
+figure3 = replace(montezuma_ladders, preset="figure3", given={"ladders": ""})
+figure4 = replace(montezuma_ladders, preset="figure4")

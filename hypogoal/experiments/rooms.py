@@ -6,9 +6,9 @@ uniform-random choice among its own options.
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Annotated
 
-from hypogoal.experiments.experiment import Command, experiment, explained
+from hypogoal.core.config import setting
+from hypogoal.experiments.experiment import Command, Integers, Names, experiment
 
 METHODS = {  # one member more than features, and two for joint
     "dbat": "--diversity dbat --members 3",
@@ -17,16 +17,15 @@ METHODS = {  # one member more than features, and two for joint
     "one": "--diversity none --members 1",
     "joint": "--diversity none --members 2 --set teacher=joint:independent",
 }
-Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles, rooms and agents of its own")]
-Truths = Annotated[tuple[str, ...], explained("what the reward asks for", choices=("shape", "place"))]
+ROOMS = "seeds: each has states, ensembles, rooms and agents of its own"
 
 
 @experiment("rooms")
 def rooms(
     *,
-    seeds: Rooms = tuple(range(990, 1000)),
-    methods: Annotated[tuple[str, ...], explained("ensembles", choices=METHODS)] = ("dbat", "none", "one"),
-    truths: Truths = ("shape", "place"),
+    seeds: Integers = setting(tuple(range(990, 1000)), ROOMS),
+    methods: Names = setting(("dbat", "none", "one"), "ensembles", choices=METHODS),
+    truths: Names = setting(("shape", "place"), "what the reward asks for", choices=("shape", "place")),
 ) -> Iterator[Command]:
     """The states of each seed, its ensembles, then an agent for each of them and each truth."""
     for seed in seeds:

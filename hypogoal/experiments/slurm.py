@@ -1,7 +1,7 @@
 """Cells as Slurm job arrays (Spec G4): Slurm decides where and when, what is on the disk says what is done.
 
-There is an array for the cells of a stage at a depth of the experiment. It begins when the arrays that it reads have
-ended, successfully or not (``afterany``). Slurm's accounting is not needed. A cell saves before its time limit and is
+There is an array for the cells of a stage. It begins when the arrays that it reads have ended, successfully or not
+(``afterany``). Slurm's accounting is not needed. A cell saves before its time limit and is
 queued again; when it is cancelled, it saves too.
 """
 
@@ -17,6 +17,7 @@ from hypogoal.cells import Cell
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.experiments.local import surroundings
+from hypogoal.stages import LISTED
 
 JOBS = "slurm/jobs"  # the numbers of the jobs last submitted, the last of them first: scancel $(cat ...)
 
@@ -40,25 +41,18 @@ wait "$cell"; code=$?; echo "$code" >"$log.code"; exit "$code"
 def check_free(run: Path, *, is_wanted: bool) -> None:
     """Refuse (``UserError``) a run whose jobs wait or run and, if Slurm ``is_wanted``, a machine without it."""
     if is_wanted and shutil.which("sbatch") is None:
-        raise UserError(
-            "there is no Slurm here (no sbatch)",
-            "--engine slurm",
-            "Use --engine local.",
-        )
+        raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     jobs = run / JOBS
-    if jobs.exists() and shutil.which("squeue"):
-        numbers = ",".join(jobs.read_text().split())
-        alive = _asked("squeue", "--me", "--noheader", "--format=%A", f"--jobs={numbers}").stdout.split()
-        if alive:
-            raise UserError(
-                "this run is in Slurm's queue",
-                run,
-                f"Wait, or end it: scancel {' '.join({*alive})}",
-            )
+    if not jobs.exists() or shutil.which("squeue") is None:
+        return
+    numbers = ",".join(jobs.read_text().split())
+    alive = _asked("squeue", "--me", "--noheader", "--format=%A", f"--jobs={numbers}").stdout.split()
+    if alive:
+        raise UserError("this run is in Slurm's queue", run, f"Wait, or end it: scancel {' '.join({*alive})}")
 
 
 def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], say: Callable[[str], None]) -> None:
-    """Submit an array for each stage of these cells at a depth.
+    """Submit an array for each stage of these cells.
 
     At most ``cap`` cells of an array run at once; 0 is no limit. ``options`` are of ``sbatch``. Every node must see
     the run's folder under the same path. A refusal by Slurm is a ``UserError``.
@@ -67,51 +61,39 @@ def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], s
     folder.mkdir(exist_ok=True)
     output = f"--output={str(folder).replace('%', '%%')}/%x-%A-%a.out"
     here, python = shlex.quote(os.getcwd()), shlex.quote(sys.executable)
-    jobs: list[str] = []
-    job_of: dict[str, str] = {}
-    for name, part in _arrays(cells).items():
+    job_of: dict[str, str] = {}  # by what it makes
+    for name in LISTED:  # a stage reads what those before it made
+        part = [cell for cell in cells if cell.stage == name]
+        if not part:
+            continue
         listed, script = folder / f"{name}.txt", folder / f"{name}.sh"
-        replace_text(listed, "".join(_line(cell, run) for cell in part))
+        replace_text(listed, "".join(map(_line, part)))
         replace_text(script, SCRIPT.format(here=here, python=python, cells=shlex.quote(str(listed))))
-        needs: set[str] = set()
-        for cell in part:
-            needs |= {job_of[need] for need in cell.needs if need in job_of}
-        words = [f"--job-name={run.resolve().name}-{name}", output, f"--array=0-{len(part) - 1}"]
+        array = f"--array=0-{len(part) - 1}"
         if cap:
-            words[-1] += f"%{cap}"
-        if needs:
-            words.append(f"--dependency=afterany:{':'.join(sorted(needs))}")
+            array += f"%{cap}"
+        words = [f"--job-name={folder.parent.name}-{name}", output, array]
+        before: set[str] = set()
+        for cell in part:
+            before.update(job_of[need] for need in cell.needs if need in job_of)
+        if before:
+            words.append(f"--dependency=afterany:{':'.join(sorted(before))}")
         done = _asked("sbatch", "--parsable", *words, *options, str(script))
         last = done.stdout.splitlines()[-1:]  # a banner may come before
         job = "".join(last).partition(";")[0]
+        jobs = " ".join(dict.fromkeys(reversed(job_of.values())))
         if done.returncode or not job.isdigit():
-            queued = f"Queued are {' '.join(jobs)}: end them with scancel. " if jobs else ""
-            problem = f"Slurm refuses {name} ({done.stderr or done.stdout})"
-            raise UserError(
-                problem,
-                None,
-                f"{queued}Change the options and give --resume.",
-            )
-        jobs.insert(0, job)
-        replace_text(run / JOBS, "\n".join(jobs) + "\n")
-        job_of |= dict.fromkeys([cell.name for cell in part], job)
+            do = f"Queued are {jobs}: end them with scancel. Change the options and give --resume."
+            raise UserError(f"Slurm refuses {name} ({done.stderr or done.stdout})", None, do)
+        replace_text(run / JOBS, f"{job} {jobs}\n")
+        job_of |= dict.fromkeys([cell.place for cell in part], job)
         say(f"job {job}: {name}, {len(part)} cells")
 
 
-def _arrays(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
-    """The cells of each array by its name, in the order of submission."""
-    depth: dict[str, int] = {}  # the longest chain of cells before each
-    arrays: dict[str, list[Cell]] = {}
-    for cell in cells:
-        depth[cell.name] = 1 + max((depth.get(need, -1) for need in cell.needs), default=-1)
-        arrays.setdefault(f"{depth[cell.name]:02d}-{cell.stage}", []).append(cell)
-    return dict(sorted(arrays.items()))
-
-
-def _line(cell: Cell, run: Path) -> str:
+def _line(cell: Cell) -> str:
     """What the batch script needs of a cell."""
-    log = cell.log(run).with_suffix("")
-    return shlex.join([str(log), str(cell.draft(run).checkpoint), *cell.command(run), "--resume"]) + "\n"
+    log = cell.log().with_suffix("")
+    return shlex.join([str(log), str(cell.draft.checkpoint), *cell.command, "--resume"]) + "\n"
 
 
 def _asked(*words: str) -> subprocess.CompletedProcess[str]:

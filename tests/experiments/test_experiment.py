@@ -13,19 +13,16 @@ from hypogoal.cells import Cell
 from hypogoal.core import own_code
 from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
-from hypogoal.experiments.experiment import read_toml
-from hypogoal.experiments.named import config_class_of
+from hypogoal.experiments.named import config_class_of, read_toml
 from hypogoal.experiments.plan import plan
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("somewhere")
 MODULE = """
-from typing import Annotated
-
-from hypogoal.experiments.experiment import explained
+from hypogoal.core.config import setting
 
 
-def members(*, sizes: Annotated[tuple[int, ...], explained("members", low=1)] = (1, 3), small: bool = False):
+def members(*, sizes: tuple[int, ...] = setting((1, 3), "members", low=1), small: bool = False):
     yield "data", "collect doorkey"
     for size in sizes:
         yield f"ensemble/size-{size}", f"train-ensemble @data --members {size}", {"size": size}
@@ -43,7 +40,7 @@ cells = [
 
 
 def cells_of(name: str, *assignments: str, **given: str) -> list[Cell]:
-    return plan(name, assignments=assignments, **given)[0]  # type: ignore[arg-type]
+    return plan(name, OUT, assignments=assignments, **given)[0]  # type: ignore[arg-type]
 
 
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, *assignments: str) -> list[Cell]:
@@ -69,11 +66,11 @@ def test_a_generator_of_names_and_commands(tmp_path: Path, monkeypatch: pytest.M
     assert [*cells] == ["data", *kinds, "evaluation", "report"]
     ensemble = cells["ensemble/size-3"]
     words = "train-ensemble somewhere/data.h5 --members 3 --out somewhere/ensemble/size-3"
-    assert ensemble.command(OUT) == words.split()
-    assert ensemble.needs == ["data"] and ensemble.columns == {"size": 3}
-    assert "--data=somewhere/data.h5" in cells["agent/size-3"].command(OUT)
-    assert cells["evaluation"].command(OUT) == ["evaluate", "somewhere", "--out", "somewhere/evaluation"]
-    assert cells["evaluation"].needs == ["data", *kinds] and cells["report"].needs == ["evaluation"]
+    assert ensemble.command == words.split()
+    assert ensemble.needs == ["data.h5"] and ensemble.columns == {"size": 3}
+    assert "--data=somewhere/data.h5" in cells["agent/size-3"].command
+    assert cells["evaluation"].command == ["evaluate", "somewhere", "--out", "somewhere/evaluation"]
+    assert cells["evaluation"].needs == ["data.h5", *kinds] and cells["report"].needs == ["evaluation"]
 
 
 def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
@@ -82,7 +79,7 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
     agents = [cell for cell in cells if cell.stage == "train-meta"]
     assert len(agents) == 6 and [cell.stage for cell in cells].count("collect") == 1
     words = "train-meta somewhere/ensemble/seed-1 --layout-seed 212 --seed 1 --out somewhere/agent/seed-1-layout-212"
-    assert agents[-1].command(OUT) == words.split() and agents[-1].needs == ["ensemble/seed-1"]
+    assert agents[-1].command == words.split() and agents[-1].needs == ["ensemble/seed-1"]
     assert agents[-1].columns == {"group": "agent", "seed": 1, "layout": 212}
     ten = of_toml(tmp_path, TOML, "seed=0-4", "layout=1,5", "evaluate=false")
     assert sum(cell.stage == "train-meta" for cell in ten) == 10 and ten[-1].stage == "train-meta"
@@ -91,15 +88,15 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
 
 NO_FUNCTION = [
     ('"collect doorkey"', '"rm -rf x"', "this is no stage"),
-    ('"collect doorkey"', '"collect \'doorkey"', "cannot be read"),
+    ('"collect doorkey"', '"collect \'doorkey"', "this is no command"),
     ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "reads what no cell before it makes"),
-    ('"collect doorkey"', "[3]", r"yields \(name, command\)"),
-    ('yield "data"', 'yield "../data"', "becomes a file's"),
+    ('"data", "collect doorkey"', "[3]", r"yields \(name, command\)"),
+    ('"collect doorkey"', "3", r"yields \(name, command\)"),
+    ('yield "data"', 'yield "../data"', "should match pattern"),
     ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "a name of its own"),
-    ("--members {size}", "--members {size} --set stepps=3", "ensemble/size-1: train-ensemble has no setting"),
-    ("--members {size}", "--members {size} --steps 0", "ensemble/size-1: "),
+    ("--members {size}", "--members {size} --set stepps=3", "(?s)train-ensemble has no setting.*ensemble/size-1"),
+    ("--members {size}", "--members {size} --steps 0", "(?s)steps.*ensemble/size-1"),
     ("small: bool = False", "small: bool", "cannot be a setting"),
-    ("small: bool = False", "workers: int = 3", "cannot be a setting"),
     ("def members", "members = 3\ndef other", "not an experiment"),
 ]
 NO_TOML = [
@@ -110,7 +107,6 @@ NO_TOML = [
     ('axes = ["seed"], command', "command", "cannot be read"),
     ("[0, 1]", "[0, 0]", "a name of its own"),
     ("[0, 1]", '"1-"', "seed"),
-    ('"collect doorkey --seed', "\"collect 'doorkey", "cannot be read"),
     ("cells = [", "cells = [ [", "cannot be read"),
     ("collect doorkey --seed", "collect evil:DOMAIN --seed", "a file names code of its own"),
 ]
@@ -161,7 +157,7 @@ def test_a_function_is_the_users_word_only_if_typed(tmp_path: Path, monkeypatch:
         ("doorkey", ["pretrain=false"]),
         ("choosing", []),
         ("rooms", []),
-        ("montezuma-ladders", ["ladders=1L,2-6", "seeds=0,1", "variants=batch_size=16"]),
+        ("montezuma-ladders", ["ladders=1L,2-6", "seeds=0,1"]),
     ],
 )
 def test_cells_need_only_what_cells_before_them_make(experiment: str, changes: list[str]) -> None:
@@ -170,7 +166,7 @@ def test_cells_need_only_what_cells_before_them_make(experiment: str, changes: l
     made: set[str] = set()
     for cell in others:
         assert {*cell.needs} <= made
-        made.add(cell.name)
+        made.add(cell.place)
     assert {*evaluation.needs} == made and len(made) == len(others)
     trained = [(cell.stage, *cell.columns.items()) for cell in others if cell.stage.startswith("train")]
     assert len({*trained}) == len(trained) or experiment == "choosing"
@@ -188,17 +184,17 @@ def settings(cell: Cell) -> dict[str, str]:
     return dict(word.split("=", 1) for before, word in pairwise(cell.words) if before == "--set")
 
 
-def test_what_all_cells_are_given_undoes_no_variant_and_no_method() -> None:
-    """Spec F1: the single CNN has one member and a variant its own setting, whatever --set train-ensemble.KEY says."""
+def test_what_all_cells_are_given_undoes_no_method() -> None:
+    """Spec F1: the single CNN has one member, whatever --set train-ensemble.KEY says."""
     common = [f"train-ensemble.{pair}" for pair in ("members=3", "diversity=none", "batch_size=8")]
-    changes = ["groups=1", "variants=batch_size=16", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
+    changes = ["groups=1", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
     cells = cells_of("montezuma-ladders", *changes, *common, "train-options.termination=learned")
     for cell in cells:
         has = settings(cell)
         if cell.stage == "train-ensemble":
             assert has["diversity"] == ("dbat" if cell.columns["method"] == "dbat" else "none")
             assert has["members"] == ("1" if cell.columns["method"] == "cnn" else "3")
-            assert has["batch_size"] == ("16" if cell.columns["variant"] else "8")
+            assert has["batch_size"] == "8"
     options = [settings(cell) for cell in cells if cell.stage == "train-options"]
     assert {has["start"] for has in options} == {"1L"}
     assert [has["termination"] for has in options].count("oracle") == 1
@@ -227,17 +223,16 @@ def test_the_papers_figures_are_experiments() -> None:
     assert cells_of("figure6") == cells_of("doorkey", preset="figure6")
     assert cells_of("figure4") == cells_of("montezuma-ladders", preset="figure4")
     assert cells_of("figure3") == cells_of("montezuma-ladders", preset="figure3")
-    assert cells_of("doorkey", preset="choosing") == cells_of("choosing")
     assert cells_of("figure6", preset="paper") == cells_of("doorkey", preset="paper")
     assert not any(cell.stage == "train-options" for cell in cells_of("figure3", preset="paper"))
-    ten = cells_of("figure6", "paired=false", "layout_seeds=210-219", seeds="0")
+    ten = cells_of("figure6", "layout_seeds=210-219", seeds="0")
     agents = [cell.columns for cell in ten if cell.stage == "train-meta" and cell.columns["agent"] == "meta"]
     assert [columns["layout_seed"] for columns in agents] == [*range(210, 220)]
-    pairs = cells_of("doorkey", "paired=true", "layout_seeds=7,8", "baselines=ppo-tuned", seeds="3,5")
+    pairs = cells_of("doorkey", "layout_seeds=7,8", "baselines=ppo-tuned", seeds="3,5")
     places = {(cell.columns["layout_seed"], cell.columns["seed"]) for cell in pairs if "layout_seed" in cell.columns}
     assert places == {(7, 3), (8, 5)}
-    with pytest.raises(UserError, match="10 layouts cannot be paired with 1 seeds"):
-        cells_of("figure6", seeds="0")
+    with pytest.raises(UserError, match="10 layouts cannot be paired with 2 seeds"):
+        cells_of("figure6", seeds="0,1")
 
 
 def test_settings_of_run_are_the_signatures() -> None:
@@ -245,7 +240,7 @@ def test_settings_of_run_are_the_signatures() -> None:
     rows = {row["name"]: row for row in described(config_class_of("run", "montezuma"))}
     assert (rows["groups"]["default"], rows["groups"]["allowed"]) == ([1, 2, 3, 7], "1 .. 7")
     assert rows["methods"]["allowed"] == "dbat|none|cnn" and rows["methods"]["source"] == "Figure 3"
-    assert rows["oracle"]["type"] == "bool" and "workers" in rows and "evaluate" in rows
+    assert "workers" in rows and "evaluate" in rows
     assert {*read_toml(ROOT / "examples" / "sweep-doorkey.toml").model.model_fields} > {"seed", "layout", "members"}
 
 

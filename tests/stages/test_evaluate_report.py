@@ -167,7 +167,7 @@ def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypat
     for name in ("ensemble", "ensemble-none"):
         shutil.copytree(tiny_run / name, tmp_path / name)
     shutil.copy(tiny_run / "data.h5", tmp_path / "data.h5")
-    begin([Cell(name=name, words=["train-ensemble", "d"]) for name in ("ensemble", "other")], tmp_path)
+    begin([Cell(name=name, words=["train-ensemble", "d"], run=tmp_path) for name in ("ensemble", "other")], tmp_path)
     *lines, then, where = run("evaluate", tmp_path).out.splitlines()
     assert max(map(len, lines)) <= 80
     assert (then, where) == (f"next: hypogoal report {tmp_path}", str(tmp_path / "evaluation"))
