@@ -4,7 +4,16 @@
     python robot_bin.py answer AUDIT takes labels.csv    # a person's answers to what an audit proposes
     python robot_bin.py judge ENSEMBLE ...               # is an arm fooled that stops at the first positive frame?
 
-docs/robot.md tells the story. Needs `pip install 'hypogoal[lerobot]' mujoco` and, without a screen, an EGL driver.
+docs/audit.md tells the story; in this folder:
+
+    hypogoal import takes --label block-in-bin=takes/labels.csv --out runs/bin/data.h5
+    LIKE="--set steps=150 --set learning_rate=1e-3 --set members=1 --set diversity=none"
+    hypogoal train-ensemble runs/bin/data.h5 --out runs/bin/first $LIKE
+    hypogoal audit runs/bin/first --out runs/bin/audit
+    hypogoal import runs/bin/data.h5 --label block-in-bin=labels.csv --out runs/bin/more.h5
+    hypogoal train-ensemble runs/bin/more.h5 --out runs/bin/second $LIKE
+
+Needs `pip install 'hypogoal[lerobot]' mujoco` and, without a screen, an EGL driver.
 """
 
 import csv

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -146,9 +147,17 @@ def test_equations_lead_to_code() -> None:
                 assert hasattr(module, name), (row, name)
 
 
+def test_the_picture_of_the_stages_is_drawn_from_their_code() -> None:
+    """``python docs/stages.py`` would change nothing; each stage reads and writes what it declares."""
+    picture = runpy.run_path(str(DOCS / "stages.py"))
+    assert picture["drawn"]() == (DOCS / "stages.svg").read_text(encoding="utf-8")
+    stage = ROOT / "hypogoal" / "stages" / "train_meta.py"
+    assert picture["declared"](stage) == ("train-meta", ["ensemble", "options"], "meta")
+
+
 def test_requirements_lead_to_code_and_tests() -> None:
     """Each requirement's row names files that exist; tests cite all rows, and nothing else."""
-    rows = re.findall(r"^\| ([A-I]\d) \| .+ \| ([^|]+) \|$", (DOCS / "requirements.md").read_text(), re.M)
+    rows = re.findall(r"^\| ([A-I]\d) \| .+ \| ([^|]+) \|$", (DOCS / "deviations.md").read_text(), re.M)
     tests = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     cited = re.findall(r"[A-I]\d", " ".join(re.findall(r"Spec [A-I]\d(?:[-, ]+[A-I]\d)*", tests)))
     assert {number for number, _ in rows} == set(cited)

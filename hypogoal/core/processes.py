@@ -97,7 +97,7 @@ def _run(task: Callable[[], T]) -> T:
 
 
 def prepare(device: str = "auto") -> str:
-    """Use one torch thread without denormal numbers; returns ``cpu`` or ``cuda`` (``auto`` is the CPU, decision 26).
+    """Use one torch thread without denormal numbers; returns ``cpu`` or ``cuda`` (``auto`` is the CPU).
 
     One thread per process is as fast on small networks, does not suffer from busy neighbours, and gives the same bytes
     again on the same machine; other processors round differently. Denormal numbers (below 1e-38, where Adam's moments
@@ -112,7 +112,7 @@ def prepare(device: str = "auto") -> str:
         raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
     if device == "cuda" and not torch.cuda.is_available():
         installed = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
-        raise UserError("torch finds no GPU", installed, "Use --device cpu, or see docs/gpu.md.")
+        raise UserError("torch finds no GPU", installed, "Use --device cpu, or see docs/cluster.md.")
     return "cuda" if device == "cuda" else "cpu"
 
 

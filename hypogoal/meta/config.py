@@ -37,7 +37,7 @@ class MetaConfig(Config):
     advantage_floor: float = setting(
         0.1,
         "advantages are divided by their standard deviation, or by this if it is larger",
-        source="ours: docs/decisions.md; paper: 0",
+        source="ours (DEV-34); paper: 0",
         low=0.0,
     )
 

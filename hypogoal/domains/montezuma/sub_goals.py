@@ -1,7 +1,7 @@
 """The sub-goals on Montezuma's Revenge: where each holds, by the console's memory, and the rooms that label it.
 
 The paper has the first; the others are in its authors' repository (``monte_terminations.py``). One more is one more
-entry of ``SUB_GOALS``. Where enemies and lasers are is in ``measured.toml``, see docs/montezuma.md.
+entry of ``SUB_GOALS``. Where enemies and lasers are is in ``measured.toml``, see docs/deviations.md.
 """
 
 from collections.abc import Callable, Iterable, Sequence
