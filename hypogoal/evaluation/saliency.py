@@ -176,7 +176,7 @@ def context(results: Results) -> dict[str, Any] | None:
     if looked_at is None:
         return None
     sub_goals = looked_at["sub_goals"]
-    states = []
+    states: list[dict[str, Any]] = []
     for name, facts in sub_goals.items():
         arrays = results.within(f"saliency/{name}")
         if "observations" in arrays:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from itertools import product
 
 from hypogoal.core.config import setting
-from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
+from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Columns, Command, Integers, Names, agents_of, experiment
 
 METHODS = {
     "dbat": "--diversity dbat --members 6",
@@ -34,8 +34,8 @@ def choosing(
     for (layout, seed), method in product(agents_of(layouts, seeds), methods):
         place = f"method-{method}-layout-{layout}-seed-{seed}"
         ensemble, of_agent = f"@ensemble/method-{method}-seed-{seed}", f"--seed {seed} --layout-seed {layout}"
-        columns = {"policy": "learned", "method": method, "layout_seed": layout, "seed": seed}
+        columns: Columns = {"policy": "learned", "method": method, "layout_seed": layout, "seed": seed}
         words = f"train-meta {ensemble} {of_agent} --set network=planned"
-        yield Command(f"planned/{place}", words, columns | {"policy": "planned"})
+        yield Command(f"planned/{place}", words, {**columns, "policy": "planned"})
         yield Command(f"options/{place}", f"train-options {ensemble} {of_agent}", columns)
         yield Command(f"agent/{place}", f"train-meta {ensemble} --options @options/{place} {of_agent}", columns)

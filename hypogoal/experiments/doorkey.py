@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from hypogoal.core.config import setting
-from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
+from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Columns, Command, Integers, Names, agents_of, experiment
 
 CONTROLS = {"random": "--set chooser=random", "oracle": "--set termination=oracle"}
 BASELINES = {
@@ -52,7 +52,7 @@ def doorkey(
         for baseline in baselines:
             commands[baseline] = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
         for agent, words in commands.items():
-            columns = {"agent": agent, "seed": seed, "layout_seed": layout}
+            columns: Columns = {"agent": agent, "seed": seed, "layout_seed": layout}
             yield Command(f"{agent}{at}", f"{words} --seed {seed} --layout-seed {layout}", columns)
 
 

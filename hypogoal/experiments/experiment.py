@@ -32,12 +32,15 @@ Integers: TypeAlias = tuple[int, ...]
 Function: TypeAlias = Callable[..., Iterable[Any]]  # of settings, by keyword; yields Command or its fields
 
 
+Columns: TypeAlias = Mapping[str, Value]  # of results.csv: seed, method, ...
+
+
 class Command(NamedTuple):
     """One command of an experiment."""
 
     name: str  # its place in the run's folder: ensemble/seed-0
     command: str  # as one would type it
-    columns: Mapping[str, Value] = {}  # of results.csv: seed, method, ...
+    columns: Mapping[str, Value] = {}
 
 
 class RunConfig(Config):

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import product
 
 from hypogoal.core.config import setting
-from hypogoal.experiments.experiment import SEEDS, Command, Integers, Names, experiment
+from hypogoal.experiments.experiment import SEEDS, Columns, Command, Integers, Names, experiment
 
 METHODS = {
     "dbat": "--set diversity=dbat",
@@ -35,7 +35,7 @@ def montezuma_ladders(
         yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}", {"groups": count})
     for count, method, seed in product(groups, methods, seeds):
         words = f"train-ensemble @data/groups-{count} {METHODS[method]} --seed {seed}"
-        columns = {"method": method, "groups": count, "seed": seed}
+        columns: Columns = {"method": method, "groups": count, "seed": seed}
         yield Command(f"ensemble/{method}/groups-{count}-seed-{seed}", words, columns)
     for ladder, seed in product(ladders, seeds):
         for count, method in product(option_groups, option_methods):

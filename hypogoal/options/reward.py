@@ -89,7 +89,7 @@ class SubgoalReward:
         """Whether the sub-goal holds where members say so: bool (N, K) to (N,)."""
         if self.by in self.least:
             return np.asarray(members.sum(1) >= self.least[self.by])
-        return members[:, self.by]
+        return members[:, int(self.by)]
 
     def wrap(
         self,
