@@ -5,7 +5,6 @@ its positive predictions. So options are learned that end at these, and the trut
 up.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
@@ -21,12 +21,12 @@ from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import COLUMNS, TABLE, option_numbers
 from hypogoal.evaluation.films import episode_gif
 from hypogoal.evaluation.selection import states_met
-from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
+from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.episodes import Frame
 from hypogoal.meta.setup import Setup
-from hypogoal.observations import PICTURE, Standard, standard_of
+from hypogoal.observations import PICTURE, Observations, Standard, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
 from hypogoal.options.tables import read_table
@@ -37,37 +37,8 @@ CHUNK = 256  # observations that own code is given at once
 CELL = 8  # of positions that count as one place
 FILMS = 4  # kinds that are shown
 RANDOM_STEPS = 4_000  # of random play
-Classifier = Callable[[Engine, NDArray[np.int64]], NDArray[np.floating]]  # state ids (n,) -> log-odds (n,)
-
-
-def own_classifier(name: str) -> Classifier:
-    """Code of the user's own, from observations (n, *obs) to probabilities (n,); else a ``UserError``."""
-    function = load(name, "classifier", "hypogoal.classifiers", {})
-    if not callable(function):
-        raise UserError("this is not a function", name, "Give one from observations (N, *obs) to probabilities (N,).")
-
-    def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
-        log_odds = []
-        for some in np.split(ids, range(CHUNK, len(ids), CHUNK)):
-            probabilities = np.asarray(function(engine.images(some)), dtype=np.float64)
-            if probabilities.shape != some.shape or not ((probabilities >= 0) & (probabilities <= 1)).all():
-                fault = f"the classifier gave {probabilities.shape} {probabilities.ravel()[:3]}"
-                raise UserError(fault, name, f"Give probabilities, 0 to 1, float ({len(some)},).")
-            log_odds.append(log_odds_of(probabilities))
-        return np.concatenate(log_odds)
-
-    return classify
-
-
-def member_of(ensemble: Ensemble, member: int) -> Classifier:
-    """A member of an ensemble; a ``UserError`` where there is no such one."""
-    if member >= len(ensemble):
-        raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(ensemble) - 1}.")
-
-    def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
-        return ensemble.log_odds(engine.images(ids))[:, member]
-
-    return classify
+DECIMALS = 6  # of a threshold, which float32 log-odds round
+Classifier = Callable[[Observations], NDArray[np.floating]]  # observations (n, *obs) -> log-odds (n,)
 
 
 @dataclass(frozen=True)
@@ -87,9 +58,33 @@ def target_of(name: str, sub_goal: str, member: int, domain: str, device: str) -
         return Target(own_classifier(name), THRESHOLD)
     source = open_artefact(Path(name), "ensemble")
     ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
-    classify, threshold = member_of(ensemble, member), float(ensemble.thresholds[member])
+    if member >= len(ensemble):
+        raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(ensemble) - 1}.")
+
+    def classify(observations: Observations) -> NDArray[np.floating]:
+        return ensemble.log_odds(observations)[:, member]
+
     world = source.config["domain_config"] if source.config["domain"] == domain else {}
-    return Target(classify, threshold, ensemble.view.standard, world, [source.path])
+    return Target(classify, float(ensemble.thresholds[member]), ensemble.view.standard, world, [source.path])
+
+
+def own_classifier(name: str) -> Classifier:
+    """Code of the user's own, from observations (n, *obs) to probabilities (n,); else a ``UserError``."""
+    function = load(name, "classifier", "hypogoal.classifiers", {})
+    if not callable(function):
+        raise UserError("this is not a function", name, "Give one from observations (N, *obs) to probabilities (N,).")
+
+    def classify(observations: Observations) -> NDArray[np.floating]:
+        parts = []
+        for some in np.split(observations, range(CHUNK, len(observations), CHUNK)):
+            probabilities = np.asarray(function(some), dtype=np.float64)
+            if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():
+                fault = f"the classifier gave {probabilities.shape} {probabilities.ravel()[:3]}"
+                raise UserError(fault, name, f"Give probabilities, 0 to 1, float ({len(some)},).")
+            parts.append(probabilities)
+        return log_odds_of(np.concatenate(parts))
+
+    return classify
 
 
 def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Setup, Engine], Terminations]:
@@ -97,25 +92,25 @@ def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Set
 
     def ends(setup: Setup, engine: Engine) -> Terminations:
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-            return np.repeat(target.classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
+            of_states = target.classify(engine.images(ids)).astype(np.float32)
+            return np.repeat(of_states[:, None], len(edges), axis=1)
 
         if engine.observation_dtype != PICTURE:
             engine.standard = target.standard or standard_of(engine.observation_shape)
         rule, length = rule_of(setup.config.termination)
         rule.refuse(setup.config, engine)
-        return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
+        thresholds = log_odds_of(edges).astype(np.float32)
+        return rule(log_odds, len(edges), None, thresholds, engine.count, length)
 
     return ends
 
 
 def report_of(loop: OptionLoop, edges: Sequence[float], sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Each policy's findings, and the threshold that it learned against; None for a policy that was not wanted."""
-    table = read_table(folder / TABLE, COLUMNS)
+    """Each policy's findings, and its threshold at the end of learning; None for a policy that was not wanted."""
     report: dict[str, Any] = dict.fromkeys(POLICIES)
-    for option, (name, edge) in enumerate(zip(POLICIES, edges, strict=False)):
-        ended = float(1 / (1 + np.exp(-loop.terminations.thresholds[option])))  # a rule may have changed it
-        threshold = edge if math.isclose(ended, edge, rel_tol=1e-6) else ended  # float32 log-odds round it
-        report[name] = {"threshold": threshold, **findings(loop, table, option, sub_goals, folder)}
+    for option, name in enumerate(POLICIES[: len(edges)]):
+        threshold = float(expit(loop.terminations.thresholds[option].astype(np.float64)))
+        report[name] = {"threshold": round(threshold, DECIMALS), **findings(loop, option, sub_goals, folder)}
     return report
 
 
@@ -125,55 +120,70 @@ def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict
     engine.reset()
     ids = states_met(engine, RANDOM_STEPS, rng)
     ids = ids[engine.remembers(ids)]
-    truth, positive = engine.labels(ids)[:, column], loop.terminations.of(ids)[:, :1]
+    truth = engine.labels(ids)[:, column]
+    positive = loop.terminations.of(ids)[:, :1]
     scores = {name: score.item() for name, score in member_scores(positive, truth).items()}
     return {"states": len(ids), "positives": int(truth.sum()), **scores}
 
 
-def findings(
-    loop: OptionLoop, table: dict[str, NDArray[np.float64]], option: int, sub_goals: Sequence[str], folder: Path
-) -> dict[str, Any]:
+def findings(loop: OptionLoop, option: int, sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
     """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
 
-    False positives are of one kind where the same sub-goals hold and, where positions are known, the cell is the same;
-    of each of the most frequent kinds a film of the shortest execution is put into ``folder``, of pictures.
+    Of each of the most frequent kinds of false positives a film is put into ``folder``, of pictures.
     """
-    engine, of_policy, rows = loop.engine, table["option"] == option, list(loop.recorder.executions[option])
+    table = read_table(folder / TABLE, COLUMNS)
+    executions = list(loop.recorder.executions[option])
+    of_policy = table["option"] == option
     positive, near = table["reached"][of_policy] > 0, table["near"][of_policy] > 0
-    fooled = [row for row, wrong in zip(rows, positive & ~near, strict=True) if wrong]
-
-    def kind_of(row: Execution) -> tuple[tuple[str, ...], tuple[int, ...]]:
-        end = np.array(row.states[-1:])
-        cell = engine.positions(end)[0] // CELL if engine.position_names else np.zeros(0, dtype=np.int64)
-        return tuple(np.array(sub_goals)[engine.labels(end)[0]].tolist()), tuple(cell.tolist())
-
-    of_kind: dict[Any, list[Execution]] = {}
-    for row in fooled:
-        of_kind.setdefault(kind_of(row), []).append(row)
-    kinds: list[dict[str, Any]] = []
-    for (holds, _), alike in sorted(of_kind.items(), key=lambda item: -len(item[1])):
-        row = min(alike, key=lambda row: row.duration)
-        path = np.array([row.began, *row.states])
-        at = engine.positions(path[-1:])[0].tolist() if engine.position_names else []
-        film = f"{POLICIES[option]}-{len(kinds) + 1}.gif"
-        pictures = engine.observation_dtype == PICTURE
-        if shown := pictures and len(kinds) < FILMS and bool(engine.remembers(path).all()):
-            (folder / film).write_bytes(_film(loop, path, option))
-        description = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
-        kinds.append({"executions": len(alike), **description, "film": film if shown else None})
-    ends = {"fooled": len(fooled), "there": int((positive & near).sum())}
-    ends["positive_at_start"] = sum(row.inside_at_start for row in rows)
-    return option_numbers(table, option) | ends | {"kinds": kinds}
+    fooled = [executions[row] for row in np.flatnonzero(positive & ~near)]
+    kinds = []
+    for number, alike in enumerate(kinds_of(loop.engine, fooled)):
+        film = f"{POLICIES[option]}-{number + 1}.gif"
+        shortest = min(alike, key=lambda row: row.duration)
+        drawn = number < FILMS and _write_film(folder / film, loop, shortest)
+        end = np.array(shortest.states[-1:])
+        holds = np.array(sub_goals)[loop.engine.labels(end)[0]].tolist()
+        at = loop.engine.positions(end)[0].tolist() if loop.engine.position_names else []
+        position = dict(zip(loop.engine.position_names, at, strict=True))
+        of_kind = {"executions": len(alike), "holds": holds, "position": position}
+        kinds.append(of_kind | {"film": film if drawn else None})
+    return {
+        **option_numbers(table, option),
+        "fooled": len(fooled),
+        "there": int((positive & near).sum()),
+        "positive_at_start": sum(row.inside_at_start for row in executions),
+        "kinds": kinds,
+    }
 
 
-def _film(loop: OptionLoop, path: NDArray[np.int64], option: int) -> bytes:
-    """An execution that ended in a false positive, from where it began."""
+def kinds_of(engine: Engine, fooled: Sequence[Execution]) -> list[list[Execution]]:
+    """False positives of one kind, the most frequent first: the same sub-goals hold, the cell is the same, if known."""
+    if not fooled:
+        return []
+    ends = np.array([row.states[-1] for row in fooled])
+    marks = engine.labels(ends).astype(np.int64)
+    if engine.position_names:
+        marks = np.concatenate([marks, engine.positions(ends) // CELL], axis=1)
+    _, kind = np.unique(marks, axis=0, return_inverse=True)
+    kinds: list[list[Execution]] = [[] for _ in range(kind.max() + 1)]
+    for row, number in zip(fooled, kind.reshape(-1), strict=True):
+        kinds[number].append(row)
+    return sorted(kinds, key=len, reverse=True)
+
+
+def _write_film(path: Path, loop: OptionLoop, execution: Execution) -> bool:
+    """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
+    ids = np.array([execution.began, *execution.states])
+    if loop.engine.observation_dtype != PICTURE or not loop.engine.remembers(ids).all():
+        return False
     timeout = loop.config.option_timeout
-    states = zip(loop.engine.images(path), loop.terminations.of(path)[:, option].tolist(), strict=True)
-    frames = [
-        Frame(picture, step, option, (positive,), timeout - step, "") for step, (picture, positive) in enumerate(states)
-    ]
-    return episode_gif([*frames[:-1], replace(frames[-1], ended="fooled")], POLICIES, 1, timeout)
+    positive = loop.terminations.of(ids)[:, execution.option].tolist()
+    frames = []
+    for step, picture in enumerate(loop.engine.images(ids)):
+        frames.append(Frame(picture, step, execution.option, (positive[step],), timeout - step, ""))
+    frames[-1] = replace(frames[-1], ended="fooled")
+    path.write_bytes(episode_gif(frames, POLICIES, 1, timeout))
+    return True
 
 
 def lines_of(report: Mapping[str, Any]) -> Iterator[str]:

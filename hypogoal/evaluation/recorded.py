@@ -1,30 +1,30 @@
-"""What recorded states say about a success classifier, without a simulator: where members disagree, which failures a
-policy would be drawn to, what a prediction hangs on, and which states to label next (Spec I6).
+"""What recorded states say about members, without a simulator: where these disagree, which failures they take for a
+success, and which states to label next (Spec I6).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import combinations, pairwise, product
-from typing import Any
-
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
+from scipy.special import expit
 
-from hypogoal.data import States
 from hypogoal.domains.observations import resized_picture
-from hypogoal.evaluation.pictures import coloured
 from hypogoal.hypotheses.thresholds import log_odds_of
-from hypogoal.observations import PICTURE, Observations, fields_of, numbers_of, spread_rows, standard_of, standardised
+from hypogoal.observations import (
+    PICTURE,
+    Observations,
+    fields_of,
+    numbers_of,
+    spread_rows,
+    standard_of,
+    standardised,
+)
 
 GRID = 16  # areas along a side of a picture, whose means are compared
 DIRECTIONS = 16  # of the states' largest variance
 NEIGHBOURS = 10  # whose distance says how dense states are
 SAMPLE = 500  # states whose usual distance is taken
-PATCHES = 6  # along a side of a picture
-FRAME = (240, 160, 0)  # around the patch that turns a prediction
-Predict = Callable[[Observations], NDArray[np.floating]]  # observations (N, *obs) -> probabilities (N, K)
 
 
 def sketches_of(observations: Observations) -> NDArray[np.float64]:
@@ -38,10 +38,11 @@ def sketches_of(observations: Observations) -> NDArray[np.float64]:
         if dtype == PICTURE:
             pictures = observations[key] if key else observations
             sides = [min(GRID, side) for side in shape[:2]]
-            parts.append(np.stack([resized_picture(picture, *sides).ravel() for picture in pictures]) / 255.0)
-    weighed = [part / (np.sqrt(part.var(0).sum()) or 1.0) for part in parts if part.shape[1]]
+            small = [resized_picture(picture, *sides).ravel() for picture in pictures]
+            parts.append(np.stack(small) / 255.0)
+    weighed = [part / (np.sqrt(part.var(axis=0).sum()) or 1.0) for part in parts if part.shape[1]]
     values = np.concatenate(weighed, axis=1).astype(np.float64)
-    values -= values.mean(0)
+    values -= values.mean(axis=0)
     _, directions = np.linalg.eigh(values.T @ values)
     return values @ directions[:, ::-1][:, :DIRECTIONS]
 
@@ -51,19 +52,18 @@ def disagreement(probabilities: NDArray[np.floating], thresholds: NDArray[np.flo
 
     Of one member, which cannot disagree, its own prediction, 0.5 at its threshold: the more, the more a policy is paid.
     """
-    centred = 1 / (1 + np.exp(log_odds_of(thresholds) - log_odds_of(probabilities)))
+    centred = np.asarray(expit(log_odds_of(probabilities) - log_odds_of(thresholds)))
     if centred.shape[1] == 1:
-        return np.asarray(centred[:, 0])
-    pairs = combinations(range(centred.shape[1]), 2)
-    return np.mean([np.abs(centred[:, first] - centred[:, second]) for first, second in pairs], axis=0)
+        return centred[:, 0]
+    first, second = np.triu_indices(centred.shape[1], 1)
+    return np.abs(centred[:, first] - centred[:, second]).mean(axis=1)
 
 
 def density_of(sketches: NDArray[np.float64]) -> NDArray[np.float64]:
     """How common each state is (N,): 1 where its ten nearest are as far as usual, up to e where they are nearer."""
     neighbours = min(NEIGHBOURS + 1, len(sketches))
-    near = KDTree(sketches).query(sketches, neighbours)[0].reshape(len(sketches), -1).mean(1)
-    density: NDArray[np.float64] = np.exp(1 - near / (np.median(near) or 1.0))
-    return density
+    near = KDTree(sketches).query(sketches, neighbours)[0].reshape(len(sketches), -1).mean(axis=1)
+    return np.asarray(np.exp(1 - near / (np.median(near) or 1.0)))
 
 
 def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: int) -> NDArray[np.int64]:
@@ -76,104 +76,32 @@ def to_label(scores: NDArray[np.float64], sketches: NDArray[np.float64], count: 
     rows: list[int] = []
     apart = np.ones(len(scores))
     for _ in range(min(count, len(scores))):
-        remaining = np.where(np.isin(np.arange(len(scores)), rows), -1.0, scores * apart)
-        rows.append(int(remaining.argmax()))
+        worth = scores * apart
+        worth[rows] = -1
+        rows.append(int(worth.argmax()))
         distance = np.linalg.norm(sketches - sketches[rows[-1]], axis=1) / usual
         apart = np.minimum(apart, 1 - np.exp(-(distance**2)))
     return np.array(rows, np.int64)
 
 
-def tempting(states: States, probabilities: NDArray[np.floating], count: int) -> NDArray[np.int64]:
-    """The rows of the negatives that a member scores (N,) highest, highest first: where a policy would be drawn to."""
-    negatives = np.flatnonzero(~states.labels)
-    return negatives[np.argsort(-probabilities[negatives], kind="stable")][:count]
-
-
-def opposite_pairs(
-    sketches: NDArray[np.float64], positive: NDArray[np.bool_], count: int
-) -> list[tuple[int, int, float]]:
-    """The nearest states with opposite predictions (N,): rows of a positive and a negative, distance; each once."""
-    positives, negatives = np.flatnonzero(positive), np.flatnonzero(~positive)
-    if not len(positives) or not len(negatives):
-        return []
-    distances, nearest = KDTree(sketches[negatives]).query(sketches[positives])
-    pairs, taken = [], set()
-    for row in np.argsort(distances, kind="stable"):
-        if (other := int(negatives[nearest[row]])) not in taken:
-            taken.add(other)
-            pairs.append((int(positives[row]), other, float(distances[row])))
-    return pairs[:count]
-
-
-@dataclass(frozen=True)
-class Turned:
-    """The patch whose exchange lowers a member's probability most."""
-
-    key: str  # of the picture, empty if it is the whole observation
-    box: tuple[int, int, int, int]  # top, left, bottom, right: pixels
-    before: float
-    after: float
-
-
-def turning_patch(state: Observations, other: Observations, member: int, predict: Predict) -> Turned | None:
-    """Which of 6 x 6 patches of ``state`` (*obs) says most of a member's positive prediction: exchanged for the same
-    patch of ``other`` (*obs), it lowers the probability most. None without pictures.
-    """
-    boxes = []
-    for key, (dtype, shape) in fields_of(state.shape, state.dtype).items():
-        if dtype == PICTURE:
-            rows, columns = (np.linspace(0, side, min(PATCHES, side) + 1).astype(int).tolist() for side in shape[:2])
-            patches = product(pairwise(rows), pairwise(columns))
-            boxes += [(key, (top, left, bottom, right)) for (top, bottom), (left, right) in patches]
-    changed = np.repeat(state[None], len(boxes) + 1, axis=0)
-    for number, (key, (top, left, bottom, right)) in enumerate(boxes):
-        pictures, source = (changed[key], other[key]) if key else (changed, other)
-        pictures[number, top:bottom, left:right] = source[top:bottom, left:right]
-    if not boxes:
-        return None
-    *after, before = predict(changed)[:, member].tolist()
-    lowest = int(np.argmin(after))
-    return Turned(*boxes[lowest], before, after[lowest])
-
-
-def picture_of(state: Observations, turned: Turned | None = None) -> NDArray[np.uint8] | None:
-    """A state's pictures side by side, uint8 (H, W, 3), the patch that turned a prediction framed; None without any."""
-    parts = []
-    for key, (dtype, _) in fields_of(state.shape, state.dtype).items():
-        if dtype == PICTURE:
-            picture = coloured(np.array(state[key] if key else state))
-            if turned and key == turned.key:
-                top, left, bottom, right = turned.box
-                width = max(1, max(picture.shape[:2]) // 64)
-                inside = picture[top:bottom, left:right]
-                for edge in (inside[:width], inside[-width:], inside[:, :width], inside[:, -width:]):
-                    edge[:] = FRAME
-            parts.append(picture)
-    if not parts:
-        return None
-    height = max(len(part) for part in parts)
-    padded = [np.pad(part, ((0, height - len(part)), (0, 0), (0, 0)), constant_values=255) for part in parts]
-    return np.concatenate(padded, axis=1)
-
-
-def member_findings(
-    labelled: States, known_scores: NDArray[np.floating], scores: NDArray[np.floating], thresholds: Sequence[float]
-) -> list[dict[str, Any]]:
+def member_table(
+    labels: NDArray[np.bool_],
+    known_scores: NDArray[np.floating],
+    scores: NDArray[np.floating],
+    thresholds: NDArray[np.floating],
+) -> pd.DataFrame:
     """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
-    positive, rows = scores > np.asarray(thresholds), []
-    negatives = ~labelled.labels
-    for member, threshold in enumerate(thresholds):
-        wrong = known_scores[negatives, member] > threshold
-        others = np.delete(positive, member, axis=1).any(1)
-        rows.append(
-            {
-                "member": member,
-                "threshold": float(threshold),
-                "negatives": int(negatives.sum()),
-                "false_positives": int(wrong.sum()),
-                "highest_negative": float(known_scores[negatives, member].max(initial=0.0)),
-                "positive_unlabelled": float(positive[:, member].mean()),
-                "positive_alone": float((positive[:, member] & ~others).mean()),
-            }
-        )
-    return rows
+    positive = scores > thresholds
+    alone = positive & (positive.sum(axis=1, keepdims=True) == 1)
+    of_failures = known_scores[~labels]
+    return pd.DataFrame(
+        {
+            "member": np.arange(len(thresholds)),
+            "threshold": thresholds.astype(np.float64),
+            "negatives": len(of_failures),
+            "false_positives": (of_failures > thresholds).sum(axis=0),
+            "highest_negative": of_failures.max(axis=0, initial=0.0).astype(np.float64),
+            "positive_unlabelled": positive.mean(axis=0),
+            "positive_alone": alone.mean(axis=0),
+        }
+    )

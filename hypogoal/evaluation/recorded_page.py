@@ -1,6 +1,6 @@
-"""What members do on recorded data, as numbers and as sections of a page (Spec I6)."""
+"""The audit of an ensemble on recorded data: its findings, its page, and the states to label next (Spec I6)."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,188 +12,138 @@ from PIL import Image
 
 from hypogoal.core.artefacts import TO_FILL_IN, Artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import write_table
 from hypogoal.data import States, joined, open_dataset
-from hypogoal.evaluation import recorded
-from hypogoal.evaluation.page import draw_page, fixed, percent, picture, section, templates
+from hypogoal.evaluation import page
+from hypogoal.evaluation.pictures import coloured
 from hypogoal.evaluation.plots import slug
-from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.observations import Observations, digest, spread_rows
+from hypogoal.evaluation.recorded import density_of, disagreement, member_table, sketches_of, to_label
+from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.observations import PICTURE, Observations, digest, fields_of, spread_rows
 
 COMPARED = 4_000  # unlabelled states, spread over the file
-SHOWN = 4  # negatives and pairs of a member on the page
-NEXT, CARDS = 100, 20  # states to label next in the table, and on the page
-REJECTED = 500  # states among which the nearest is sought that a member rejects
+NEXT = 100  # states to label next in the table
+CARDS, FAILURES = 20, 4  # on the page: of these, and of each member's failures
 
 
-@dataclass(frozen=True)
-class Look:
-    """One sub-goal's ensemble on its data."""
-
-    sub_goal: str
-    ensemble: Ensemble
-    known: States  # labelled and held out
-    known_scores: NDArray[np.float32]  # (N, K)
-    unlabelled: Observations  # (M, *obs)
-    scores: NDArray[np.float32]  # (M, K)
-
-    @property
-    def thresholds(self) -> NDArray[np.float32]:
-        """Of the members, (K,)."""
-        return self.ensemble.thresholds.cpu().numpy()
-
-
-def look_at(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Look:
-    """The members' predictions of all states of the data file."""
-    dataset = open_dataset(data)
-    ensemble = read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
-    splits = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    labelled = joined([States(split.observations, split.labels) for split in splits])
-    unlabelled = dataset.unlabelled()
-    if not len(unlabelled):
-        raise UserError("there are no unlabelled states to audit on", data, "Import or collect some.")
-    known_scores, scores = ensemble.predict(labelled.observations), ensemble.predict(unlabelled)
-    return Look(sub_goal, ensemble, labelled, known_scores, unlabelled, scores)
+def picture_of(state: Observations) -> NDArray[np.uint8] | None:
+    """A state's pictures side by side, uint8 (H, W, 3); None without any."""
+    parts = []
+    for key, (dtype, _) in fields_of(state.shape, state.dtype).items():
+        if dtype == PICTURE:
+            parts.append(coloured(state[key] if key else state))
+    if not parts:
+        return None
+    height = max(len(part) for part in parts)
+    padded = [np.pad(part, ((0, height - len(part)), (0, 0), (0, 0)), constant_values=255) for part in parts]
+    return np.concatenate(padded, axis=1)
 
 
 @dataclass(frozen=True)
 class Findings:
     """What is found of one sub-goal's ensemble."""
 
-    numbers: dict[str, Any]
-    cards: list[dict[str, Any]]  # headings, each with its states
-    rows: NDArray[np.int64]  # of the unlabelled states to label next, best first
+    numbers: dict[str, Any]  # of ``audit.json``
+    members: pd.DataFrame  # a row each
+    cards: dict[str, list[dict[str, Any]]]  # headings of the page, each with its states
+    states: Observations  # to label next, best first, (n, *obs)
+    rows: NDArray[np.int64]  # theirs, among the unlabelled ones
     disputed: NDArray[np.float64]  # how much members disagree on them
 
 
-def findings_of(look: Look) -> Findings:
-    """A sub-goal's numbers, its states for the page, and the states to label next."""
-    rows = spread_rows(len(look.unlabelled), COMPARED)  # the states that are compared
-    scores = look.scores[rows]
-    sketches = recorded.sketches_of(look.unlabelled[rows])
-    disputed = recorded.disagreement(scores, look.thresholds)
-    proposed = recorded.to_label(disputed * recorded.density_of(sketches), sketches, NEXT)
-    positive = scores > look.thresholds
-    disagree = (positive.any(1) & ~positive.all(1)).mean()
+def findings_of(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Findings:
+    """What one sub-goal's members do on the data file, and the states to label next."""
+    dataset = open_dataset(data)
+    ensemble = read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
+    thresholds = ensemble.thresholds.cpu().numpy()
+    splits = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
+    known = joined([States(split.observations, split.labels) for split in splits])
+    unlabelled = dataset.unlabelled()
+    if not len(unlabelled):
+        raise UserError("there are no unlabelled states to audit on", data, "Import or collect some.")
+    known_scores, scores = ensemble.predict(known.observations), ensemble.predict(unlabelled)
+
+    compared = spread_rows(len(unlabelled), COMPARED)
+    sketches = sketches_of(unlabelled[compared])
+    disputed = disagreement(scores[compared], thresholds)
+    proposed = to_label(disputed * density_of(sketches), sketches, NEXT)
+    rows = compared[proposed]
+    measure = "disagreement" if len(thresholds) > 1 else "prediction"
+    titles = [f"state {row}, {measure} {disputed[place]:.2f}" for row, place in zip(rows, proposed, strict=True)]
+    next_ones = rows[:CARDS]
+    cards = {"To label next": _cards(titles, unlabelled[next_ones], scores[next_ones], thresholds)}
+    failures = np.flatnonzero(~known.labels)
+    for member, of_member in enumerate(known_scores[failures].T):
+        drawn_to = failures[np.argsort(-of_member, kind="stable")][:FAILURES]
+        heading = f"Member {member}: failures that a policy would be drawn to"
+        titles = ["a failure"] * len(drawn_to)
+        cards[heading] = _cards(titles, known.observations[drawn_to], known_scores[drawn_to], thresholds)
+
+    members = member_table(known.labels, known_scores, scores, thresholds)
+    positive = scores[compared] > thresholds
+    disagree = positive.any(axis=1) & ~positive.all(axis=1)
     numbers = {
-        "sub_goal": look.sub_goal,
-        "known": len(look.known.labels),
-        "unlabelled": len(look.unlabelled),
-        "disagreement": float(disagree),
-        "members": recorded.member_findings(look.known, look.known_scores, look.scores, look.thresholds.tolist()),
-        "next": [int(rows[row]) for row in proposed[:CARDS]],
+        "sub_goal": sub_goal,
+        "known": len(known.labels),
+        "unlabelled": len(unlabelled),
+        "disagreement": float(disagree.mean()),
+        "members": members.to_dict("records"),
+        "next": next_ones.tolist(),
     }
-    measure = "disagreement" if len(look.ensemble) > 1 else "prediction"
-    shown = []
-    for row in proposed[:CARDS]:
-        title = f"state {rows[row]}, {measure} {disputed[row]:.2f}"
-        shown.append(_card(look, title, look.unlabelled[rows[row]], look.scores[rows[row]]))
-    cards = [{"heading": "To label next", "states": shown}]
-    for member in range(len(look.ensemble)):
-        drawn = [*_drawn_to(look, member)]
-        cards.append({"heading": f"Member {member}: failures that a policy would be drawn to", "states": drawn})
-        pairs = [*_pairs(look, member, rows, sketches)]
-        cards.append({"heading": f"Member {member}: nearest states with opposite predictions", "states": pairs})
-    return Findings(numbers, cards, rows[proposed], disputed[proposed])
+    return Findings(numbers, members, cards, unlabelled[rows], rows, disputed[proposed])
 
 
-def write_next(
-    folder: Path,
-    columns: Sequence[str],
-    states: Observations,
-    rows: NDArray[np.int64],
-    disputed: NDArray[np.float64],
-) -> None:
-    """Write proposed states (N, *obs), rows of the unlabelled ones, as pictures and a table to fill in.
+def _cards(
+    titles: Sequence[str], states: Observations, scores: NDArray[np.floating], thresholds: NDArray[np.floating]
+) -> list[dict[str, Any]]:
+    """States (n, *obs) with their scores (n, K) for the page; none of states without pictures."""
+    cards = []
+    for title, state, of_state in zip(titles, states, scores, strict=False):
+        shown = picture_of(state)
+        if shown is not None:
+            lines = []
+            for member, score in enumerate(of_state):
+                lines.append({"positive": score > thresholds[member], "text": f"member {member}: {score:.2f}"})
+            cards.append({"source": page.picture(shown), "title": title, "lines": lines})
+    return cards
 
-    ``001.png``, ... are in the table's order; states without pictures have the table alone.
-    """
+
+def write_next(folder: Path, columns: Sequence[str], findings: Findings) -> None:
+    """Write the states to label next: a table to fill in, and pictures ``001.png``, ... in its order, if they are."""
     folder.mkdir(parents=True)
     lines = []
-    for number, state in enumerate(states):
-        shown = recorded.picture_of(state)
+    for number, state in enumerate(findings.states):
+        shown = picture_of(state)
         name = "" if shown is None else f"{number + 1:03d}.png"
         if shown is not None:
             Image.fromarray(shown).save(folder / name)
-        lines.append([name, "", int(rows[number]), digest(state).hex(), round(float(disputed[number]), 4)])
-    write_table(folder / TO_FILL_IN, columns, lines)
+        lines.append([name, "", findings.rows[number], digest(state).hex(), findings.disputed[number]])
+    table = pd.DataFrame(lines, columns=[*columns])
+    table.round(4).to_csv(folder / TO_FILL_IN, index=False)
 
 
-def _card(
-    look: Look, title: str, state: Any, scores: NDArray[np.float32], turned: recorded.Turned | None = None
-) -> dict[str, Any] | None:
-    """A state and its scores (K,); None of states without pictures."""
-    shown = recorded.picture_of(state, turned)
-    if shown is None:
-        return None
-    lines = []
-    for member, (score, threshold) in enumerate(zip(scores, look.thresholds, strict=True)):
-        lines.append({"positive": bool(score > threshold), "text": f"member {member}: {score:.2f}"})
-    return {"source": picture(shown), "title": title, "lines": lines}
-
-
-def _drawn_to(look: Look, member: int) -> Iterator[dict[str, Any] | None]:
-    """The known failures that a member scores highest, with the patch that says most of it."""
-    threshold = look.thresholds[member]
-    rejected = np.flatnonzero(look.scores[:, member] <= threshold)
-    for row in recorded.tempting(look.known, look.known_scores[:, member], SHOWN):
-        state, scores = look.known.observations[row], look.known_scores[row]
-        turned, title = None, "a failure"
-        if scores[member] > threshold and len(rejected):
-            some = rejected[spread_rows(len(rejected), REJECTED)]
-            sketches = recorded.sketches_of(np.concatenate([state[None], look.unlabelled[some]]))
-            nearest = some[np.linalg.norm(sketches[1:] - sketches[0], axis=1).argmin()]
-            turned = recorded.turning_patch(state, look.unlabelled[nearest], member, look.ensemble.predict)
-        if turned is not None:
-            title = f"a false positive; {turned.after:.2f} with the framed patch exchanged"
-        yield _card(look, title, state, scores, turned)
-
-
-def _pairs(
-    look: Look, member: int, rows: NDArray[np.int64], sketches: NDArray[np.float64]
-) -> Iterator[dict[str, Any] | None]:
-    """The nearest unlabelled states with opposite predictions of a member, side by side."""
-    positive = look.scores[rows, member] > look.thresholds[member]
-    pairs = recorded.opposite_pairs(sketches, positive, SHOWN)
-    for number, (first, second, _) in enumerate(pairs, 1):
-        for row in rows[[first, second]]:
-            yield _card(look, f"pair {number}, state {row}", look.unlabelled[row], look.scores[row])
-
-
-def draw(name: str, findings: Iterable[Findings]) -> str:
+def draw(name: str, findings: Sequence[Findings]) -> str:
     """The page of an audit of the artefact called ``name``."""
     sections = []
     for of_goal in findings:
-        cards = [{**group, "states": [card for card in group["states"] if card]} for group in of_goal.cards]
-        context = {"numbers": of_goal.numbers, "table": _table(of_goal.numbers), "cards": cards}
-        sub_goal = of_goal.numbers["sub_goal"]
-        sections.append((slug(sub_goal), sub_goal, section("audited", context), False))
-    lines = lines_of([of_goal.numbers for of_goal in findings])
-    return draw_page(f"hypogoal: audit of {name}", sections, "audit.html", lines=lines)
-
-
-def _table(numbers: dict[str, Any]) -> pd.DataFrame:
-    rows = []
-    for row in numbers["members"]:
-        rows.append(
+        members = of_goal.members
+        shown = pd.DataFrame(
             {
-                "member": row["member"],
-                "threshold": fixed(row["threshold"]),
-                "false positives": f"{row['false_positives']} of {row['negatives']}",
-                "highest negative": fixed(row["highest_negative"]),
-                "positive, unlabelled": percent(row["positive_unlabelled"]),
-                "alone": percent(row["positive_alone"]),
+                "member": members["member"],
+                "threshold": members["threshold"].map(page.fixed),
+                "false positives": members["false_positives"].astype(str) + f" of {members['negatives'][0]}",
+                "highest negative": members["highest_negative"].map(page.fixed),
+                "positive, unlabelled": members["positive_unlabelled"].map(page.percent),
+                "alone": members["positive_alone"].map(page.percent),
             }
         )
-    return pd.DataFrame(rows).set_index("member")
+        context = {"numbers": of_goal.numbers, "table": shown.set_index("member"), "cards": of_goal.cards}
+        sub_goal = of_goal.numbers["sub_goal"]
+        sections.append((slug(sub_goal), sub_goal, page.section("audited", context), False))
+    lines = lines_of([of_goal.numbers for of_goal in findings])
+    return page.draw_page(f"hypogoal: audit of {name}", sections, "audit.html", lines=lines)
 
 
 def lines_of(parts: Sequence[dict[str, Any]]) -> list[str]:
     """The findings in a few lines, for the page and the terminal."""
-    template = templates().get_template("audited.txt")
-    lines = []
-    for part in parts:
-        worst = max(part["members"], key=lambda row: row["false_positives"])
-        alike = [row["member"] for row in part["members"] if row["positive_unlabelled"] in (0.0, 1.0)]
-        lines.append(" ".join(template.render(part=part, worst=worst, alike=alike).split()))
-    return lines
+    template = page.templates().get_template("audited.txt")
+    return [" ".join(template.render(part=part).split()) for part in parts]

@@ -7,7 +7,7 @@ from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
-from hypogoal.evaluation.recorded_page import draw, findings_of, lines_of, look_at, write_next
+from hypogoal.evaluation.recorded_page import draw, findings_of, lines_of, write_next
 from hypogoal.importing.labels import COLUMNS
 from hypogoal.stages import Call
 
@@ -29,12 +29,9 @@ def audit_recorded(call: Call, source: Path, sub_goal: str | None) -> list[str]:
         Progress("audit", len(goals), quiet=call.quiet) as progress,
     ):
         for goal in goals:
-            look = look_at(artefact, data, goal, device)
-            findings = findings_of(look)
+            findings = findings_of(artefact, data, goal, device)
+            write_next(draft.files / "next" / goal, COLUMNS, findings)
             every.append(findings)
-            write_next(
-                draft.files / "next" / goal, COLUMNS, look.unlabelled[findings.rows], findings.rows, findings.disputed
-            )
             progress.advance()
         parts = [findings.numbers for findings in every]
         text = json.dumps({"sub_goals": parts}, indent=1)

@@ -5,18 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hypogoal.data import States
-from hypogoal.evaluation.recorded import (
-    density_of,
-    disagreement,
-    member_findings,
-    opposite_pairs,
-    picture_of,
-    sketches_of,
-    tempting,
-    to_label,
-    turning_patch,
-)
+from hypogoal.evaluation.recorded import density_of, disagreement, member_table, sketches_of, to_label
 from hypogoal.evaluation.recorded_page import lines_of
 from hypogoal.observations import packed
 
@@ -48,42 +37,15 @@ def test_states_to_label_are_disputed_common_and_unlike_each_other() -> None:
     np.testing.assert_array_equal(to_label(np.ones(1), sketches[:1], 1), [0])
 
 
-def test_a_policy_is_drawn_to_the_negatives_that_score_highest() -> None:
-    states = States(np.zeros((5, 2), np.float32), np.array([True, False, False, True, False]))
-    np.testing.assert_array_equal(tempting(states, np.array([0.99, 0.2, 0.7, 0.1, 0.4]), 2), [2, 4])
+def test_members_are_told_apart_by_what_they_alone_call_positive() -> None:
+    labels = np.array([True, False, False, True, False])
     scores = np.array([[0.9, 0.9], [0.2, 0.6], [0.7, 0.1], [0.1, 0.1], [0.4, 0.4]])
-    first, second = member_findings(states, scores, np.array([[0.9, 0.1], [0.9, 0.9], [0.1, 0.1]]), [0.5, 0.5])
-    assert (first["negatives"], first["false_positives"], first["highest_negative"]) == (3, 1, 0.7)
-    assert (second["false_positives"], second["highest_negative"]) == (1, 0.6)
-    assert first["positive_unlabelled"] == pytest.approx(2 / 3) and first["positive_alone"] == pytest.approx(1 / 3)
-    assert second["positive_alone"] == 0
-
-
-def test_nearest_states_with_opposite_predictions() -> None:
-    places = np.array([[0.0], [1.0], [1.1], [5.0], [5.5]])
-    pairs = opposite_pairs(places, np.array([True, True, False, False, True]), 5)
-    assert [pair[:2] for pair in pairs] == [(1, 2), (4, 3)], "each negative once, the nearest first"
-    np.testing.assert_allclose([pair[2] for pair in pairs], [0.1, 0.5])
-    assert opposite_pairs(places, np.ones(5, bool), 2) == []
-
-
-def test_the_patch_that_says_it_is_found() -> None:
-    """A member that looks at one corner of one camera is positive until that corner is exchanged."""
-    bright, dark = (np.full((1, 12, 12, 3), level, np.uint8) for level in (200, 0))
-    state, other = (packed({"a": cam, "b": cam, "x": np.zeros((1, 2), np.float32)})[0:1] for cam in (bright, dark))
-
-    def predict(states: np.ndarray) -> np.ndarray:
-        corner = states["b"][:, 10:12, 0:2].mean((1, 2, 3)) / 255
-        return np.stack([np.zeros(len(states)), corner], axis=1)
-
-    turned = turning_patch(state[0], other[0], 1, predict)
-    assert turned is not None and (turned.key, turned.box) == ("b", (10, 0, 12, 2))
-    assert turned.before == pytest.approx(200 / 255) and turned.after == 0
-    drawn = picture_of(state[0], turned)
-    assert drawn is not None and drawn.shape == (12, 24, 3)
-    assert (drawn[:10] == 200).all() and (drawn[10:, 12:14] != 200).any(), "the frame is in the second camera"
-    numbers = np.zeros(3, np.float32)
-    assert turning_patch(numbers, numbers, 0, predict) is None and picture_of(numbers) is None
+    unlabelled = np.array([[0.9, 0.1], [0.9, 0.9], [0.1, 0.1]])
+    table = member_table(labels, scores, unlabelled, np.array([0.5, 0.5]))
+    assert table["negatives"].tolist() == [3, 3] and table["false_positives"].tolist() == [1, 1]
+    assert table["highest_negative"].tolist() == [0.7, 0.6]
+    assert table["positive_unlabelled"].tolist() == pytest.approx([2 / 3, 1 / 3])
+    assert table["positive_alone"].tolist() == pytest.approx([1 / 3, 0])
 
 
 def test_sketches_are_alike_where_states_are() -> None:

@@ -14,7 +14,7 @@ from command_line import refuses, run, settings
 
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.data import open_dataset
-from hypogoal.evaluation.recorded import picture_of
+from hypogoal.evaluation.recorded_page import picture_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
 from tests import mixed
