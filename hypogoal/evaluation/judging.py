@@ -63,13 +63,11 @@ class Judgement:
     domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
 
-    def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
-        """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
+    def see(self, ensemble: Ensemble, states: NDArray[np.int64]) -> tuple[Any, Any]:
+        """What an ensemble sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
         from hypogoal.hypotheses.deep_lift import mean_state
 
-        ensemble = self.case.read()
-        seen = ensemble.see(self.split.observations[states])
-        return ensemble, seen, mean_state(ensemble.see(self.unlabelled))
+        return ensemble.see(self.split.observations[states]), mean_state(ensemble.see(self.unlabelled))
 
     def write_states(self, group: Any, states: NDArray[np.int64]) -> list[str]:
         """Put held-out states (n,) and what members predict of them into ``group``; returns where they are from.

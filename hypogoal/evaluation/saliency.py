@@ -12,9 +12,9 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.house import tidy_members
 from hypogoal.evaluation.judging import Judgement, Work
-from hypogoal.evaluation.page import Drawn, Results, fixed, picture
+from hypogoal.evaluation.page import Drawn, Results, picture
 from hypogoal.evaluation.pictures import SIGNED, attribution_image, coloured
-from hypogoal.evaluation.plots import PALETTE, legend_below, panels, plot, styled
+from hypogoal.evaluation.plots import legend_below, panels, plot, styled
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 TITLE = "What members look at"
@@ -37,22 +37,21 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     if judgement.number != work.browsed or not len(judgement.split.labels):
         return
     place = work.place_of(judgement)
-    sub_goal = judgement.case.sub_goal
     looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})
-    group = work.arrays.create_group(f"saliency/{sub_goal}")
-    if judgement.split.observations.dtype != PICTURE:
-        looked_at["sub_goals"][sub_goal] = _write_features(group, judgement)
-        return
-    facts, attributions = _write_states(group, judgement)
-    looked_at["sub_goals"][sub_goal] = facts
+    group = work.arrays.create_group(f"saliency/{judgement.case.sub_goal}")
+    is_of_pictures = judgement.split.observations.dtype == PICTURE
+    facts, attributions, values = (_look_at_states if is_of_pictures else _look_at_numbers)(group, judgement)
     error = attributions.completeness_error()
+    facts |= {"how": attributions.method, "completeness_error": float(error.max())}
+    looked_at["sub_goals"][judgement.case.sub_goal] = facts
+    group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
     for row, kind in enumerate(facts["kinds"]):
         columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
         yield tidy_members(columns, **place, scope=f"state: {kind}")
 
 
-def _write_states(group: Any, judgement: Judgement) -> tuple[dict[str, Any], Any]:
-    """Write states to look through, first those of the figures; the first of them are explained."""
+def _look_at_states(group: Any, judgement: Judgement) -> tuple[dict[str, Any], Any, NDArray[np.floating]]:
+    """States to look through, those of the figures first, of which the first are explained."""
     from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, method_of
 
     split, judged = judgement.split, judgement.judged
@@ -64,32 +63,33 @@ def _write_states(group: Any, judgement: Judgement) -> tuple[dict[str, Any], Any
     rng = rng_for(0, "browse", judgement.case.sub_goal)
     browsed = pick_for_gallery(judged.predictions, split.labels, places, rng)
     states = pd.unique(np.array([*kinds.values(), *browsed]))[: GALLERY // sub_goals]
-    few = max(len(kinds), EXPLAINED // sub_goals)
-    ensemble, seen, baseline = judgement.see(states[:few])
-    if method_of(ensemble.members[0]) != DEEP_LIFT:
-        seen = seen[: max(len(kinds), INTEGRATED // sub_goals)]
+    ensemble = judgement.case.read()
+    few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
+    seen, baseline = judgement.see(ensemble, states[: max(len(kinds), few // sub_goals)])
     attributions = attributed(ensemble, seen, baseline)
     group["seen"] = seen
-    _write_attributions(group, attributions.values)
-    dataset = open_dataset(judgement.case.data)
-    default = 3 if dataset.observation_shape[-1] == 3 else 1
     facts = {
         "kinds": [*kinds],
-        "states": len(split.labels),
         "places": judgement.write_states(group, states),
-        "colours": dataset.channels.get("", (1, default))[1],  # of each frame of a stack
-        "how": attributions.method,
-        "completeness_error": float(attributions.completeness_error().max()),
+        "colours": _colours(judgement),
     }
-    return facts, attributions
+    return facts, attributions, attributions.values
 
 
-def _write_features(group: Any, judgement: Judgement) -> dict[str, Any]:
-    """Write the attributions to each number, and to each picture as a whole, of states that are spread over all."""
+def _colours(judgement: Judgement) -> int:
+    """How many channels each frame of a stack has."""
+    dataset = open_dataset(judgement.case.data)
+    default = 3 if dataset.observation_shape[-1] == 3 else 1
+    return dataset.channels.get("", (1, default))[1]
+
+
+def _look_at_numbers(group: Any, judgement: Judgement) -> tuple[dict[str, Any], Any, NDArray[np.floating]]:
+    """Attributions to each number, and to each picture as a whole, of states that are spread over all."""
     from hypogoal.hypotheses.deep_lift import attributed, by_key
 
-    labels = judgement.split.labels
-    ensemble, seen, baseline = judgement.see(spread_rows(len(labels), AVERAGED))
+    ensemble = judgement.case.read()
+    states = spread_rows(len(judgement.split.labels), AVERAGED)
+    seen, baseline = judgement.see(ensemble, states)
     attributions = attributed(ensemble, seen, baseline)
     values = attributions.values.reshape(*attributions.log_odds.shape, -1)
     if seen.dtype.names:
@@ -99,19 +99,7 @@ def _write_features(group: Any, judgement: Judgement) -> dict[str, Any]:
             flat = of_keys[key].reshape(*values.shape[:2], -1)
             features.append(flat.sum(axis=-1, keepdims=True) if dtype == PICTURE else flat)
         values = np.concatenate(features, axis=-1)
-    _write_attributions(group, values)
-    return {
-        "kinds": [],
-        "states": len(labels),
-        "features": open_dataset(judgement.case.data).features(),
-        "how": attributions.method,
-        "completeness_error": float(attributions.completeness_error().max()),
-    }
-
-
-def _write_attributions(group: Any, values: NDArray[np.floating]) -> None:
-    compressed = {"compression": "gzip", "compression_opts": 1}
-    group.create_dataset("attributions", data=values.astype(np.float32), **compressed)
+    return {"kinds": [], "features": open_dataset(judgement.case.data).features()}, attributions, values
 
 
 def pick_to_explain(
@@ -170,29 +158,23 @@ def pick_for_gallery(
     return states.assign(turn=turn, right=right).sort_values(["right", "turn"], kind="stable").index.to_numpy()
 
 
+def explained(results: Results) -> dict[str, Any]:
+    """What is known of each sub-goal that has a figure: a state that members are positive in, or numbers."""
+    looked_at = results.facts.get("looked_at") or {"sub_goals": {}}
+    return {name: facts for name, facts in looked_at["sub_goals"].items() if facts["kinds"] or "features" in facts}
+
+
 def context(results: Results) -> dict[str, Any] | None:
-    """For the template: whose members, and the states of the gallery."""
+    """For the template: whose members, how they were explained, and the states of the gallery."""
     looked_at = results.facts.get("looked_at")
     if looked_at is None:
         return None
-    sub_goals = looked_at["sub_goals"]
     states: list[dict[str, Any]] = []
-    for name, facts in sub_goals.items():
+    for name, facts in looked_at["sub_goals"].items():
         arrays = results.within(f"saliency/{name}")
         if "observations" in arrays:
             states += _gallery(arrays, name, facts)
-    explained = [*_explained(sub_goals).values()]
-    return {
-        "ensemble": looked_at["ensemble"],
-        "how": explained[0]["how"] if explained else None,
-        "error": max(facts["completeness_error"] for facts in sub_goals.values()),
-        "states": states,
-    }
-
-
-def _explained(sub_goals: Mapping[str, Any]) -> dict[str, Any]:
-    """Those that have a figure: a state that members are positive in, or numbers."""
-    return {name: facts for name, facts in sub_goals.items() if facts["kinds"] or "features" in facts}
+    return {"ensemble": looked_at["ensemble"], "explained": [*explained(results).values()], "states": states}
 
 
 def _gallery(arrays: Mapping[str, NDArray[Any]], sub_goal: str, facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -200,41 +182,39 @@ def _gallery(arrays: Mapping[str, NDArray[Any]], sub_goal: str, facts: Mapping[s
     colours = facts["colours"]
     outcome = outcomes(arrays["predictions"], arrays["labels"])
     for index, place in enumerate(facts["places"]):
-        explained = arrays["attributions"][index] if index < len(arrays["attributions"]) else ()
-        maps = [picture(attribution_image(values, arrays["seen"][index], colours)) for values in explained]
-        truth = arrays["labels"][index]
-        members = []
-        for says, probability in zip(arrays["predictions"][index], arrays["probabilities"][index], strict=True):
-            members.append({"says": says, "right": says == truth, "probability": fixed(probability)})
+        maps = []
+        if index < len(arrays["seen"]):
+            for values in arrays["attributions"][index]:
+                maps.append(picture(attribution_image(values, arrays["seen"][index], colours)))
         yield {
             "source": picture(coloured(arrays["observations"][index], colours)),
             "maps": maps,
-            "members": members,
-            "sub_goal": sub_goal,
-            "truth": truth,
+            "predictions": arrays["predictions"][index],
+            "probabilities": arrays["probabilities"][index],
+            "truth": arrays["labels"][index],
             "outcome": outcome[index],
+            "sub_goal": sub_goal,
             "place": place,
         }
 
 
 def figures(results: Results) -> Iterator[Drawn]:
     """Figures 2 and 9 of each sub-goal, a true positive where there is one; of numbers, which features members use."""
-    looked_at = results.facts.get("looked_at") or {"sub_goals": {}}
-    explained = _explained(looked_at["sub_goals"])
-    for sub_goal, facts in explained.items():
+    of_sub_goals = explained(results)
+    for sub_goal, facts in of_sub_goals.items():
         arrays = results.within(f"saliency/{sub_goal}")
-        suffix = f"-{sub_goal}" if len(explained) > 1 else ""
+        suffix = f"-{sub_goal}" if len(of_sub_goals) > 1 else ""
+        about = {"sub_goal": sub_goal}
         if "features" in facts:
-            values = np.abs(arrays["attributions"]).mean(axis=0)
-            bars = bars_of_features(values, facts["features"])
-            yield Drawn(f"features{suffix}", "What members go by", bars, {"sub_goal": sub_goal})
-        else:
-            state = {name: values[0] for name, values in arrays.items()}
-            about = {"sub_goal": sub_goal, "kind": facts["kinds"][0], "place": facts["places"][0]}
-            figure2 = attributions_of_members(state, facts["colours"])
-            figure9 = attributions_of_channels(state, facts["colours"])
-            yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", figure2, about)
-            yield Drawn(f"figure9{suffix}", "Figure 9: attributions of every frame", figure9, about)
+            bars = bars_of_features(arrays["attributions"], facts["features"])
+            yield Drawn(f"features{suffix}", "What members go by", bars, about)
+            continue
+        about |= {"kind": facts["kinds"][0], "place": facts["places"][0]}
+        state = {name: values[0] for name, values in arrays.items()}
+        figure2 = attributions_of_members(state, facts["colours"])
+        yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", figure2, about)
+        figure9 = attributions_of_channels(state, facts["colours"])
+        yield Drawn(f"figure9{suffix}", "Figure 9: attributions of every frame", figure9, about)
 
 
 def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
@@ -268,18 +248,13 @@ def attributions_of_channels(state: Mapping[str, NDArray[Any]], colours: int) ->
     return panels(shown, count, SIGNED)
 
 
-def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:
-    """Bars side by side, those of features that members (K, numbers) go by most."""
-    order = np.argsort(-values.mean(axis=0), kind="stable")[:MOST_BARS]
-    high = 0.8 / len(values)
-    places = np.arange(len(order))
+def bars_of_features(attributions: NDArray[np.floating], names: Sequence[str]) -> Figure:
+    """Bars side by side, those of the features that members go by most, of attributions (n, K, features)."""
+    sizes = pd.DataFrame(np.abs(attributions).mean(axis=0).T, index=[*names]).add_prefix("member ")
+    most = sizes.mean(axis=1).nlargest(MOST_BARS).index
     with styled():
-        figure, axes = plot(0.7 + 0.35 * len(order))
-        for member, of_member in enumerate(values):
-            colour = PALETTE[member % len(PALETTE)]
-            axes.barh(places + high * member, of_member[order], high, color=colour, label=f"member {member}")
-        axes.set_yticks(places + (0.8 - high) / 2, [names[feature] for feature in order])
-        axes.invert_yaxis()
+        figure, axes = plot(0.7 + 0.35 * len(most))
+        sizes.loc[most[::-1]].plot.barh(ax=axes, width=0.8, legend=False)
         axes.set_xlabel("mean absolute attribution, log-odds")
         legend_below(figure, [axes], 4)
     return figure
