@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-DRAWING = frozenset(
-    {
-        *(torch.bernoulli, torch.multinomial, torch.normal, torch.rand, torch.randint, torch.randn, torch.randperm),
-        *(Tensor.bernoulli_, Tensor.exponential_, Tensor.normal_, Tensor.random_, Tensor.uniform_),
-    }
+IN_PLACE = frozenset(
+    {Tensor.bernoulli_, Tensor.exponential_, Tensor.normal_, Tensor.random_, Tensor.uniform_},
 )
+DRAWING = IN_PLACE | {
+    *(torch.bernoulli, torch.multinomial, torch.normal, torch.rand, torch.randint, torch.randn, torch.randperm),
+}
 
 
 class DrawsFrom(TorchFunctionMode):
@@ -32,3 +32,14 @@ class DrawsFrom(TorchFunctionMode):
         if given.get("generator") is None and ("generator" in given or func in DRAWING):
             given["generator"] = self.generator
         return func(*args, **given)
+
+
+class Undrawn(TorchFunctionMode):
+    """A context: tensors that would be filled with random numbers stay as they are: no time, no draws."""
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        if func in IN_PLACE:
+            return args[0]
+        return func(*args, **(kwargs or {}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -72,11 +73,11 @@ def load_into(module: M, weights: Mapping[str, Tensor], where: str, *, assign: b
 def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: str, *, custom: bool = False) -> M:
     """The module that ``make`` builds, with these weights; a ``UserError`` if they do not fit it.
 
-    It is built without numbers, which costs no time and no draws, unless it is ``custom``: the user's code.
+    It is built without random numbers, which costs no time and no draws, unless it is ``custom``: the user's code.
     """
-    import torch
+    from hypogoal.core.drawing import Undrawn
 
-    with torch.device("cpu" if custom else "meta"):
+    with contextlib.nullcontext() if custom else Undrawn():
         module = make()
     copies = {name: tensor.clone() for name, tensor in weights.items()}
     return load_into(module, copies, where, assign=not custom)
