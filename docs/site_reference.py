@@ -6,11 +6,75 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
+PYTHON = {  # what other programs use: by heading, names or (name, its members that are shown)
+    "Stages": (
+        "hypogoal.stages.collect.collect",
+        "hypogoal.stages.train_ensemble.train_ensemble",
+        "hypogoal.stages.train_options.train_options",
+        "hypogoal.stages.train_meta.train_meta",
+        "hypogoal.stages.train_baseline.train_baseline",
+        "hypogoal.stages.evaluate.evaluate",
+        "hypogoal.stages.report.report",
+        "hypogoal.api.compare",
+        ("hypogoal.made.Made", "metrics, show"),
+    ),
+    "Loading and playing": (
+        "hypogoal.api.load_ensemble",
+        "hypogoal.api.load_options",
+        "hypogoal.options.env.Options",
+        "hypogoal.options.env.OptionEnv",
+        "hypogoal.options.reward.SubgoalReward",
+        ("hypogoal.hypotheses.ensemble.Ensemble", "predict, attributions, see"),
+        "hypogoal.core.errors.UserError",
+    ),
+    "Own domains": (
+        "hypogoal.domains.gymnasium.domain.GymnasiumDomain",
+        "hypogoal.domains.base.Domain",
+        "hypogoal.domains.base.Engine",
+        "hypogoal.domains.base.Step",
+        "hypogoal.data.Collected",
+        "hypogoal.data.States",
+        "hypogoal.core.config.setting",
+    ),
+    "Contracts, as tests": (
+        "hypogoal.check.check_domain",
+        "hypogoal.check.check_objective",
+        "hypogoal.check.check_network",
+        "hypogoal.check.require",
+        "hypogoal.check.Verdict",
+    ),
+    "Data files": (
+        "hypogoal.data.open_dataset",
+        "hypogoal.data.Dataset",
+        "hypogoal.data.write_dataset",
+    ),
+    "Objectives": (
+        "hypogoal.diversity.dbat.pair_loss",
+        ("hypogoal.diversity", "Context, load_objective"),
+        ("hypogoal.hypotheses.fit", "fit, disagreement_of"),
+        ("hypogoal.hypotheses.training", "Training, train"),
+    ),
+    "Numbers": (
+        (
+            "hypogoal.hypotheses.scores",
+            "member_scores, ranking, best_threshold, cross_fitted, best_mean_worst, mean_disagreement",
+        ),
+        (
+            "hypogoal.evaluation.house",
+            "read_numbers, per_run, over, pairs, compare, interval, student_interval, interquartile_mean",
+        ),
+        ("hypogoal.hypotheses.deep_lift", "attributed, Attributions"),
+        "hypogoal.meta.smdp.smdp_advantages",
+        "hypogoal.learners.double_dqn.double_q_targets",
+    ),
+}
+
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages; MkDocs calls it once it knows the pages that are files."""
-    for name, text in (("reference/cli.md", command_line()), ("reference/settings.md", settings())):
-        files.append(File.generated(config, name, content=text))
+    pages = {"cli": command_line(), "settings": settings(), "python": python()}
+    for name, text in pages.items():
+        files.append(File.generated(config, f"reference/{name}.md", content=text))
     return files
 
 
@@ -48,6 +112,23 @@ def settings() -> str:
             lines += [_row(row) for row in rows]
             lines.append("")
     return "\n".join(lines)
+
+
+def python() -> str:
+    """What the docstrings say of the names that other programs use."""
+    lines = ["# Python", "", "What other programs use. Everything else may change between versions.", ""]
+    for heading, names in PYTHON.items():
+        lines += [f"## {heading}", ""]
+        for entry in names:
+            lines += _documented(entry)
+    return "\n".join(lines)
+
+
+def _documented(entry: str | tuple[str, str]) -> list[str]:
+    if isinstance(entry, str):
+        return [f"::: {entry}", ""]
+    name, members = entry
+    return [f"::: {name}", "    options:", f"      members: [{members}]", ""]
 
 
 def _row(row: dict[str, Any]) -> str:
