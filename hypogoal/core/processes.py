@@ -1,4 +1,4 @@
-"""Where work runs: in processes of their own, on a device, with one thread of torch's; and how a process is stopped."""
+"""Where work runs: in processes of their own, on a device, with one thread of torch's; how it is stopped (Spec G5)."""
 
 import multiprocessing
 import os

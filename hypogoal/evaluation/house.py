@@ -1,4 +1,4 @@
-"""The one table of results, and what is done with it: a value of each run, means over runs, pairs of runs (Spec F5)."""
+"""The one table of results, and what is done with it: values of runs, means over runs, pairs of runs (Spec F5, H7)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run of cells: begun, made anew in part, gone on with (Spec A6, G1, G4)."""
+"""A run of cells: begun, made anew in part, gone on with (Spec A6, G1, G4, I7)."""
 
 import shlex
 import shutil

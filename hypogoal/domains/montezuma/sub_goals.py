@@ -1,7 +1,8 @@
-"""The sub-goals on Montezuma's Revenge: where each holds, by the console's memory, and the rooms that label it.
+"""The sub-goals on Montezuma's Revenge (Spec I4): where each holds, by the console's memory, and rooms that label it.
 
 The paper has the first; the others are in its authors' repository (``monte_terminations.py``). One more is one more
-entry of ``SUB_GOALS``. Where enemies and lasers are is in ``measured.toml``, see docs/deviations.md.
+entry of ``SUB_GOALS``. Where enemies and lasers are is in ``measured.toml``; where the authors' code differs, in
+docs/deviations.md.
 """
 
 from collections.abc import Callable, Iterable, Sequence
