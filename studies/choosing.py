@@ -69,7 +69,7 @@ ROOMS = {  # columns, by what their files' names end in
 COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
 HIGH = 0.9
 SHARES = "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
-SHOWN = {"success": "solved", "within_rho": "within-rho", "pair": "better of two", "score": "score"}
+SHOWN = {"success": "solved", "within_rho": "within-rho", "pair": "better of two"}
 
 
 def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
@@ -221,6 +221,8 @@ def _joint_minus(rows: list[dict[str, str]], method: str, truth: str) -> str:
 
 def _mean(values: NDArray[np.float64]) -> str:
     defined = values[~np.isnan(values)]
+    if not len(defined):
+        return "-"
     few = f" (n = {len(defined)})" if len(defined) < len(values) else ""
     return f"{interval(defined, 2)}{few}"
 

@@ -53,7 +53,6 @@ OPTIONS = {
 }
 SCORES = {
     "within_2": "within twice the shortest path",
-    "near": "within 1.5 times",
     "success": "solved",
 }
 UNIFORM = "_uniform"  # what columns of uniform-random choice end in
@@ -96,26 +95,21 @@ def tables(path: Path) -> Iterator[str]:
     """What the cells of options say, as lines of Markdown."""
     within = read(path, "within_2")
     wrong = read(path, "false_positives")
-    success = read(path, "success")
-    spent = read(path, "cpu_seconds")
     rows = []
     for method, title in METHODS.items():
-        minutes = max(mean_member(spent, method).values()) / 60
         rows.append(
             [
                 title,
                 interval(_values(mean_member(within, method)), 2),
                 interval(_values(picked_member(within, method)), 2),
                 interval(_values(mean_member(wrong, method)), 2),
-                interval(_values(mean_member(success, method)), 2),
-                f"{minutes:.1f}" if minutes else "-",
                 str(len(within[method, NEW])),
             ]
         )
     yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals."
     yield "Picked: the member that is best on 50 layouts learned in."
     yield ""
-    titles = ["options", "mean member", "picked member", "false positives", "any success", "CPU minutes", "seeds"]
+    titles = ["options", "mean member", "picked member", "false positives", "seeds"]
     yield from table(titles, rows)
     yield "Differences over the seeds that both have."
     yield ""
@@ -152,11 +146,10 @@ def tables_of_agents(path: Path) -> Iterator[str]:
         for options, title in OPTIONS.items():
             if agents := cells[world, options]:
                 shares = [_beside_uniform(agents, score) for score in SCORES]
-                seconds = np.median(_column(agents, "cpu_seconds"))
-                rows.append([f"{world_title}, {title}", *shares, f"{seconds:.0f}", str(len(agents))])
+                rows.append([f"{world_title}, {title}", *shares, str(len(agents))])
     yield "100 new layouts, without learning there, those that can be solved: agent / uniform-random choice."
     yield ""
-    yield from table(["world, options", *SCORES.values(), "CPU seconds", "seeds"], rows)
+    yield from table(["world, options", *SCORES.values(), "seeds"], rows)
 
 
 def _beside_uniform(agents: list[dict[str, str]], score: str) -> str:

@@ -165,8 +165,6 @@ SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
     "balanced accuracy at 0.5, cross-fitted best": lambda members: crossed(members, "balanced_accuracy"),
     "mean member": lambda members: float(members["balanced_accuracy"].mean()),
     "worst member": lambda members: float(members["balanced_accuracy"].min()),
-    "above the 95th percentile, mean": lambda members: float(members["at_q95"].mean()),
-    "at its best threshold, mean": lambda members: float(members["at_best"].mean()),
 }
 CROSSED = ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best")
 

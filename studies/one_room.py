@@ -39,12 +39,12 @@ GROUPS = {
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     distances = read(path, 1)
-    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds (how many)."
+    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds."
     yield ""
     rows = []
     for ladder in (*LADDERS, *ON_BASES):
         rows.append([ladder, *(_bold(distances.get((method, ladder), {})) for method in METHODS)])
-    yield from table(["ladder", *METHODS.values()], rows)
+    yield from table(["ladder", *(_titled(distances, method) for method in METHODS)], rows)
     yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders."
     yield ""
     rows = []
@@ -67,8 +67,13 @@ def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
     if not seeds:
         return "-"
     best, mean, worst = best_mean_worst(seeds)
-    text = f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
-    return f"{text} ({len(seeds)})"
+    return f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
+
+
+def _titled(distances: Distances, method: str) -> str:
+    """A method and how many seeds each of its ladders has."""
+    counts = {len(seeds) for (name, _), seeds in distances.items() if name == method}
+    return f"{METHODS[method]} (seeds: {', '.join(map(str, sorted(counts)))})"
 
 
 def _of_group(distances: Distances, method: str, ladders: tuple[str, ...]) -> dict[int, float]:
