@@ -13,7 +13,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import NormalizedName, canonicalize_name
@@ -208,12 +207,10 @@ def test_formats_are_readable_without_hypogoal(
     numbers = Path("runs/demo/evaluation/numbers.csv")
     numbers.parent.mkdir()
     numbers.write_text("quantity,value,method,scope,step\nsuccess,0.5,option agent,,\n")
-    assert len(snippets) == 5 and not any("hypogoal" in snippet for snippet in snippets)
+    assert len(snippets) == 4 and not any("hypogoal" in snippet for snippet in snippets)
     found: dict[str, Any] = {}
     for snippet in snippets:
         exec(compile(snippet, "docs/formats.md", "exec"), found)
-    logits = member.logits(np.zeros((1, 64, 64, 3), np.uint8))[0]
-    np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-6)
     printed = capsys.readouterr().out
     assert "option agent" in printed
     positives = int(open_dataset(data).labelled("open-red-door").labels.sum())
