@@ -6,7 +6,8 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-PYTHON = {  # what other programs use: by heading, names or (name, its members that are shown)
+# What other programs use: by heading, names or (name, its members that are shown).
+PYTHON: dict[str, tuple[str | tuple[str, str], ...]] = {
     "Stages": (
         "hypogoal.stages.collect.collect",
         "hypogoal.stages.train_ensemble.train_ensemble",
