@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import of_user
+from hypogoal.core.own_code import message
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,8 @@ def verdicts(laws: Iterable[Callable[[Any], str | None]], subject: Any) -> Itera
             warnings.simplefilter("always")
             try:
                 ok, text = True, law(subject) or str(law.__doc__)
-            except UserError as error:
-                ok, text = False, str(error)
             except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code raises
-                ok, text = False, str(of_user(error) or UserError(type(error).__name__, error))
+                ok, (text, _) = False, message(error)
         texts = dict.fromkeys(str(warning.message) for warning in caught)
         yield Verdict(law.__name__.replace("_", " "), ok, text, tuple(texts))
         if not ok:

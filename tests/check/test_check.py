@@ -89,22 +89,24 @@ def moody(self: Any, ids: np.ndarray) -> np.ndarray:
 
 
 BROKEN = [
-    (having(sub_goals=("a/b", "c")), "settings", "a/b"),
-    (having(defaults={"train-ensemble": {"memberz": 4}}), "settings", "memberz"),
-    (having(defaults={"train_ensemble": {"members": 4}}), "settings", "'train_ensemble', which is not a stage"),
-    (domain_of(images=lambda self, ids, out=None: np.zeros((3, 64, 64, 3), np.float32)), "observations", "float32"),
-    (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "observations", "does not fill out"),
-    (domain_of(images=lambda self, ids, out=None: 1 // 0), "observations", "ZeroDivisionError"),
+    (having(sub_goals=("a/b", "c")), "collect", "a/b"),
+    (domain_of(images=lambda self, ids, out=None: np.zeros((3, 64, 64, 3), np.float32)), "steps", "float32"),
+    (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "steps", "does not fill out"),
+    (domain_of(images=lambda self, ids, out=None: 1 // 0), "steps", "ZeroDivisionError"),
     (stepping(rewards=lambda values: values[:2]), "steps", "the engine's step gave rewards"),
     (stepping(rewards=lambda values: values * np.nan), "steps", "finite"),
     (domain_of(step=never_ending), "steps", "went on after max_steps"),
-    (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "labels", "(3, 1)"),
-    (domain_of(labels=moody), "labels", "asked twice in the same state, labels differ: right-end"),
+    (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "steps", "(3, 1)"),
+    (domain_of(labels=moody), "steps", "asked twice in the same state, labels differ"),
     (domain_of(step=wandering), "two engines", "differ in step"),
     (domain_of(restore=forgetful), "restore", "differ in step"),
     (collecting("labelled", labels=lambda labels: labels.astype(int)), "collect", "are not truth values"),
     (collecting("labelled", labels=np.zeros_like), "collect", "left-end has no positives"),
-    (collecting("heldout", observations=lambda some: some[:0], labels=lambda some: some[:0]), "collect", "no heldout"),
+    (
+        collecting("heldout", observations=lambda some: some[:0], labels=lambda some: some[:0]),
+        "collect",
+        "heldout: uint8 (0, 64, 64, 3)",
+    ),
     (collecting("unlabelled", observations=NOBODYS.permutation), "collect", "states differ when collected again"),
 ]
 
@@ -120,11 +122,9 @@ def test_each_broken_law_of_a_domain_is_named(domain: CorridorDomain, law: str, 
 
 def test_domains_that_keep_the_contract_pass() -> None:
     """Spec B6: one of an engine, one of an environment."""
-    defaults = {"train-ensemble": {"members": 4}, "collect": {"copies": 2}, "train-baseline": {}}
-    found = [*check_domain(having(defaults=defaults))]
+    found = [*check_domain(CorridorDomain())]
     require(found)
-    laws = ["settings", "observations", "steps", "labels", "two engines", "restore", "collect"]
-    assert [verdict.name for verdict in found] == laws
+    assert [verdict.name for verdict in found] == ["steps", "two engines", "restore", "collect"]
     assert not any(verdict.warnings for verdict in found)
     both = GymnasiumDomain(CorridorEnv, SUB_GOALS, success=swift)
     require(check_domain(both, SMALL))
@@ -137,7 +137,7 @@ def test_what_may_surprise_is_a_warning() -> None:
         return np.stack([ids == 0, np.full(len(ids), self.elapsed[0] % 2 == 0)], axis=1)
 
     surprises = [
-        (check_domain(domain_of(labels=hidden)), "labels", "different labels: no classifier"),
+        (check_domain(domain_of(labels=hidden)), "steps", "different labels: no classifier"),
         (check_domain(domain_of(resumes=False)), "restore", "cannot be resumed"),
         (check_domain(NEVER, SMALL), "collect", "on-the-moon has no positives"),
     ]
@@ -191,11 +191,10 @@ PAIRS = [
     (lambda a, b: dbat.pair_loss(a.detach(), b), "gradients"),
     (lambda a, b: a.square().mean(-1), "finite"),
     (lambda a, b: dbat.pair_loss(a, b) * a.shape[-2] / a.shape[-2], "finite"),
-    (lambda a, b: dbat.pair_loss(a, b) + 0.1 * a.square().sum((-2, -1)), "order"),
 ]
 ENSEMBLES: list[tuple[Any, str]] = [
     (lambda context: context.unlabelled.square().sum() / context.unlabelled.shape[1], "finite"),
-    (lambda context: context.unlabelled[0].square().sum(), "order"),
+    (lambda context: context.unlabelled[0].square().sum(), "gradients"),
     (lambda context: -(context.unlabelled.softmax(-1)[..., 0] / 1e9).log().sum(), "finite"),
     (lambda context: context.unlabelled.detach().square().sum(), "gradients"),
 ]
@@ -275,11 +274,11 @@ def test_the_command_prints_a_line_for_each_law(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(TESTS)
     small = settings("steps=150", "heldout_seeds=4,5")
     told = run("check", "corridor_env:DOMAIN", *small).out.splitlines()
-    assert len(told) == 8 and all(line.startswith("ok   ") for line in told)
+    assert len(told) == 5 and all(line.startswith("ok   ") for line in told)
     told = fails("check", "corridor_env:RESTLESS", *small).out.splitlines()
     assert told[-1].startswith("FAIL two engines") and "np_random" in told[-1]
     told = run("check", "corridor_env:SENSED", *small, "--network", "mlp").out.splitlines()
-    assert len(told) == 12 and not any(line.startswith("FAIL") for line in told)
+    assert len(told) == 9 and not any(line.startswith("FAIL") for line in told)
     told = fails("check", "corridor_env:SENSED", *small, "--network", "doorkey").out.splitlines()
     assert told[-1].startswith("FAIL logits: the network 'doorkey' does not take these observations")
     monkeypatch.chdir(TESTS.parent / "examples")
