@@ -353,15 +353,13 @@ def import_(
         list[str] | None,
         Option(
             metavar="NAME=RULE",
-            help="Episodes: a column, last:N frames, FILE.csv or MODULE:FUNCTION; data file: FILE.csv.",
+            help="Episodes: a column, last:N frames, FILE.csv; data file: FILE.csv.",
         ),
     ] = None,
     key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
     every: Annotated[int, Option(min=1, help="Episodes: take every N-th frame.")] = 1,
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
-    resize: Annotated[
-        list[str] | None, Option(metavar="[KEY=]N", help="Most pixels on the longer side of pictures, or of a key's.")
-    ] = None,
+    resize: Annotated[int, Option(min=0, help="Most pixels on the longer side of pictures; 0: as many as given.")] = 0,
     group: Annotated[str, Option(help="Arrays: which one says what states belong together; held out whole.")] = "",
     stack: Annotated[bool, Option("--stack", metavar="", help="Axes of frames and colours become channels.")] = False,
     domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
@@ -371,30 +369,28 @@ def import_(
 ) -> None:
     """Make a data file of your arrays, pictures or recorded episodes."""
     from hypogoal import look
-    from hypogoal.data import open_dataset
-    from hypogoal.importing import data_file, taken
+    from hypogoal.importing.data_file import import_data
 
-    sides = _sides(resize or ())
-    remarks = data_file.import_data(
+    remarks = import_data(
         source,
         out,
-        sub_goals=sub_goal or (),
-        labels=_labels(label or ()),
-        keys=key or (),
+        sub_goals=tuple(sub_goal or ()),
+        rules=_labels(label or ()),
         share=heldout,
-        sides=sides,
-        every=every,
-        stack=stack,
         group=group,
         domain=domain,
         seed=seed,
         force=force,
+        keys=tuple(key or ()),
+        every=every,
+        resize=resize,
+        stack=stack,
     )
     for line in remarks:
         say(f"hypogoal: {line}", err=True)
     if not quiet:
-        dataset = open_dataset(out)
-        for line in (*taken.describe(dataset, resized=bool(sides)), *look.count_lines(dataset.counts())):
+        details = look.describe(out)
+        for line in (f"states: {details['observations']}", *look.outcome(details)):
             say(line)
         run_folder = out.parent if out.name == "data.h5" else Path("runs", out.stem)
         say(f"next: {own_code.command('train-ensemble', out, '--out', run_folder / 'ensemble')}")
@@ -410,17 +406,6 @@ def _labels(texts: Iterable[str]) -> dict[str, str]:
             raise UserError("--label needs NAME=RULE", text, "For example --label won=next.success.")
         labels[name] = rule
     return labels
-
-
-def _sides(texts: Iterable[str]) -> dict[str, int]:
-    """The pixels of ``--resize [KEY=]N`` by key; without a key they are those of all pictures."""
-    sides = {}
-    for text in texts:
-        key, _, pixels = text.rpartition("=")
-        if not pixels.isdecimal():
-            raise UserError("--resize needs a number of pixels", text, "Give --resize 128 or KEY=128.")
-        sides[key] = int(pixels)
-    return sides
 
 
 @command(OWN, "export runs/mine/ensemble --out mine")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import NO_FILE_NAME, plain_names, replacing
+from hypogoal.core.files import NO_FILE_NAME, plain_names, reading, replacing
 from hypogoal.observations import (
     NUMBERS,
     DType,
@@ -43,7 +42,6 @@ GET_MORE = "Collect more steps or other layouts, or bring a policy that gets the
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
-UNREADABLE = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError)  # h5py's, of a damaged file
 Labels: TypeAlias = NDArray[np.bool_]
 Integers: TypeAlias = NDArray[np.int64]
 
@@ -103,8 +101,7 @@ def joined(parts: Sequence[States]) -> States:
         return parts[0]
     observations = np.concatenate([part.observations for part in parts])
     labels = np.concatenate([part.labels for part in parts])
-    names = [set(part.origins) for part in parts]
-    shared = set.intersection(*names)
+    shared = set.intersection(*[{*part.origins} for part in parts])
     origins = {}
     for name in sorted(shared):
         origins[name] = np.concatenate([part.origins[name] for part in parts])
@@ -142,23 +139,12 @@ def require_names(sub_goals: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def reading(path: Path, subject: str = "the data file", do: str = RECOLLECT) -> Iterator[Any]:
+def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> Iterator[Any]:
     """An HDF5 file opened for reading; whatever cannot be read in the block is a ``UserError``."""
     import h5py
 
-    try:
-        with h5py.File(path, "r", locking="best-effort") as file:
-            yield file
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        cause = os.strerror(error.errno or 0).lower()
-        raise UserError(f"{subject} cannot be read: {cause}", path, "Is it the right path?") from None
-    except UNREADABLE as error:
-        cause = str(error)
-        if "h5clear" in cause:
-            do = f"If no program writes it any more, one has crashed: h5clear -s {path}"
-        elif "unable to lock" in cause:
-            do = "It is open in another program: close it there first."
-        raise UserError(f"{subject} cannot be read: {cause}", path, do) from None
+    with reading(path, do, subject), h5py.File(path, "r", locking="best-effort") as file:
+        yield file
 
 
 @contextlib.contextmanager
@@ -186,7 +172,14 @@ def fixed(text: str) -> NDArray[np.bytes_]:
     return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
 
 
-def write_dataset(path: Path, collected: Collected, *, domain: str, config: Mapping[str, Any], seed: int) -> None:
+def write_dataset(
+    path: Path,
+    collected: Collected,
+    *,
+    domain: str,
+    config: Mapping[str, Any],
+    seed: int,
+) -> None:
     """Write collected states; a file of that name is replaced once the new one is complete.
 
     Raises ``UserError`` if a name cannot be a file name or labels are not truth values.
@@ -224,7 +217,8 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
         raise UserError(f"the domain's {split} labels are not truth values", labels.dtype, "Give bool (N, sub-goals).")
     first = file.create_group(f"{split}/{sub_goals[0]}")
     _write_states(first, states)
-    for sub_goal, column in zip(sub_goals, labels.T, strict=True):
+    columns = labels.reshape(len(labels), len(sub_goals))
+    for sub_goal, column in zip(sub_goals, columns.T, strict=True):
         group = file.require_group(f"{split}/{sub_goal}")
         for name in first.keys() - group.keys() - {"labels"}:
             group[name] = first[name]
@@ -272,22 +266,23 @@ class Dataset:
 
         Of a mixed observation ``key[0]``, ``key[1]``, ..., and a picture's key alone.
         """
-        with reading(self.path) as file:
+        with opened(self.path) as file:
             if "features" in file:
                 return [*json.loads(file["features"][()])]
-        names = []
+        names: list[str] = []
         for key, (kind, shape) in fields_of(self.observation_shape, self.observation_dtype).items():
             size = prod(shape) if kind == NUMBERS else 1
-            names += [f"{key or 'x'}[{place}]" for place in range(size)] if size > 1 else [key]
+            numbered = [f"{key or 'x'}[{place}]" for place in range(size)]
+            names += numbered if size > 1 else [key]
         return names
 
     def labelled(self, sub_goal: str) -> States:
         """The labelled states of one sub-goal."""
-        return self._split("labelled", sub_goal)
+        return self._states("labelled", sub_goal)
 
     def heldout(self, sub_goal: str) -> States:
         """The held-out states of one sub-goal with their true labels, for evaluation only."""
-        return self._split("heldout", sub_goal)
+        return self._states("heldout", sub_goal)
 
     def unlabelled(self) -> Observations:
         """The unlabelled states: uint8 or float32 (M, *obs)."""
@@ -295,53 +290,46 @@ class Dataset:
 
     def unlabelled_states(self) -> States:
         """The same with their origins, if the file has any, and no labels, (M, 0)."""
-        with reading(self.path) as file:
-            observations = self._observations(file["unlabelled"])
-            none = np.zeros((len(observations), 0), np.bool_)
-            return States(observations, none, _origins(file["unlabelled"]))
+        return self._states("unlabelled")
 
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""
-        with reading(self.path) as file:
+        with opened(self.path) as file:
             counts: dict[str, Any] = {"unlabelled": len(file["unlabelled/observations"])}
             for split in SPLITS:
                 counts[split] = {}
                 for goal in self.sub_goals:
-                    labels = _labels(file[f"{split}/{goal}"])
+                    labels = _column(file[f"{split}/{goal}"], "labels")
                     counts[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
             return counts
 
-    def _split(self, split: str, sub_goal: str) -> States:
-        if sub_goal not in self.sub_goals:
-            raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {', '.join(self.sub_goals)}.")
-        with reading(self.path) as file:
+    def _states(self, split: str, sub_goal: str = "") -> States:
+        """The states of a split; what is not as the root's attributes say is a ``UserError``."""
+        if sub_goal not in ("", *self.sub_goals):
+            goals = ", ".join(self.sub_goals)
+            raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {goals}.")
+        with opened(self.path) as file:
             group = file[f"{split}/{sub_goal}"]
-            observations = self._observations(group)
-            return States(observations, _labels(group), _origins(group))
-
-    def _observations(self, group: Any) -> Observations:
-        data = group["observations"]
-        if data.shape[1:] != self.observation_shape or data.dtype != self.observation_dtype:
-            raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
-        values = data[()]
-        if not np.isfinite(numbers_of(values)).all():
-            raise ValueError(f"{data.name} has numbers that are not finite")
-        return values
+            data = group["observations"]
+            has_shape = data.shape[1:] == self.observation_shape
+            if not has_shape or data.dtype != self.observation_dtype:
+                raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
+            values = data[()]
+            if not np.isfinite(numbers_of(values)).all():
+                raise ValueError(f"{data.name} has numbers that are not finite")
+            labels = np.zeros((len(values), 0), np.bool_)
+            if sub_goal:
+                labels = _column(group, "labels").astype(np.bool_)
+            origins = {}
+            for name in group.get("origin", ()):
+                origins[name] = _column(group, f"origin/{name}").astype(np.int64)
+            return States(values, labels, origins)
 
 
 def _plain(attribute: Any) -> Any:
     """An attribute as Python's own: a text, int, float or bool."""
     value = np.asarray(attribute).item()
     return value.decode() if isinstance(value, bytes) else value
-
-
-def _labels(group: Any) -> Labels:
-    return _column(group, "labels").astype(np.bool_)
-
-
-def _origins(group: Any) -> dict[str, Integers]:
-    names = group.get("origin", ())
-    return {name: _column(group, f"origin/{name}").astype(np.int64) for name in names}
 
 
 def _column(group: Any, name: str) -> NDArray[Any]:
@@ -354,7 +342,7 @@ def _column(group: Any, name: str) -> NDArray[Any]:
 
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
-    with reading(path) as file:
+    with opened(path) as file:
         attributes = {name: _plain(value) for name, value in file.attrs.items()}
         version = attributes.get("format")
         if not isinstance(version, int):

@@ -52,18 +52,20 @@ def fields_of(shape: Shape, dtype: DType) -> Fields:
 
 def values_in(shape: Shape, dtype: DType) -> int:
     """How many values an observation has, bytes of pictures and numbers."""
-    sizes = [prod(size) for _, size in fields_of(shape, dtype).values()]
-    return sum(sizes)
+    sizes = 0
+    for _, size in fields_of(shape, dtype).values():
+        sizes += prod(size)
+    return sizes
 
 
 def mixed_type(fields: Fields) -> DType:
     """The type of observations with these parts, sorted by key; malformed ones are a ``ValueError``."""
-    if not plain_names([*fields]):
+    sizes = [min(shape, default=0) for _, shape in fields.values()]
+    are_plain = plain_names([*fields])
+    if not are_plain or min(sizes) <= 0:
         raise ValueError(f"malformed observations: {fields}")
     parts = []
     for key, (dtype, shape) in sorted(fields.items()):
-        if min(shape, default=0) <= 0:
-            raise ValueError(f"malformed observations: {fields}")
         parts.append((key, dtype.str, shape))
     return np.dtype(parts)
 
@@ -74,8 +76,7 @@ def type_text(dtype: DType) -> str:
         return str(dtype)
     parts = {}
     for key, (kind, shape) in fields_of((), dtype).items():
-        name = str(kind)
-        parts[key] = [name, list(shape)]
+        parts[key] = [str(kind), shape]
     return json.dumps(parts)
 
 
@@ -95,12 +96,12 @@ def type_of(text: str) -> DType:
 def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations:
     """Mixed observations (N,) from arrays (N, ...) by key, all that ``dtype`` has if given; else a ``ValueError``."""
     arrays = {}
+    fields = {}
     for key, values in parts.items():
         array = np.asarray(values)
-        if array.dtype == np.float64:
-            array = array.astype(NUMBERS)
+        kind = NUMBERS if array.dtype == np.float64 else array.dtype
         arrays[key] = array
-    fields = {key: (array.dtype, array.shape[1:]) for key, array in arrays.items()}
+        fields[key] = (kind, array.shape[1:])
     stored = mixed_type(fields)
     if dtype is not None and stored != dtype:
         raise ValueError(type_text(stored))
@@ -121,18 +122,16 @@ def numbers_of(observations: Observations) -> Floats:
     for key, (dtype, shape) in fields.items():
         if dtype == NUMBERS:
             values = observations[key] if key else observations
-            rows.append(values.reshape(count, prod(shape)))
+            row = values.reshape(count, prod(shape))
+            rows.append(row)
     return np.concatenate(rows, axis=1)
 
 
 def standard_of(shape: Shape, *observations: Observations) -> Standard:
     """Mean and deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary, or without any."""
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
-    none = np.zeros((0, *shape), NUMBERS)
-    sample = np.concatenate([none, *rows])
-    if not len(sample):
-        nothing = np.zeros(shape, NUMBERS)
-        return nothing, nothing + 1
+    nothing = np.zeros((1, *shape), NUMBERS)
+    sample = np.concatenate(rows or [nothing])
     mean = sample.mean(0, dtype=np.float64)
     deviation = sample.std(0, dtype=np.float64)
     varies = deviation > 1e-6 * np.abs(mean)
@@ -148,6 +147,7 @@ def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
 
 def spread_rows(count: int, most: int) -> NDArray[np.int64]:
     """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
-    last, wanted = count - 1, min(count, most)
+    last = count - 1
+    wanted = min(count, most)
     rows = np.linspace(0, last, wanted)
     return rows.astype(np.int64)

@@ -14,7 +14,7 @@ from command_line import fails, refuses, run
 from toy_data import SHAPE, write
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import Collected, States, fixed, open_dataset, reading, write_dataset
+from hypogoal.data import Collected, States, fixed, open_dataset, opened, write_dataset
 
 OBSERVATIONS, LABELS = "labelled/one/observations", "labelled/one/labels"
 CRASH = """
@@ -108,7 +108,7 @@ def test_a_crashed_programs_file_names_h5clear(tmp_path: Path) -> None:
     """Its data are whole: the HDF5 tools take the mark away that it is open for writing."""
     path = tmp_path / "crashed.h5"
     subprocess.run([sys.executable, "-c", CRASH, path], check=False)
-    with pytest.raises(UserError, match=f"h5clear -s {path}"), reading(path):
+    with pytest.raises(UserError, match=f"h5clear -s {path}"), opened(path):
         pass
 
 

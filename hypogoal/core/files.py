@@ -14,6 +14,31 @@ from typing import Any
 from hypogoal.core.errors import UserError
 
 NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
+POINTER = b"version https://git-lfs"  # how a file begins that Git LFS has not fetched
+AGAIN = "Write or download it again; hypogoal's page on data of your own says what is read."
+
+
+@contextlib.contextmanager
+def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None]:
+    """A block that reads a file by some library: whatever that raises becomes one line with the cause."""
+    try:
+        yield
+    except (UserError, MemoryError):
+        raise
+    except ImportError as error:
+        do = "pip install 'hypogoal[lerobot,minari]'"
+        raise UserError(f"a package that reads this is not installed ({error})", path, do) from None
+    except FileNotFoundError as error:
+        raise UserError("no such file", error.filename or path, do) from None
+    except Exception as error:  # noqa: BLE001 - libraries raise what they like
+        fault = f"{subject} cannot be read ({type(error).__name__}: {error})"[:250]
+        if "h5clear" in fault:
+            do = f"If no program writes it any more, one has crashed: h5clear -s {path}"
+        elif "unable to lock" in fault:
+            do = "It is open in another program: close it there first."
+        elif path.is_file() and path.read_bytes().startswith(POINTER):
+            fault, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
+        raise UserError(fault, path, do) from None
 
 
 def read_text(path: Path, subject: str, do: str) -> str:

@@ -16,7 +16,7 @@ from hypogoal.core.artefacts import AGAIN, MANIFEST, Artefact, open_artefact, sh
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, visible
 from hypogoal.core.own_code import command
-from hypogoal.data import reading
+from hypogoal.data import opened
 from hypogoal.evaluation.house import EVALUATE_AGAIN, read_numbers
 from hypogoal.evaluation.page import Results
 from hypogoal.options.tables import MAX_INTEGER
@@ -123,7 +123,7 @@ def read_layout(path: Path) -> dict[str, Any]:
 
 def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
     """``terminations.h5``: option -> the last states in which its classifier ended it, (n, *obs)."""
-    with reading(path, "the file of terminations", AGAIN) as file:
+    with opened(path, AGAIN, "the file of terminations") as file:
         return {int(name): states[()] for name, states in file.items()}
 
 
@@ -151,7 +151,7 @@ def read_evaluation(run: Path) -> Results:
     """
     source = evaluation_of(run)
     results = with_missing(read_results(source), _since(run, source))
-    with reading(source.path / "arrays.h5", "the evaluation's arrays", EVALUATE_AGAIN) as file:
+    with opened(source.path / "arrays.h5", EVALUATE_AGAIN, "the evaluation's arrays") as file:
         names: list[str] = []
         file.visit(names.append)
         arrays = {name: file[name][()] for name in names if hasattr(file[name], "shape")}

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import Collected, Integers, Labels, States, doubts_of, require_classes
-from hypogoal.importing.episodes import ROLES, Array
-from hypogoal.importing.files import reading
-from hypogoal.importing.states import Frame
+from hypogoal.data import Collected, Labels, States, doubts_of, require_classes
+from hypogoal.importing.episodes import HELDOUT, LABELLED, ROLES, UNLABELLED
+from hypogoal.importing.states import Frames
 from hypogoal.importing.taken import together
 from hypogoal.observations import digest, packed
 
@@ -22,7 +23,8 @@ REMARK = "no held-out states were given: {} of the labelled ones are held out, w
 
 def assemble(
     source: Path,
-    frames: Sequence[Frame],
+    frames: Frames,
+    labels: Labels,
     goals: Sequence[str],
     features: Sequence[str] = (),
     *,
@@ -32,176 +34,119 @@ def assemble(
     """The states in the form of a data file, and lines on what is allowed but may surprise.
 
     Without held-out states, a ``share`` of each class of the labelled ones, or of their groups, is held out by
-    ``seed``. Unusable states, and a class that is missing or only has states that the other class has too, are a
-    ``UserError``.
+    ``seed``. Unusable states and a class that is missing are a ``UserError``.
     """
-    labelled, unlabelled, heldout = split(frames, seed, source)
-    names = [frame.name for frame in frames]
-    first = frames[0]
-    for frame in frames:
-        if frame.seen.keys() != first.seen.keys():
-            fault = "episodes have different observations"
-            raise UserError(fault, f"{first.name}, {frame.name}", "Choose some by --key.")
-    parts, channels, remarks = {}, {}, []
-    for key in first.seen:
-        states = [frame.seen[key] for frame in frames]
-        short = key.replace("/", ".") if len(first.seen) > 1 else ""
-        parts[short] = together(states, names, key or "the observations")
-        stack = first.channels[key]
-        if stack:
-            channels[short] = stack
+    kept = frames.table["kept"]
+    table = frames.table[kept].reset_index(drop=True)
+    labels = labels[kept]
+    parts = {}
+    for key, states in frames.seen.items():
+        parts[key] = together(states, table["name"].tolist(), key or "the observations")
     with reading(source, "Give keys that can be file names."):
         observations = parts[""] if "" in parts else packed(parts)
     count = observations[0].size
     if features and len(features) != count:
         raise UserError(f"{len(features)} names of features do not fit", f"{count} numbers", "Give one for each.")
-    labels = np.array([frame.labels for frame in frames])
-    looks = np.array([digest(state).hex() for state in observations])
-    remarks += contradictions(names, labels, looks, goals, labelled, heldout)
-    learned = np.concatenate([labelled, unlabelled])
-    if not len(heldout):
-        groups = np.array([frame.group for frame in frames])
-        is_held = _held_out(labels[labelled], groups[labelled], looks[labelled], share, seed)
-        heldout, labelled = labelled[is_held], labelled[~is_held]
-        learned = labelled
-        remarks.append(REMARK.format(len(heldout)))
-        of_unlabelled = groups[unlabelled]
-        alike = np.isin(of_unlabelled, groups[heldout]) & (of_unlabelled != "")
-        unlabelled = _without(unlabelled, alike, "unlabelled states are of held-out groups", remarks)
-    alike = np.isin(looks[heldout], looks[learned])
-    heldout = _without(heldout, alike, "held-out states look like ones to learn from", remarks)
-    alike = np.isin(looks[unlabelled], looks[heldout])
-    unlabelled = _without(unlabelled, alike, "unlabelled states look like ones held out", remarks)
-    require_classes(labels[labelled], goals, None, "Give states of both kinds.")
-    remarks += doubts_of(labels[labelled], labels[heldout], goals)
+    table["look"] = [digest(state).hex() for state in observations]
+    table = with_roles(table, seed)
+    table, remarks = apart(table, labels, share, seed)
     sets = []
-    for rows in (labelled, unlabelled, heldout):
+    for role in ROLES:
+        is_own = table["role"] == role
+        rows = table.index[is_own].to_numpy()
+        if not rows.size:
+            do = "; ".join(remarks) or MORE
+            raise UserError(f"there are no {role} states", source, do)
         origins = {ROW: np.arange(len(rows))}
         sets.append(States(observations[rows], labels[rows], origins))
+    labelled, unlabelled, heldout = sets
+    require_classes(labelled.labels, goals, None, "Give states of both kinds.")
     collected = Collected(
         observations.shape[1:],
         tuple(goals),
-        labelled=sets[0],
-        unlabelled=sets[1],
-        heldout=sets[2],
-        features=tuple(features),
-        channels=channels,
+        labelled,
+        unlabelled,
+        heldout,
+        tuple(features),
+        frames.channels,
     )
-    return collected, remarks
+    return collected, remarks + doubts_of(labelled.labels, heldout.labels, goals)
 
 
-def contradictions(
-    names: Sequence[str],
-    labels: Labels,
-    looks: Array,
-    goals: Sequence[str],
-    labelled: Integers,
-    heldout: Integers,
-) -> list[str]:
-    """A line for each sub-goal with equal states whose labels differ; a ``UserError`` if a class has no others.
+def with_roles(table: pd.DataFrame, seed: int) -> pd.DataFrame:
+    """What is known of frames, with a role for all: :attr:`Frames.table`.
 
-    ``names``, ``labels`` (N, G) and ``looks``, equal where states are, are of all states, the last two rows of some.
+    Whole episodes whose role is open are drawn for those of the three that no frame has yet, ``SPLIT`` of them each,
+    and stand in the order in which they were drawn.
     """
-    judged = np.concatenate([labelled, heldout])
-    lines = []
-    for goal, column in zip(goals, labels.T, strict=True):
-        both = _ambiguous(looks, column, judged)
-        if not len(both):
-            continue
-        alike = judged[looks[judged] == both[0]]
-        example = " and ".join(names[row] for row in alike)
-        learned = _ambiguous(looks, column, labelled)
-        clear = labelled[~np.isin(looks[labelled], learned)]
-        where = f"without those that have both labels, such as {example}"
-        require_classes(column[clear, None], [goal], where, "Remove the copies whose label is wrong.")
-        fault = f"{len(both)} times equal states have both labels of {goal}"
-        lines.append(f"{fault}: no member can be right about {example}")
-    return lines
+    is_open = table["role"] == ""
+    number_of, episodes = pd.factorize(table["episode"][is_open])
+    if not len(episodes):
+        return table
+    is_missing = ~np.isin(ROLES, table["role"])
+    shares = np.cumsum(SPLIT * is_missing)
+    ends = np.round(shares[:2] / shares[2] * len(episodes))
+    order = rng_for(seed, "minari").permutation(len(episodes))
+    place = np.argsort(order)[number_of]
+    role_of = np.searchsorted(ends, place, side="right")
+    table.loc[is_open, "role"] = np.array(ROLES)[role_of]
+    table.loc[is_open, "place"] = place
+    return table.sort_values("place", kind="stable", na_position="first")
 
 
-def _ambiguous(looks: Array, labels: Labels, rows: Integers) -> Array:
-    """The looks of states, some rows of all, that carry both labels."""
-    positive = labels[rows]
-    return np.intersect1d(looks[rows[positive]], looks[rows[~positive]])
-
-
-def split(frames: Sequence[Frame], seed: int, source: Path) -> list[Integers]:
-    """The rows of frames that are labelled, unlabelled and held out.
-
-    Whole episodes whose role is open are drawn for those of the three that have no frames yet, ``SPLIT`` of them each.
-    """
-    sets: dict[str, list[int]] = {role: [] for role in ROLES}
-    free: dict[str, list[int]] = {}
-    for row, frame in enumerate(frames):
-        if frame.role:
-            sets[frame.role].append(row)
-        else:
-            free.setdefault(frame.episode, []).append(row)
-    if free:
-        are_empty = [not rows for rows in sets.values()]
-        shares = np.cumsum(SPLIT * are_empty)
-        ends = shares[:2] / shares[2] * len(free)
-        episodes = [*free.values()]
-        order = rng_for(seed, "minari").permutation(len(free))
-        parts = np.split(order, np.round(ends).astype(int))
-        for role, drawn in zip(ROLES, parts, strict=True):
-            for episode in drawn:
-                sets[role] += episodes[episode]
-    needed = ROLES if free else ROLES[:2]
-    for role in needed:
-        if not sets[role]:
-            raise UserError(f"there are no {role} states", source, MORE)
-    return [np.array(rows, np.int64) for rows in sets.values()]
-
-
-def _without(
-    rows: Integers,
-    left: Labels,
-    reason: str,
-    remarks: list[str],
-) -> Integers:
-    """The rows that are not ``left`` out, which is said with the reason; if none is kept: a ``UserError``."""
-    if left.all():
-        raise UserError(f"all {len(rows)} {reason}", None, "Give some of other contexts.")
-    if left.any():
-        remarks.append(f"{left.sum()} of {len(rows)} {reason}: they are left out")
-    return rows[~left]
-
-
-def _held_out(
+def apart(
+    table: pd.DataFrame,
     labels: Labels,
-    groups: Array,
-    looks: Array,
     share: float,
     seed: int,
-) -> Labels:
-    """Which states are held out, bool (N,): whole groups, and without groups all that look alike."""
-    alike = np.where(groups == "", looks, groups)
-    _, first, unit = np.unique(alike, return_index=True, return_inverse=True)
-    kinds = labels[first]
-    if groups.any():  # which labels a group has
-        rows = []
-        for group in range(len(first)):
-            some = labels[unit == group]
-            rows.append([*some.any(axis=0), *some.all(axis=0)])
-        kinds = np.array(rows)
-    order = np.argsort(first)  # each once, in the original order
-    chosen = held_out(kinds[order], share, seed)
-    held = np.zeros(len(first), np.bool_)
-    held[order[chosen]] = True
-    return held[unit]
+) -> tuple[pd.DataFrame, list[str]]:
+    """The frames without those that are in two sets, and lines that say so.
 
-
-def held_out(labels: Labels, share: float, seed: int) -> Labels:
-    """Which states are held out, bool (N,): a random ``share`` of each combination of labels (N, G), never all of it.
-
-    A remainder of less than one state is carried over to the next combination. No state at all is a ``UserError``.
+    Where no states are held out, nor drawn by episodes, a ``share`` of the labelled ones is.
     """
+    lines = []
+    learned = [LABELLED, UNLABELLED]
+    groups: set[str] = set()
+    if HELDOUT not in {*table["role"]} and "place" not in table:
+        labelled = table[table["role"] == LABELLED]
+        is_held = held_out(labels[labelled.index], labelled, share, seed)
+        held = labelled[is_held]
+        table.loc[held.index, "role"] = HELDOUT
+        groups = {*held["group"]} - {""}
+        learned = [LABELLED]
+        lines.append(REMARK.format(len(held)))
+    for role, others in ((HELDOUT, learned), (UNLABELLED, [HELDOUT])):
+        own = table[table["role"] == role]
+        other = table[table["role"].isin(others)]
+        is_known = own["look"].isin(other["look"])
+        is_grouped = own["group"].isin(groups.intersection(other["group"]))
+        alike = own.index[is_known | is_grouped]
+        if len(alike):
+            like = " or ".join(others)
+            count = f"{len(alike)} of {len(own)} {role} states"
+            lines.append(f"{count} look like {like} ones, or are of their groups: they are left out")
+            table = table.drop(alike)
+    return table, lines
+
+
+def held_out(labels: Labels, table: pd.DataFrame, share: float, seed: int) -> Labels:
+    """Which states are held out, bool (N,): whole groups, and without groups all that look alike.
+
+    Of each combination of labels (N, G) that groups have, a random ``share``, never all. A remainder of less than one
+    is carried over to the next combination. None at all is a ``UserError``.
+    """
+    in_group = table["group"] != ""
+    unit = table["group"].where(in_group, table["look"])
+    units = pd.DataFrame(labels).groupby(unit.to_numpy(), sort=False)
+    kinds = units.first()
+    if in_group.any():
+        kinds = pd.concat([units.any(), units.all()], axis=1)
+    of_each = kinds.to_numpy()
     rng = rng_for(seed, "held-out")
-    chosen = np.zeros(len(labels), np.bool_)
+    chosen = np.zeros(len(of_each), np.bool_)
     due = 0.0
-    for kind in np.unique(labels, axis=0):
-        rows = np.flatnonzero((labels == kind).all(axis=1))
+    for kind in np.unique(of_each, axis=0):
+        rows = np.flatnonzero((of_each == kind).all(axis=1))
         due += share * len(rows)
         taken = min(round(due), len(rows) - 1)
         chosen[rng.permutation(rows)[:taken]] = True
@@ -209,4 +154,4 @@ def held_out(labels: Labels, share: float, seed: int) -> Labels:
     if not chosen.any():
         do = "Give held-out states, a larger --heldout, or more labelled ones."
         raise UserError(f"none of {len(labels)} labelled states, or groups of them, can be held out", None, do)
-    return chosen
+    return chosen[units.ngroup()]

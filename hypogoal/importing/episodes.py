@@ -12,7 +12,7 @@ ROLES = LABELLED, UNLABELLED, HELDOUT = "labelled", "unlabelled", "heldout"
 
 @dataclass(frozen=True)
 class Episode:
-    """Frames that are labelled, unlabelled or held out together: a recorded episode, one picture, one row of arrays.
+    """Frames in order: a recorded episode, one picture, or a set of arrays.
 
     Attributes:
         name: what messages and tables of labels call it.
@@ -20,8 +20,8 @@ class Episode:
         observations: by key, an array (T, ...), or a function from rising numbers of frames to what is seen in these,
             one after another. The key is "" if there are none.
         columns: (T,) by name, which may label frames.
-        role: one of ``ROLES``; empty if it may become any.
-        group: with which others it is held out, if at all; empty if it stands alone.
+        role: one of ``ROLES``; empty if it may become any, as a whole.
+        group: with which others frames are held out, if at all: one name, or (T,) names; empty if they stand alone.
     """
 
     name: str
@@ -29,4 +29,4 @@ class Episode:
     observations: Mapping[str, Any]
     columns: Mapping[str, Array]
     role: str = ""
-    group: str = ""
+    group: str | Array = ""

@@ -8,25 +8,26 @@ from typing import Any
 import numpy as np
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import AGAIN, reading
 from hypogoal.data import Integers
 from hypogoal.importing.episodes import Array
-from hypogoal.importing.files import AGAIN, needed, reading
 from hypogoal.importing.pictures import SCALE
 
-EXTRA = "lerobot"  # that brings PyAV
 SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi")
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A film and its first moving stream; pictures of a cover do not move."""
-    av = needed("av", EXTRA)
-    with reading(path), path.open("rb") as file, av.open(file) as container:  # not the path: it may be a pattern
+    with reading(path):
+        import av
+
         cover = av.stream.Disposition.attached_pic
-        streams = [stream for stream in container.streams.video if not stream.disposition & cover]
-        if not streams:
-            raise ValueError("no moving pictures")
-        yield container, streams[0]
+        with path.open("rb") as file, av.open(file) as container:  # not the path: it may be a pattern
+            streams = [stream for stream in container.streams.video if not stream.disposition & cover]
+            if not streams:
+                raise ValueError("no moving pictures")
+            yield container, streams[0]
 
 
 def count_frames(path: Path) -> int:
@@ -70,14 +71,13 @@ def _upright(frame: Any, path: Path) -> Array:
     picture = frame.to_ndarray(format="rgb24")
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":
-            matrix = np.frombuffer(bytes(data), np.int32)
-            picture = _turned(picture, matrix.reshape(3, 3))
+            picture = _turned(picture, np.frombuffer(data, np.int32))
     return picture
 
 
 def _turned(picture: Array, matrix: Array) -> Array:
-    """A picture by the display matrix: a row of it says where going one column to the right, or one row down, leads."""
-    right, down = np.sign(matrix[:2, :2])
-    if not right[0]:
-        picture, right, down = picture.swapaxes(0, 1), down, right
-    return picture[:: down[1], :: right[0]]
+    """A picture by the display matrix: where one column to the right leads, then one row down, as x, y, 0 each."""
+    right_x, right_y, _, down_x, down_y = np.sign(matrix[:5])
+    if right_x:
+        return picture[::down_y, ::right_x]
+    return picture.swapaxes(0, 1)[::right_y, ::down_x]

@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from hypogoal.core.files import reading
 from hypogoal.data import Integers
 from hypogoal.importing.episodes import Array, Episode
-from hypogoal.importing.files import needed, reading
-from hypogoal.importing.films import EXTRA, frames_in
+from hypogoal.importing.films import frames_in
 from hypogoal.importing.pictures import picture_of
 
 INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
-DO = "Give the folder of a whole LeRobotDataset in format v2.1 or v3.0."
 OWNER = "episode_index"  # a column of every table
-NUMBERS = ("float", "int", "uint", "bool")  # how the types of all others begin that are read
 
 
 def read_lerobot(
@@ -31,84 +30,61 @@ def read_lerobot(
     left: Counter[str],
 ) -> Iterator[Episode]:
     """The episodes of a dataset, with ``keys`` of its features beside all ``observation*``."""
-    with reading(source, DO):
-        text = (source / INFO).read_text(encoding="utf-8-sig")
-        info = json.loads(text)
-        table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
-        for row in _listed(source):
-            place = partial(_place, source, info, row)
-            file = place("data_path", "data")
-            table = table_of(file)
-            is_own = np.array(table[OWNER]) == row[OWNER]
-            frames = table.filter(is_own)
-            columns = {}
-            seen: dict[str, Any] = {}
-            for key, feature in info["features"].items():
-                kind = feature["dtype"]
-                if kind.startswith(NUMBERS):
-                    values = np.array(frames[key].to_pylist())
-                    columns[key] = values.reshape(len(frames), *feature["shape"])
-                if key not in keys and not key.startswith("observation"):
-                    continue
-                if kind == "video":
-                    film = place("video_path", f"videos/{key}", key)
-                    begin = row.get(f"videos/{key}/from_timestamp", 0.0)
-                    seen[key] = partial(frames_in, film, rate=info["fps"], begin=begin)
-                elif kind == "image":
-                    seen[key] = partial(_cells, file, frames[key])
-                else:
-                    seen[key] = columns.get(key)
-            yield Episode(
-                str(row[OWNER]),
-                len(frames),
-                seen,
-                columns,
-            )
+    text = (source / INFO).read_text(encoding="utf-8-sig")
+    info = json.loads(text)
+    table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
+    listed = _listed(source)
+    listed["episode_chunk"] = listed[OWNER] // info["chunks_size"]
+    for row in listed.to_dict("records"):
+        file = source / info["data_path"].format(**_facts(row, "data"))
+        table = table_of(file)
+        frames = table[table[OWNER] == row[OWNER]]
+        columns = {}
+        seen: dict[str, Any] = {}
+        for key, feature in info["features"].items():
+            if feature["dtype"] == "video":
+                facts = _facts(row, f"videos/{key}")
+                film = source / info["video_path"].format(video_key=key, **facts)
+                values: Any = partial(
+                    frames_in,
+                    film,
+                    rate=info["fps"],
+                    begin=facts["from_timestamp"],
+                )
+            elif feature["dtype"] == "image":
+                values = partial(_cells, file, frames[key])
+            else:
+                values = np.array(frames[key].tolist())
+                if values.ndim == 1:
+                    columns[key] = values
+            if key in keys or key.startswith("observation"):
+                seen[key] = values
+        yield Episode(str(row[OWNER]), len(frames), seen, columns)
 
 
-def _listed(source: Path) -> list[dict[str, Any]]:
+def _listed(source: Path) -> pd.DataFrame:
     """What ``meta/`` says of each episode."""
     file = source / EPISODES.with_suffix(".jsonl")
     if file.exists():
-        text = file.read_text(encoding="utf-8-sig")
-        lines = filter(str.strip, text.splitlines())
-        return [*map(json.loads, lines)]
-    rows: list[dict[str, Any]] = []
+        return pd.read_json(file, lines=True, encoding="utf-8-sig")
     files = (source / EPISODES).glob("*/*.parquet")
-    for file in sorted(files):
-        rows += _table(file).to_pylist()
-    return rows
+    return pd.concat(map(_table, sorted(files)))
 
 
-def _place(
-    source: Path,
-    info: Mapping[str, Any],
-    row: Mapping[str, Any],
-    name: str,
-    head: str,
-    key: str = "",
-) -> Path:
-    """Where an episode's table or film lies: its row of the list says so in v3.0."""
-    size = info.get("chunks_size", 1000)
-    chunk = row.get(f"{head}/chunk_index", row[OWNER] // size)
-    file = row.get(f"{head}/file_index", row[OWNER])
-    place = info[name].format(
-        video_key=key,
-        chunk_index=chunk,
-        file_index=file,
-        episode_chunk=chunk,
-        episode_index=file,
-    )
-    return source / place
+def _facts(row: Mapping[Any, Any], head: str) -> dict[Any, Any]:
+    """The row of an episode with what it says of its table or film in v3.0: the file's numbers, and when it begins."""
+    facts = dict(row)
+    for name in ("chunk_index", "file_index", "from_timestamp"):
+        facts[name] = row.get(f"{head}/{name}", 0)
+    return facts
 
 
-def _table(file: Path) -> Any:
-    parquet = needed("pyarrow.parquet", EXTRA)
-    with reading(file), file.open("rb") as raw:
-        return parquet.ParquetFile(raw).read(use_threads=False)
+def _table(file: Path) -> pd.DataFrame:
+    with reading(file):
+        return pd.read_parquet(file, engine="pyarrow", dtype_backend="pyarrow", partitioning=None)
 
 
 def _cells(file: Path, column: Any, rows: Integers) -> Iterator[Array]:
     """The pictures in cells of a table, ``{bytes, path}``."""
-    for cell in column.take(rows).to_pylist():
+    for cell in column.iloc[rows]:
         yield picture_of(cell["bytes"], file)

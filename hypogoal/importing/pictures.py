@@ -16,16 +16,17 @@ import numpy as np
 import PIL.Image
 import PIL.ImageOps
 
+from hypogoal.core.files import reading
 from hypogoal.data import Integers
 from hypogoal.importing.episodes import HELDOUT, LABELLED, UNLABELLED, Array, Episode
-from hypogoal.importing.files import files_of, reading
+from hypogoal.importing.files import files_of
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP", "TIFF", "PPM", "AVIF")  # for PostScript, Pillow runs a program
 ARRAY = ".npy"  # a state that no format of pictures holds, such as a stack of four frames
-SUFFIXES = [ARRAY, ".mpo"]  # that is JPEG
+SUFFIXES = {ARRAY, ".mpo"}  # that is JPEG
 for suffix, name in PIL.Image.registered_extensions().items():
     if name in FORMATS:
-        SUFFIXES.append(suffix)
+        SUFFIXES.add(suffix)
 POSITIVE = "positive"
 PLACES = {
     POSITIVE: LABELLED,
@@ -48,10 +49,10 @@ def picture_of(data: bytes, where: Path) -> Array:
         deep = any(";16" in str(tile.args) for tile in opened.tile)  # Pillow's mode says 8 bits of most such files
         opened.load()  # in a PNG the orientation may follow the pixels
         image = PIL.ImageOps.exif_transpose(opened)
-        if image.has_transparency_data:
-            alpha = np.asarray(image.convert("RGBA"))[..., 3]
-            if alpha.min() < 255:
-                raise ValueError("it is transparent in places")
+        alpha = image.convert("RGBA").getchannel("A")
+        is_clear = np.asarray(alpha) < 255
+        if image.has_transparency_data and is_clear.any():
+            raise ValueError("it is transparent in places")
         if image.mode in ("I", "F"):
             raise ValueError("it has 32 bits a channel")
         if image.mode.startswith("I;16"):

@@ -1,6 +1,5 @@
 """Readers of recorded episodes: Minari, robomimic's HDF5, folders of films, and LeRobotDataset (Spec I6)."""
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -9,17 +8,15 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hypogoal.core.errors import UserError
-from hypogoal.data import reading as reading_hdf5
+from hypogoal.data import opened
 from hypogoal.importing.episodes import HELDOUT, Array, Episode
-from hypogoal.importing.files import files_of, needed, reading
+from hypogoal.importing.files import files_of
 from hypogoal.importing.films import SUFFIXES, count_frames, frames_in
 from hypogoal.importing.lerobot import INFO, read_lerobot
 
 MINARI = Path("data") / "metadata.json"  # in a dataset's folder
 HDF5 = (".h5", ".hdf5")
 DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it."
-SMALL = 32  # Minari keeps pictures with a shorter side as they are
 TABLE = ".csv"  # labels of films, beside them
 
 # From a source, the keys to read, and what counts by suffix the files that are not read.
@@ -44,31 +41,15 @@ def read_minari(
     left: Counter[str],
 ) -> Iterator[Episode]:
     """The episodes of a dataset in any of Minari's formats; T is one more than the steps."""
-    minari = needed("minari", "minari")
-    with reading(source):
-        text = (source / MINARI).read_text(encoding="utf-8")
-        jpeg = json.loads(text).get("jpeg_encoding", True)
-        dataset = minari.MinariDataset(source / MINARI.parent)
-        for recorded in dataset.iterate_episodes():
-            columns = {
-                "rewards": np.append(0, recorded.rewards),
-                "terminations": np.append(0, recorded.terminations),
-            }
-            name = f"episode_{recorded.id}"
-            episode = _episode(name, recorded.observations, columns)
-            for key, values in episode.observations.items():
-                read = not keys or key in keys
-                if jpeg and read and _is_large_picture(values):
-                    fault = "its images are stored as JPEG, not as they were seen"
-                    raise UserError(fault, source, "Make it with jpeg_encoding=False.")
-            yield episode
+    import minari
 
-
-def _is_large_picture(values: Any) -> bool:
-    """Whether Minari stores these states (T, ...) as JPEG unless told not to."""
-    if getattr(values, "dtype", None) != np.uint8:
-        return False
-    return values.ndim > 2 and min(values.shape[1:3]) >= SMALL
+    dataset = minari.MinariDataset(source / MINARI.parent)
+    for recorded in dataset.iterate_episodes():
+        columns = {
+            "rewards": np.append(0, recorded.rewards),
+            "terminations": np.append(0, recorded.terminations),
+        }
+        yield _episode(f"episode_{recorded.id}", recorded.observations, columns)
 
 
 def read_robomimic(
@@ -77,18 +58,13 @@ def read_robomimic(
     left: Counter[str],
 ) -> Iterator[Episode]:
     """The demonstrations ``data/*/obs/KEY``; those that ``mask/valid`` lists are held out."""
-    with reading_hdf5(source, "the recording", DEMOS) as file:
+    with opened(source, DEMOS, "the recording") as file:
         demos = file["data"]
-        valid: list[bytes] = []
-        if "mask/valid" in file:
-            valid = file["mask/valid"][()].tolist()
+        valid = np.array(file.get("mask/valid", ()))
         by_number = sorted(demos, key=len)  # HDF5 lists names in order: demo_10 before demo_2
         for name in by_number:
             demo = demos[name]
-            columns = {}
-            for key, part in demo.items():
-                if getattr(part, "ndim", 0) == 1:
-                    columns[key] = part[()]
+            columns = {key: part[()] for key, part in demo.items() if getattr(part, "ndim", 0) == 1}
             role = HELDOUT if name.encode() in valid else ""
             yield _episode(name, demo["obs"], columns, role)
 
@@ -109,8 +85,8 @@ def read_films(
 def _episode(name: str, observations: Any, columns: Mapping[str, Array], role: str = "") -> Episode:
     """An episode whose observations are arrays (T, ...) in nested dictionaries, HDF5 groups or tuples."""
     leaves = _leaves(observations, "")
-    lengths = map(len, leaves.values())
-    return Episode(name, max(lengths, default=0), leaves, columns, role)
+    length = max(map(len, leaves.values()), default=0)
+    return Episode(name, length, leaves, columns, role)
 
 
 def _leaves(values: Any, place: str) -> dict[str, Any]:

@@ -1,140 +1,110 @@
-"""From episodes to their frames, whatever they were read from: chosen, labelled and taken."""
+"""From episodes to their frames, whatever they were read from: chosen and taken."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from hypogoal.core.config import near
 from hypogoal.core.errors import UserError
-from hypogoal.data import Integers
-from hypogoal.importing.episodes import UNLABELLED, Array, Episode
-from hypogoal.importing.files import reading
-from hypogoal.importing.labels import Rule, is_marked
+from hypogoal.core.files import AGAIN, reading
+from hypogoal.importing.episodes import Array, Episode
 from hypogoal.importing.taken import take
-from hypogoal.observations import PICTURE
-
-NO_RULE = "Give --label NAME=COLUMN, NAME=last:N, NAME=TABLE.csv or NAME=module:function."
 
 
-class Frame(NamedTuple):
-    """A state, and what is known of it.
+class Frames(NamedTuple):
+    """States in order, and what is known of them.
 
     Attributes:
-        name: what messages call it.
-        episode: of which it is, by name.
-        group: see :class:`Episode`.
-        labels: whether each sub-goal holds; False where it is unlabelled.
-        seen: a picture or numbers by key.
-        channels: frames and colours by key, see :class:`hypogoal.data.Collected`.
+        table: a row for each frame, also those of which nothing is seen: ``name`` in messages, ``episode``, ``group``,
+            ``role``, whether it is ``kept``.
+        columns: of the episodes, a row for each frame.
+        seen: by key, a picture or numbers of each frame that is kept; by "" if there is one key.
+        channels: frames and colours of stacks by key, see :class:`hypogoal.data.Collected`.
     """
 
-    name: str
-    episode: str
-    group: str
-    role: str
-    labels: list[bool]
-    seen: dict[str, Array]
-    channels: dict[str, tuple[int, int] | None]
+    table: pd.DataFrame
+    columns: pd.DataFrame
+    seen: dict[str, list[Array]]
+    channels: dict[str, tuple[int, int]]
 
 
 def frames_of(
     source: Path,
     episodes: Iterable[Episode],
-    rules: Mapping[str, Rule],
     left: Counter[str],
     *,
     keys: Sequence[str] = (),
     every: int = 1,
-    sides: Mapping[str, int] | None = None,
+    resize: int = 0,
     stack: bool = False,
-) -> Iterator[Frame]:
-    """The frames of episodes, labelled by a rule for each sub-goal; ``left`` counts what is not read.
-
-    An episode that some rule does not list is unlabelled.
+) -> Frames:
+    """The frames of episodes; ``left`` counts what is not read.
 
     Args:
         keys: of observations; none: all.
-        every: each n-th frame, and the last.
-        sides: most pixels on the longer side of pictures, by key; "" is of all that have none of their own.
+        every: keep each n-th frame, and the last.
+        resize: most pixels on the longer side of pictures; 0: as many as they have.
         stack: axes of frames and colours become channels.
     """
-    if not rules:
-        raise UserError("nothing says where the sub-goal holds", source, NO_RULE)
-    sides = sides or {}
-    met: list[str] = []
-    taken: dict[str, Array] = {}
-    for episode in episodes:
-        if not episode.length:
-            left["episodes without frames"] += 1
-            continue
-        met.append(episode.name)
-        chosen = _chosen(episode, keys, source, left)
-        marks = [rule.marks(episode) for rule in rules.values()]
-        role = UNLABELLED if any(mark is None for mark in marks) else episode.role
-        rows = kept(episode.length, every)
-        for row, seen in zip(rows.tolist(), _seen(episode, chosen, rows, source), strict=True):
-            name = f"{episode.name}, frame {row}" if episode.length > 1 else episode.name
-            view = seen if len(chosen) > 1 else seen[chosen[0]]
-            labels = [role != UNLABELLED and is_marked(mark, row, view) for mark in marks]
-            taken, channels = {}, {}
-            for key, state in seen.items():
-                side = sides.get(key, sides.get("", 0))
-                taken[key], channels[key] = take(state, f"{name}: {key or 'observations'}", side, stack)
-            yield Frame(name, episode.name, episode.group, role, labels, taken, channels)
-    for rule in rules.values():
-        for name in rule.listed.keys() - met:
-            examples = f"There are {', '.join(met[:3])} ..."
-            fault = f"a label is of an unknown episode, {name!r}"
-            raise UserError(fault, rule.listed[name], examples)
-    pictures = [key for key, state in taken.items() if state.ndim == 3 and state.dtype == PICTURE]
-    for key in sides:
-        if not pictures or key not in ("", *pictures):
-            raise UserError("only pictures can be resized", key or source, "Leave out --resize.")
-
-
-def kept(length: int, every: int) -> Integers:
-    """Every n-th frame of an episode, and always its last."""
-    return np.arange((length - 1) % every, length, every)
-
-
-def _chosen(
-    episode: Episode,
-    keys: Sequence[str],
-    source: Path,
-    left: Counter[str],
-) -> list[str]:
-    """The keys to read, all of pictures and numbers if none are given; an unknown one is a ``UserError``."""
-    present = []
-    for key, values in sorted(episode.observations.items()):
-        dtype = getattr(values, "dtype", np.dtype(object))
-        if callable(values) or dtype.kind in "iufb":
-            present.append(key)
-        elif not keys:
-            left[f"times {key!r}, neither pictures nor numbers"] += 1
-    chosen = sorted(set(keys)) or present
-    for key in chosen or [""]:
-        if key not in present:
-            names = ", ".join(present) or "none"
-            do = near(key, present) or f"There are {names}."
-            where = f"{source}, {episode.name}"
-            raise UserError(f"no pictures or numbers {key!r}", where, do)
-    return chosen
-
-
-def _seen(
-    episode: Episode,
-    keys: Sequence[str],
-    rows: Integers,
-    source: Path,
-) -> Iterator[dict[str, Array]]:
-    """What is seen in some frames, by key, as read."""
+    tables, columns = [], []
+    seen: dict[str, list[Array]] = {}
+    channels: dict[str, tuple[int, int]] = {}
     with reading(source):
-        parts: list[Iterable[Any]] = []
-        for key in keys:
-            values = episode.observations[key]
-            parts.append(values(rows) if callable(values) else np.asarray(values)[rows])
-        for states in zip(*parts, strict=True):
-            yield dict(zip(keys, map(np.asarray, states), strict=True))
+        for episode in episodes:
+            length = episode.length
+            if not length:
+                left["episodes without frames"] += 1
+                continue
+            frames = range(length)
+            names = [f"{episode.name}[{frame}]" for frame in frames]
+            kept = slice((length - 1) % every, length, every)
+            table = pd.DataFrame({"name": names, "episode": episode.name, "group": episode.group, "role": episode.role})
+            table["kept"] = np.isin(frames, frames[kept])
+            tables.append(table)
+            columns.append(pd.DataFrame(episode.columns, index=table.index))
+            parts = _parts(episode, keys, kept, left)
+            if seen and seen.keys() != parts.keys():
+                raise UserError("episodes have different observations", episode.name, "Choose some by --key.")
+            for key, states in parts.items():
+                own = seen.setdefault(key, [])
+                for name, state in zip(names[kept], states, strict=True):
+                    taken, stacked = take(state, f"{name} {key}", resize, stack)
+                    own.append(taken)
+                    if stacked:
+                        channels[key] = stacked
+    if not seen:
+        raise UserError("there are no pictures or numbers", source, AGAIN)
+    table = pd.concat(tables, ignore_index=True)
+    return Frames(table, pd.concat(columns, ignore_index=True), seen, channels)
+
+
+def _parts(
+    episode: Episode,
+    keys: Sequence[str],
+    kept: slice,
+    left: Counter[str],
+) -> dict[str, Iterable[Any]]:
+    """What is seen in the frames that are kept, by key, of all pictures and numbers if no keys are given.
+
+    An unknown key is a ``UserError``. In the names of several keys / becomes a dot, since they are names of fields.
+    """
+    parts: dict[str, Iterable[Any]] = {}
+    for key in sorted({*keys} or episode.observations):
+        values: Any = episode.observations.get(key)
+        dtype = getattr(values, "dtype", np.dtype(object))
+        name = key.replace("/", ".")
+        if callable(values):
+            parts[name] = values(np.arange(episode.length)[kept])
+        elif dtype.kind in "iufb":
+            parts[name] = values[kept]
+        elif keys:
+            names = ", ".join(episode.observations)
+            raise UserError(f"no pictures or numbers {key!r}", episode.name, f"There are {names}.")
+        else:
+            left[f"times {key!r}, neither pictures nor numbers"] += 1
+    if len(parts) > 1:
+        return parts
+    return dict(zip([""], parts.values(), strict=False))

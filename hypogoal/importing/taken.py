@@ -1,20 +1,19 @@
 """What is taken for what: states as read become pictures or numbers, key by key (the table in docs/own-domain.md)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import Dataset
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.importing.episodes import Array
-from hypogoal.observations import NUMBERS, PICTURE, fields_of, spread_rows
+from hypogoal.observations import NUMBERS, PICTURE, spread_rows
 
-STACKED = "'import --stack' puts stacked frames among the channels."
+STACKED = "Give pictures as uint8 (H, W, C); 'import --stack' puts stacked frames among the channels."
 MOST_COMPARED = 2_000  # rows of numbers that are compared before and after the cast to float32, spread evenly
 LEFT = 0.9  # the share of a column's distinct values that float32 must keep
-LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
 NAMED = 4  # columns that a message names
 IN_FLOAT32 = "have values that float32 makes infinite, 0 or equal, or that are not finite"
 
@@ -35,38 +34,34 @@ def take(
     """
     reading = reading_of(state.shape, state.dtype)
     fault = reading.fault
-    do = CLEARLY
-    if state.dtype.kind not in "iufb" or not state.size:
+    is_stack = bool(fault) and len(reading.axes) > 2
+    are_numbers = state.dtype.kind in "iufb"
+    if not are_numbers or not state.size:
         fault = "are neither pictures nor numbers"
-    elif fault and len(reading.axes) > 2:
-        do = f"{CLEARLY} {STACKED}"
-        fault = "" if stack else fault
-    if fault:
+    if fault and not (is_stack and stack):
+        do = STACKED if is_stack else CLEARLY
         raise UserError(f"{where} {fault}", f"{state.dtype} {state.shape}", do)
     if reading.dtype != PICTURE:
         return state.reshape(reading.shape), None
     picture = reading.arranged(state)
     small = shrunk_picture(picture, side)
-    if not reading.fault:
+    if not is_stack:
         return small, None
     last = state.shape[reading.axes[-1]]
     colours = last if last in (1, 3) else 1
     return small, (small.shape[2] // colours, colours)
 
 
-def together(
-    states: Sequence[Array],
-    names: Sequence[str],
-    subject: str,
-) -> Array:
+def together(states: Sequence[Array], names: Sequence[str], subject: str) -> Array:
     """States of one size (N, ...): pictures, where some are coloured all so, or numbers as float32."""
     if {state.shape[2:] for state in states} == {(1,), (3,)}:
         states = [state.repeat(3 // state.shape[2], axis=2) for state in states]
-    kinds = [(state.shape, state.dtype == PICTURE) for state in states]
-    for kind, name in zip(kinds, names, strict=True):
-        if kind != kinds[0]:
+    first = states[0]
+    for state, name in zip(states, names, strict=True):
+        are_alike = (state.dtype == PICTURE) == (first.dtype == PICTURE)
+        if state.shape != first.shape or not are_alike:
             do = "Make them all pictures, or numbers, of one size; --resize makes large pictures smaller."
-            sizes = f"{name} is {kind[0]}, {names[0]} is {kinds[0][0]}"
+            sizes = f"{name} is {state.shape}, {names[0]} is {first.shape}"
             raise UserError("states differ in size or type", sizes, do)
     values = np.stack(states)
     if values.ndim == 4 and values.dtype == PICTURE:
@@ -85,7 +80,8 @@ def as_numbers(values: Array, subject: str) -> NDArray[np.float32]:
     before, after = values.reshape(count, -1), cast.reshape(count, -1)
     lost = ~np.isfinite(after) | ((after == 0) != (before == 0))
     rows = spread_rows(count, MOST_COMPARED)
-    merged = _distinct(after[rows]) < LEFT * _distinct(before[rows])
+    distinct = pd.DataFrame(before[rows]).nunique()
+    merged = pd.DataFrame(after[rows]).nunique() < LEFT * distinct
     columns = np.flatnonzero(lost.any(axis=0) | merged)
     if len(columns):
         named = ", ".join(map(str, columns[:NAMED]))
@@ -93,20 +89,3 @@ def as_numbers(values: Array, subject: str) -> NDArray[np.float32]:
         do = "Give finite ones; subtract an offset, change the unit, or leave these columns out."
         raise UserError(f"{subject} {IN_FLOAT32}", where, do)
     return cast
-
-
-def _distinct(values: Array) -> Array:
-    """How many distinct values each column of (N, D) has, (D,)."""
-    ordered = np.sort(values, axis=0)
-    return (ordered[1:] != ordered[:-1]).sum(axis=0) + 1
-
-
-def describe(dataset: Dataset, *, resized: bool) -> Iterator[str]:
-    """How the states of a data file were read, a line a key; of large pictures, how to import them smaller."""
-    fields = fields_of(dataset.observation_shape, dataset.observation_dtype)
-    for key, (dtype, shape) in fields.items():
-        sizes = " x ".join(map(str, shape))
-        kind = "pictures" if dtype == PICTURE else "numbers"
-        yield f"{key or 'states'}: taken for {kind}, {sizes} {dtype}"
-        if dtype == PICTURE and max(shape[:2]) > LARGE and not resized:
-            yield f"pictures of {sizes} need much memory and time; add --resize {LARGE} --force"

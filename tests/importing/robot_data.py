@@ -58,16 +58,14 @@ def write_film(path: Path, frames: list[np.ndarray], fps: int = FPS) -> None:
         container.mux(stream.encode())
 
 
-def columns(episode: int, first: int) -> dict[str, Any]:
+def columns(episode: int) -> dict[str, Any]:
     """An episode's columns of numbers; the third episode fails."""
     count, at = LENGTHS[episode], places(episode)
     success = (at > 0.5) & (episode != 2)
     return {
         STATE: pa.array(np.stack([at, 1 - at, at**2], 1).tolist(), pa.list_(pa.float32(), 3)),
         "action": pa.array([[0.0, 1.0]] * count, pa.list_(pa.float32(), 2)),
-        "timestamp": pa.array((np.arange(count) / FPS).astype(np.float32)),
         "episode_index": pa.array(np.full(count, episode)),
-        "index": pa.array(np.arange(first, first + count)),
         "next.reward": pa.array(success.astype(np.float32)),
         "next.success": pa.array(success),
     }
@@ -76,56 +74,40 @@ def columns(episode: int, first: int) -> dict[str, Any]:
 def facts(version: str, kind: str) -> dict[str, Any]:
     """``meta/info.json``: what of it is read."""
     features = {key: {"dtype": kind, "shape": [*SIDES[key.rpartition(".")[2]], 3]} for key in (TOP, WRIST)}
-    features |= {STATE: {"dtype": "float32", "shape": [3]}, "action": {"dtype": "float32", "shape": [2]}}
-    for name in ("timestamp", "next.reward"):
-        features[name] = {"dtype": "float32", "shape": [1]}
-    for name in ("episode_index", "index"):
-        features[name] = {"dtype": "int64", "shape": [1]}
-    features["next.success"] = {"dtype": "bool", "shape": [1]}
+    features |= {name: {"dtype": "float32", "shape": [size]} for name, size in ((STATE, 3), ("action", 2))}
+    features |= {name: {"dtype": "float32", "shape": [1]} for name in ("next.reward", "next.success")}
     files = "chunk-{chunk_index:03d}/file-{file_index:03d}"
     episodes = "episode_{episode_index:06d}"
-    new = version == "v3.0"
-    return {
-        "codebase_version": version,
-        "fps": FPS,
-        "chunks_size": 1000,
-        "features": features,
-        "data_path": f"data/{files}.parquet" if new else f"data/chunk-{{episode_chunk:03d}}/{episodes}.parquet",
-        "video_path": f"videos/{{video_key}}/{files}.mp4"
-        if new
-        else f"videos/chunk-{{episode_chunk:03d}}/{{video_key}}/{episodes}.mp4",
-    }
+    data, film = f"data/{files}.parquet", f"videos/{{video_key}}/{files}.mp4"
+    if version == "v2.1":
+        chunk = "chunk-{episode_chunk:03d}"
+        data, film = f"data/{chunk}/{episodes}.parquet", f"videos/{chunk}/{{video_key}}/{episodes}.mp4"
+    return {"fps": FPS, "chunks_size": 1000, "features": features, "data_path": data, "video_path": film}
 
 
 def cells(camera: str, episode: int) -> pa.Array:
     """Frames as a table keeps them: ``{bytes, path}``."""
     rows = []
-    for number, place in enumerate(places(episode)):
+    for place in places(episode):
         file = io.BytesIO()
         Image.fromarray(picture(camera, place, episode)).save(file, format="png")
-        rows.append({"bytes": file.getvalue(), "path": f"frame_{number:06d}.png"})
+        rows.append({"bytes": file.getvalue(), "path": "frame.png"})
     return pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
-
-
-def write_table(path: Path, table: pa.Table) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, path)
 
 
 def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> Path:
     """A LeRobotDataset; in v3.0 two files share the episodes of each camera, and one table all of them."""
-    (folder / "meta").mkdir(parents=True)
+    for part in ("meta/episodes/chunk-000", "data/chunk-000"):
+        (folder / part).mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps(facts(version, kind)))
-    first = np.cumsum([0, *LENGTHS]).tolist()
     tables, listed = [], []
     for episode, length in enumerate(LENGTHS):
-        rows = columns(episode, first[episode])
-        file, row = episode // 3, {"episode_index": episode, "tasks": ["reach"], "length": length}
+        rows = columns(episode)
+        file, row = episode // 3, {"episode_index": episode, "length": length}
         for key in (TOP, WRIST):
             camera = key.rpartition(".")[2]
             begin = sum(LENGTHS[3 * file : episode])
-            times = {"from_timestamp": begin / FPS, "to_timestamp": (begin + length) / FPS}
-            films = {"chunk_index": 0, "file_index": file, **times}
+            films = {"chunk_index": 0, "file_index": file, "from_timestamp": begin / FPS}
             if kind == "image":
                 rows[key] = cells(camera, episode)
             elif version == "v2.1":
@@ -136,12 +118,12 @@ def write_lerobot(folder: Path, version: str = "v3.0", kind: str = "video") -> P
         tables.append(pa.table(rows))
         listed.append(row | ({} if version == "v2.1" else {"data/chunk_index": 0, "data/file_index": 0}))
         if version == "v2.1":
-            write_table(folder / f"data/chunk-000/episode_{episode:06d}.parquet", tables[-1])
+            pq.write_table(tables[-1], folder / f"data/chunk-000/episode_{episode:06d}.parquet")
     if version == "v2.1":
         (folder / "meta" / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in listed))
         return folder
-    write_table(folder / "data/chunk-000/file-000.parquet", pa.concat_tables(tables))
-    write_table(folder / "meta/episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(listed))
+    pq.write_table(pa.concat_tables(tables), folder / "data/chunk-000/file-000.parquet")
+    pq.write_table(pa.Table.from_pylist(listed), folder / "meta/episodes/chunk-000/file-000.parquet")
     for key, file in product((TOP, WRIST), (0, 1) if kind == "video" else ()):
         some = [(at, place) for at in range(3 * file, 3 * file + 3) for place in places(at)]
         frames = [picture(key.rpartition(".")[2], place, at) for at, place in some]

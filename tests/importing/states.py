@@ -18,7 +18,7 @@ from PIL import Image
 from hypogoal.data import Collected
 from hypogoal.importing.arrays import episodes_of, read_arrays
 from hypogoal.importing.assemble import assemble
-from hypogoal.importing.labels import rule_of
+from hypogoal.importing.labels import labels_of
 from hypogoal.importing.states import frames_of
 
 SIDE = 48
@@ -33,10 +33,6 @@ def pictures(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     for image, right in zip(images, labels, strict=True):
         image[10:30, (30 if right else 5) : (42 if right else 17)] = 255
     return images, labels
-
-
-def at_right(observation: np.ndarray) -> bool:
-    return bool(observation[20, 35, 0] == 255)
 
 
 def arrays(**changes: Any) -> dict[str, Any]:
@@ -54,10 +50,11 @@ def assembled(given: dict[str, Any], group: str = "") -> tuple[Collected, list[s
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "own.npz")
         np.savez(path, **given)
-        episodes = episodes_of(read_arrays(path, group), ["goal"], group, path)
-        frames = [*frames_of(path, episodes, {"goal": rule_of("goal")}, Counter())]
-        features = [*given.get("features", ())]
-        return assemble(path, frames, ["goal"], features)
+        left: Counter[str] = Counter()
+        frames = frames_of(path, episodes_of(read_arrays(path), ["goal"], group, left), left)
+        labels = labels_of(frames, {"goal": "goal"})
+        collected, said = assemble(path, frames, labels, ["goal"], [*given.get("features", ())])
+        return collected, [*said, *left]
 
 
 def save_pictures(folder: Path, *, held: bool = True, change: Callable[[np.ndarray], np.ndarray] = lambda x: x) -> Path:
@@ -72,13 +69,13 @@ def save_pictures(folder: Path, *, held: bool = True, change: Callable[[np.ndarr
     return folder
 
 
-def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, jpeg: bool = False) -> Path:
-    """A Minari dataset of six states an episode, three of them with the square at the right."""
+def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False) -> Path:
+    """A Minari dataset of six states an episode, three of them with the square at the right, and a table of these."""
     picture = spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
     speed = spaces.Box(-99, 99, (2,), np.float64)
     space = spaces.Dict(image=picture, arm=spaces.Dict(speed=speed), task=spaces.Text(9)) if nested else picture
     (folder / "data").mkdir(parents=True)
-    storage = MinariStorage.new(folder / "data", space, spaces.Discrete(2), jpeg_encoding=jpeg)
+    storage = MinariStorage.new(folder / "data", space, spaces.Discrete(2), jpeg_encoding=False)
     for number in range(episodes):
         seen: Any = pictures(6, number)[0]
         if nested:
@@ -89,4 +86,6 @@ def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, jpeg:
         )
         storage.update_episodes([buffer])
     storage.update_metadata({"dataset_id": "own-v0", "minari_version": minari.__version__})
+    lines = [f"episode_{number},{frame},{frame + 1}" for number in range(episodes) for frame in (1, 3, 5)]
+    (folder / "right.csv").write_text("\n".join(["episode,from,to", *lines, ""]))
     return folder

@@ -18,10 +18,9 @@ import numpy as np
 from PIL import Image
 
 from hypogoal.core.errors import UserError
-from hypogoal.importing.labels import rule_of
 from hypogoal.importing.pictures import picture_of
 from hypogoal.importing.recordings import read_robomimic
-from hypogoal.importing.states import Frame, frames_of
+from hypogoal.importing.states import Frames, frames_of
 from hypogoal.importing.taken import as_numbers, together
 
 COLOURS = {1: 0, 2: 4, 3: 2, 4: 6}  # PNG's colour type, by channels
@@ -179,21 +178,20 @@ def outcome_of_recording(seed: int, folder: Path) -> str:
     lengths = {len(values) for name, (values, _) in drawn.items() if name in wanted}
     refused = lengths != {LENGTH} or any(taken is None for taken in wanted.values())
 
-    def read() -> tuple[list[Frame], dict[str, np.ndarray], Counter[str]]:
+    def read() -> tuple[Frames, dict[str, np.ndarray], Counter[str]]:
         left: Counter[str] = Counter()
-        frames = [*frames_of(path, read_robomimic(path, (), left), {"won": rule_of("rewards")}, left)]
-        names = [frame.name for frame in frames]
-        return frames, {key: together([each.seen[key] for each in frames], names, key) for key in frames[0].seen}, left
+        frames = frames_of(path, read_robomimic(path, (), left), left)
+        return frames, {key: together(seen, frames.table["name"], key) for key, seen in frames.seen.items()}, left
 
     seen = told(read)
     assert isinstance(seen, str) == refused, (seed, seen)
     if refused:
         return "refused"
     frames, states, left = seen
-    for row, frame in enumerate(frames):
-        for key, values in wanted.items():
-            right = np.asarray(values)[int(frame.name.rpartition(" ")[2])]
-            np.testing.assert_allclose(states[key][row], right, rtol=1e-6, err_msg=str(seed))
+    for key, values in wanted.items():
+        name = key.replace("/", ".") if len(wanted) > 1 else ""
+        right = np.concatenate([values] * (len(frames.table) // LENGTH))
+        np.testing.assert_allclose(states[name], right, rtol=1e-6, err_msg=str(seed))
     assert bool(left) == (len(wanted) < len(names))
     return "right"
 

@@ -30,7 +30,7 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     palette = io.BytesIO()
     Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
     for data, said in (
-        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size or type: positive/zz.png is (48, 20, 3)"),
+        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size or type: positive/zz.png[0] is (48, 20, 3)"),
         (b"no image", "this cannot be read"),
         (saved(pictures(1)[0][0])[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
@@ -103,11 +103,11 @@ def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
     np.savez(tmp_path / "own.npz", **arrays())
     sources = [save_pictures(tmp_path / "at-right"), tmp_path / "own.npz", save_minari(tmp_path / "own-v0")]
     for number, source in enumerate(sources):
-        given = ["--label", "right=tests.importing.states:at_right"] if number == 2 else []
+        given = ["--label", f"right={source / 'right.csv'}"] if number == 2 else []
         out = tmp_path / f"{number}.h5"
         run("import", source, "--out", out, "--resize", "24", *given, "-q")
         data = open_dataset(out)
-        assert data.observation_shape == (24, 24, 3) and data.config["resize"] == {"": 24}
+        assert data.observation_shape == (24, 24, 3) and data.config["resize"] == 24
         if number == 0:
             positives = small[np.arange(24) % 2 == 1]
             assert np.abs(data.labelled("at-right").observations[:12] - positives).max() <= 1
@@ -116,9 +116,6 @@ def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
     refuses("states differ in size", "import", sources[0], "--out", tmp_path / "x.h5")
     run("import", sources[0], "--out", tmp_path / "x.h5", "--resize", "30", "-q")
     assert open_dataset(tmp_path / "x.h5").observation_shape == (30, 30, 3)
-    np.savez(tmp_path / "rows.npz", **{name: x.reshape(len(x), -1)[:, :9] for name, x in arrays().items()})
-    rows = ["import", tmp_path / "rows.npz", "--out", tmp_path / "y.h5", "--resize", "24"]
-    refuses("only pictures can be resized", *rows)
 
 
 def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
@@ -135,16 +132,3 @@ def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
     whole = states[[2, 5]].transpose(0, 2, 3, 1, 4).reshape(2, 16, 4, 12, 4, 12).mean((2, 4))
     assert np.abs(found.unlabelled() - whole).max() <= 1
     assert found.channels == {"": [4, 3]}
-
-
-def test_large_pictures_are_proposed_to_be_made_smaller(tmp_path: Path) -> None:
-    """Spec B6, G1: in a line that is a command and works as it stands; never of what is small, or was made so."""
-    few = {name: states for name, states in arrays().items() if "heldout" not in name}
-    large = {name: states.repeat(5, 1).repeat(4, 2) if states.ndim == 4 else states for name, states in few.items()}
-    np.savez(tmp_path / "it's large.npz", **large)
-    given = ["import", tmp_path / "it's large.npz", "--out", tmp_path / "data.h5", "--domain", "montezuma"]
-    [line] = [line for line in run(*given).out.splitlines() if "--resize" in line]
-    assert "pictures of 240 x 192 x 3 need much memory and time; add --resize 160 --force" in line
-    assert "--resize" not in run(*given, *line.partition("add ")[2].split()).out
-    after = open_dataset(tmp_path / "data.h5")
-    assert after.observation_shape == (160, 128, 3) and after.domain == "montezuma"

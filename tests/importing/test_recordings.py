@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from itertools import chain
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 from command_line import refuses, run
 
 from hypogoal.data import Dataset, open_dataset
 from hypogoal.importing import films
-from hypogoal.importing.assemble import split
-from hypogoal.importing.states import Frame, kept
+from hypogoal.importing.assemble import with_roles
+from hypogoal.importing.episodes import ROLES
 from hypogoal.observations import digest
 from tests.importing import robot_data
 from tests.importing.robot_data import LENGTHS, STATE, TOP, WRIST
@@ -30,9 +29,7 @@ from tests.importing.test_odd import turned
 FORMATS = [("v2.1", "video"), ("v3.0", "video"), ("v2.1", "image"), ("v3.0", "image")]
 LABEL = ["--label", "reached=next.success"]
 UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
-ME = "tests.importing.test_recordings"
 Change: TypeAlias = Callable[[Path], None]
-RIGHT = ["--label", "right=tests.importing.states:at_right"]
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +84,7 @@ def test_keys_are_chosen_and_one_picture_alone_is_a_picture(datasets: Path, tmp_
     source, out = datasets / "v3.0-image", tmp_path / "data.h5"
     assert imported(source, out, *LABEL, "--key", TOP).observation_shape == (96, 128, 3)
     assert imported(source, out, *LABEL, "--key", STATE).observation_shape == (3,)
-    both = imported(source, out, *LABEL, "--key", TOP, "--key", STATE, "--resize", f"{TOP}=32")
+    both = imported(source, out, *LABEL, "--key", TOP, "--key", STATE, "--resize", "32")
     assert both.observation_dtype[TOP].shape == (24, 32, 3)
 
 
@@ -107,10 +104,11 @@ def test_labels_of_last_frames_and_of_a_table(datasets: Path, tmp_path: Path) ->
 
 
 def test_every_third_frame_and_the_last(datasets: Path, tmp_path: Path) -> None:
-    assert kept(7, 3).tolist() == [0, 3, 6] and kept(8, 3).tolist() == [1, 4, 7] and kept(2, 5).tolist() == [1]
     few = imported(datasets / "v3.0-video", tmp_path / "few.h5", *LABEL, "--every", "3")
     every = imported(datasets / "v3.0-video", tmp_path / "all.h5", *LABEL)
-    assert len(frames_of(few)) == sum(len(kept(length, 3)) for length in LENGTHS)
+    assert len(frames_of(few)) == sum(-(-length // 3) for length in LENGTHS)
+    last = {np.float32(robot_data.places(episode)[-1]) for episode in range(6)}
+    assert last <= {state[STATE][0] for state, _ in frames_of(few)}
     whole = {state[STATE].tobytes(): state.tobytes() for state, _ in frames_of(every)}
     assert all(whole[state[STATE].tobytes()] == state.tobytes() for state, _ in frames_of(few))
 
@@ -124,15 +122,13 @@ def test_episodes_are_split_whole_and_what_is_held_out_stays_so() -> None:
         ([""] * 8 + ["heldout"] * 2, (4, 4, 2)),
         (["heldout"] + [""] * 3 + ["unlabelled"] * 2, (3, 2, 1)),
     ):
-        frames = []
-        for number, role in enumerate(roles):
-            frames += [Frame("", str(number), "", role, [], {}, {})] * 3
-        sets = split(frames, 0, Path("here"))
-        episodes = [sorted({int(frames[row].episode) for row in rows}) for rows in sets]
-        assert tuple(map(len, episodes)) == sizes and sum(map(len, sets)) == 3 * len(roles)
-        assert sorted(chain(*episodes)) == list(range(len(roles)))
-        fixed = [number for number, role in enumerate(roles) if role == "heldout"]
-        assert not fixed or episodes[2] == fixed
+        table = pd.DataFrame({"episode": range(len(roles)), "role": roles}).sample(30, replace=True, random_state=0)
+        table = pd.concat([pd.DataFrame({"episode": range(len(roles)), "role": roles}), table], ignore_index=True)
+        drawn = with_roles(table.copy(), 0)
+        assert sorted(drawn.index) == [*range(len(table))] and (drawn.groupby("episode")["role"].nunique() == 1).all()
+        role_of = drawn.groupby("episode")["role"].first()
+        assert tuple((role_of == role).sum() for role in ROLES) == sizes
+        assert all(role in ("", role_of[number]) for number, role in enumerate(roles))
 
 
 def test_robomimics_file_is_read(datasets: Path, tmp_path: Path) -> None:
@@ -142,9 +138,10 @@ def test_robomimics_file_is_read(datasets: Path, tmp_path: Path) -> None:
     assert len(frames_of(data)) == sum(LENGTHS)
     for state, label in frames_of(data):
         assert label in (None, state["robot0_eef_pos"][0] > 0.5)
+    shutil.copy(datasets / "demo.hdf5", tmp_path / "part.hdf5")
     with h5py.File(tmp_path / "merged.hdf5", "w") as file:
         for demo in range(5):
-            file[f"data/demo_{demo}"] = h5py.ExternalLink(datasets / "demo.hdf5", f"/data/demo_{demo}")
+            file[f"data/demo_{demo}"] = h5py.ExternalLink("part.hdf5", f"/data/demo_{demo}")
         file.copy(file["data/demo_0"], "data/demo_7")
         for demo in file["data"].values():
             del demo["obs/agentview_image"]
@@ -169,29 +166,22 @@ def test_a_recorder_that_was_killed_is_named(tmp_path: Path) -> None:
     refuses(f"one has crashed: h5clear -s {tmp_path / 'x.hdf5'}", *command)
 
 
-def test_minari_is_labelled_by_a_function(tmp_path: Path) -> None:
+def test_minari_is_read(tmp_path: Path) -> None:
     """Spec B6: whole episodes are labelled, unlabelled or held out, the same for the same seed."""
     folder, data = save_minari(tmp_path / "own-v0"), tmp_path / "data.h5"
-    found = imported(folder, data, *RIGHT)
+    right = ["--label", f"right={folder / 'right.csv'}"]
+    found = imported(folder, data, *right)
     counts = found.counts()
     assert counts["labelled"]["right"] == {"states": 24, "positives": 12}
     assert counts["heldout"]["right"] == {"states": 12, "positives": 6} and counts["unlabelled"] == 24
-    assert found.config["labels"] == {"right": "tests.importing.states:at_right"}
+    labelled = found.labelled("right")
+    np.testing.assert_array_equal(labelled.observations[:, 20, 35, 0] == 255, labelled.labels)
     before = found.unlabelled()
-    np.testing.assert_array_equal(imported(folder, data, *RIGHT).unlabelled(), before)
+    np.testing.assert_array_equal(imported(folder, data, *right).unlabelled(), before)
     nested = save_minari(tmp_path / "nested-v0", nested=True)
-    assert imported(nested, data, *RIGHT, "--key", "image").observation_shape == (SIDE, SIDE, 3)
-    mine = ["--label", f"right={ME}:goes_right", "--key", "image", "--key", "arm/speed"]
-    states = imported(nested, data, *mine).labelled("right")
-    assert states.labels.sum() == 12 and set(states.observations["arm.speed"][:, 0]) == {0, 2, 4, 6, 8, 10}
-
-
-def goes_right(observation: dict[str, np.ndarray]) -> bool:
-    return observation["arm/speed"][0] % 4 == 2 and bool(observation["image"][20, 35, 0] == 255)
-
-
-def is_unsure(_: np.ndarray) -> Any:
-    return np.nan
+    assert imported(nested, data, *right, "--key", "image").observation_shape == (SIDE, SIDE, 3)
+    states = imported(nested, data, *right).labelled("right").observations
+    assert states.dtype.names == ("arm.speed", "image") and set(states["arm.speed"][:, 0]) == {0, 2, 4, 6, 8, 10}
 
 
 def write_turned(path: Path, orientation: int) -> None:
@@ -271,18 +261,6 @@ def cut(name: str) -> Change:
     return lambda folder: os.truncate(folder / name, 6 * (folder / name).stat().st_size // 10)
 
 
-def info(key: str = "", **changes: object) -> Change:
-    """Change the dataset's facts, or those of a feature."""
-
-    def work(folder: Path) -> None:
-        file = folder / "meta" / "info.json"
-        whole = json.loads(file.read_text())
-        (whole["features"][key] if key else whole).update(changes)
-        file.write_text(json.dumps(whole))
-
-    return work
-
-
 def other_film(camera: str, count: int) -> Change:
     frames = [robot_data.picture(camera, 0.5, 0)] * count
     return lambda folder: robot_data.write_film(folder / f"videos/{TOP}/chunk-000/file-000.mp4", frames)
@@ -300,10 +278,8 @@ TABLE, LIST = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-0
         (other_film("top", 5), "frames that are listed"),
         (other_film("wrist", 60), "states differ in size"),
         (cut(TABLE), "this cannot be read"),
-        (without(LIST), "there are no labelled states"),
+        (without(LIST), "this cannot be read"),
         (cut("meta/info.json"), "this cannot be read"),
-        (info(STATE, shape=[4]), "this cannot be read"),
-        (info(STATE, dtype="string"), "no pictures or numbers 'observation.state'"),
     ],
 )
 def test_a_damaged_dataset_is_one_line(datasets: Path, tmp_path: Path, damage: Change, words: str) -> None:
@@ -315,62 +291,48 @@ def test_a_damaged_dataset_is_one_line(datasets: Path, tmp_path: Path, damage: C
     refuses(words, "import", source, "--out", tmp_path / "data.h5", *LABEL, *keys)
 
 
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ("episode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
-        ("episode,from,to\n0,0,99\n", "a label is of frames 0 up to 99 of 12"),
-        ("episode,from,to\n0,a,2\n", "invalid literal for int() with base 10: 'a'"),
-        ("episode;from;to\n0;1;2\n", "Give a CSV file, with commas"),
-        ("\ufeffepisode,from,to\n99,0,1\n", "a label is of an unknown episode, '99'"),
-        ("episode,from,to\n0,1,2\n", "there are no heldout states"),
-    ],
-)
-def test_labels_that_fit_no_frame_are_one_line(datasets: Path, tmp_path: Path, table: str, words: str) -> None:
-    (tmp_path / "labels.csv").write_text(table)
-    rule = ["--label", f"reached={tmp_path / 'labels.csv'}", "--key", STATE]
-    refuses(words, "import", datasets / "v3.0-image", "--out", tmp_path / "data.h5", *rule)
+REFUSED = [
+    ("", "Recordings are labelled by --label NAME=RULE"),
+    ("--label a", "--label needs NAME=RULE"),
+    ("--label a=next.sucess", "no column with a number for each frame: next.sucess. There are next"),
+    ("--label a=last:0", "a has no positives"),
+    ("--label a=missing.csv", "no such file: missing.csv"),
+    ("--label a=last:3 --key observation.stat", "no pictures or numbers 'observation.stat'"),
+    ("--label a=last:3 --resize big", "Invalid value for '--resize'"),
+    ("--label a=last:3 --group task", "--group is for arrays"),
+    ("episode,from,to\n99,0,1\n", "a label is of frames 0 up to 1 of 0 in '99'"),
+    ("episode,from,to\n0,0,99\n", "a label is of frames 0 up to 99 of 12 in '0'"),
+    ("episode,from,to\n0,a,2\n", "this cannot be read (ValueError: "),
+    ("episode;from;to\n0;1;2\n", "Give a CSV file, with commas"),
+    ("\ufeffepisode,from,to\n99,0,1\n", "a label is of frames 0 up to 1 of 0 in '99'"),
+    ("episode,from,to\n0,1,2\n", "there are no heldout states"),
+]
 
 
-@pytest.mark.parametrize(
-    ("source", "words", "said"),
-    [
-        ("v3.0-image", [], "nothing says where the sub-goal holds"),
-        ("v3.0-image", ["--label", "a"], "--label needs NAME=RULE"),
-        ("v3.0-image", ["--label", "a=next.sucess"], "no column 'next.sucess' with a number for each frame"),
-        ("v3.0-image", ["--label", "a=last:0"], "a has no positives"),
-        ("v3.0-image", ["--label", "a=missing.csv"], "no such file: missing.csv"),
-        ("v3.0-image", [*LABEL, "--key", "observation.stat"], "no pictures or numbers 'observation.stat'"),
-        ("v3.0-image", [*LABEL, "--resize", "big"], "--resize needs a number of pixels"),
-        ("v3.0-image", [*LABEL, "--group", "task"], "--group is for arrays"),
-        ("demo.hdf5", ["--label", "a=actions"], "no column 'actions' with a number for each frame"),
-        ("takes", ["--label", "a=last:3", "--key", "top"], "There are video"),
-        ("takes", ["--label", "a=rewards"], "Its columns are none"),
-        ("takes", ["--label", f"a={ME}:is_unsure"], "the label function gave neither True nor False: nan"),
-        ("takes", ["--label", f"a={ME}:goes_right"], "your code raised IndexError"),
-    ],
-)
-def test_what_is_not_there_is_one_line(
-    datasets: Path, tmp_path: Path, source: str, words: list[str], said: str
-) -> None:
-    refuses(said, "import", datasets / source, "--out", tmp_path / "data.h5", *words)
+@pytest.mark.parametrize(("words", "said"), REFUSED)
+def test_what_does_not_fit_is_one_line(datasets: Path, tmp_path: Path, words: str, said: str) -> None:
+    """Spec G2: options, and tables of labels."""
+    given = words.split()
+    if "episode" in words:
+        (tmp_path / "labels.csv").write_text(words)
+        given = ["--label", f"reached={tmp_path / 'labels.csv'}", "--key", STATE]
+    refuses(said, "import", datasets / "v3.0-image", "--out", tmp_path / "data.h5", *given)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words", "said"),
-    [
-        ({"episodes": 2}, RIGHT, "there are no heldout states"),
-        ({"jpeg": True}, RIGHT, "Make it with jpeg_encoding=False"),
-        ({"nested": True}, [*RIGHT, "--key", "imag"], "Did you mean 'image'"),
-        ({"nested": True}, [*RIGHT, "--key", "task"], "no pictures or numbers 'task'"),
-    ],
-)
-def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, settings: Any, words: list[str], said: str) -> None:
-    folder = save_minari(tmp_path / "own-v0", **settings)
-    refuses(said, "import", folder, "--out", tmp_path / "data.h5", *words)
+def test_what_other_recordings_lack_is_one_line(datasets: Path, tmp_path: Path) -> None:
+    few, some = (save_minari(tmp_path / f"{count}-v0", count, nested=True) for count in (2, 3))
+    for source, rule, key, said in (
+        (datasets / "demo.hdf5", "actions", "robot0_eef_pos", "no column with a number for each frame: actions"),
+        (datasets / "takes", "last:3", "top", "There are video"),
+        (datasets / "takes", "rewards", "video", "There are none"),
+        (few, few / "right.csv", "image", "there are no heldout states"),
+        (some, some / "right.csv", "imag", "'imag': episode_0. There are arm/speed, image, task"),
+        (some, some / "right.csv", "task", "no pictures or numbers 'task'"),
+    ):
+        refuses(said, "import", source, "--out", tmp_path / "data.h5", "--label", f"a={rule}", "--key", key)
 
 
 def test_the_missing_extra_is_named(datasets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     words = ["import", datasets / "v3.0-video", "--out", tmp_path / "data.h5", *LABEL]
-    refuses("this needs av, which is not installed. pip install 'hypogoal[lerobot]'", *words)
+    refuses("pip install 'hypogoal[lerobot,minari]'", *words)

@@ -44,9 +44,9 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     [part] = json.loads((audit / "audit.json").read_text())["sub_goals"]
     assert (part["sub_goal"], part["known"], part["unlabelled"], len(part["members"])) == (GOAL, 56, 20, 2)
     rows = read_table(audit / "next" / GOAL / TO_FILL_IN, {"row": int, "digest": str})
-    places = [row["row"] for row in rows]
+    places = rows["row"].tolist()
     assert sorted(places) == list(range(20)) and places == part["next"]
-    assert all(digest(data.unlabelled()[place]).hex() == row["digest"] for place, row in zip(places, rows, strict=True))
+    assert [digest(data.unlabelled()[place]).hex() for place in places] == rows["digest"].tolist()
     page = (audit / "index.html").read_text()
     assert "To label next" in page and page.count("data:image/webp") >= 20
     assert "Content-Security-Policy" in page and "http" not in page.replace("http-equiv", "")
