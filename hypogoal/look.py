@@ -3,6 +3,7 @@
 import shlex
 import textwrap
 from pathlib import Path
+from statistics import fmean
 from typing import Any, TypeAlias
 
 from hypogoal.cells import read_plan, status_lines
@@ -15,9 +16,8 @@ from hypogoal.observations import type_text
 
 WIDTH = 80  # columns
 EVALUATION = "evaluation"
-# Of a training's log, in the order in which they are shown, with their titles.
-LOGGED = {"labelled": "labelled loss"}
-LOGGED |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
+# Of a training's log, in the order in which they are shown.
+LOGGED = ("labelled", "success", "length", "reached", "terminated", "duration", "episodes")
 Details: TypeAlias = dict[str, Any]  # a description
 
 
@@ -37,8 +37,9 @@ def parts_of(path: Path) -> list[Path]:
 def unfinished(path: Path) -> list[str]:
     """A line for each output at or below a path that is being made, or was interrupted."""
     lines = []
-    below = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in path.rglob(".*.partial")]
-    for out in (path, *sorted(below)):
+    drafts = sorted(path.rglob(".*.partial"))
+    below = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in drafts]
+    for out in (path, *below):
         draft = Draft(out)
         if draft.begun.is_file():
             state = "in progress" if draft.is_locked else "interrupted; its command with --resume continues it"
@@ -75,10 +76,10 @@ def numbers_of(path: Path) -> Details:
     """The last numbers in a training's log, means over sub-goals."""
     last = {row.get("sub_goal"): row for row in read_log(path / LOG)}
     numbers = {}
-    for name, title in LOGGED.items():
+    for name in LOGGED:
         values = [row[name] for row in last.values() if isinstance(row.get(name), int | float)]
         if values:
-            numbers[title] = sum(values) / len(values)
+            numbers["labelled loss" if name == "labelled" else name] = fmean(values)
     return numbers
 
 
@@ -121,19 +122,19 @@ def lines(details: Details) -> list[str]:
         return [lines(part)[0] for part in details["parts"]]
     facts = dict(details)
     heading = f"{facts.pop('path')}: {facts.pop('kind')}"
-    numbers = facts.pop("numbers").items()
-    logged = [f"{name} {round(value, 4):g}" for name, value in numbers if isinstance(value, float)]
-    text = ["; ".join([heading, ", ".join(logged)]) if logged else heading]
-    config = facts.pop("config")
+    for name, value in facts.pop("numbers").items():
+        if isinstance(value, float):
+            heading += f"; {name} {value:.4g}"
     if "inputs" in facts:
         facts["inputs"] = [f"{entry['kind']} {entry['path']}" for entry in facts["inputs"]]
         facts["command"] = shlex.join(facts["command"])
         facts["files"] = [*facts["files"]]
-    for name, value in facts.items():
-        text += _wrapped(f"{name}: {_typed(value)}")
-    text.append("config:")
-    for name, value in config.items():
-        text += _wrapped(f"  {name}={_typed(value)}")
+    settings = facts.pop("config")
+    rows = [f"{name}: {_typed(value)}" for name, value in facts.items()]
+    rows += [f"  {name}={_typed(value)}" for name, value in settings.items()]
+    text = [heading]
+    for row in rows:
+        text += textwrap.wrap(row, WIDTH, subsequent_indent="    ", break_on_hyphens=False, break_long_words=False)
     return text
 
 
@@ -141,13 +142,7 @@ def _typed(value: Any) -> str:
     """A value as one would type it."""
     if isinstance(value, dict):
         value = [f"{name} {_typed(part)}" for name, part in value.items()]
-    if isinstance(value, list):
-        return ", ".join(map(str, value))
-    return str(value)
-
-
-def _wrapped(line: str) -> list[str]:
-    return textwrap.wrap(line, WIDTH, subsequent_indent="    ", break_on_hyphens=False, break_long_words=False)
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def faults(path: Path) -> list[str]:
@@ -182,10 +177,12 @@ def stale(run: Path) -> list[Details]:
     for place in parts:
         _find_reasons(place, reasons)
     rows = []
-    for place in [place for place in reasons if place in parts]:
-        command = Artefact(place).manifest.command if reasons[place] else []
+    for place, why in reasons.items():
+        if place not in parts:
+            continue
+        command = Artefact(place).manifest.command if why else []
         typed = shlex.join(command) if command[:1] == ["hypogoal"] else ""  # a program's cannot be given again
-        rows.append({"path": str(parts[place]), "reasons": reasons[place], "command": typed})
+        rows.append({"path": str(parts[place]), "reasons": why, "command": typed})
     return rows
 
 

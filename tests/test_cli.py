@@ -111,7 +111,7 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("evaluate {ensemble} --out {ensemble} --force", "would replace an input"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
         ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
-        ("collect doorkey --out {out} --seed -1", "a seed is 0 or more"),
+        ("collect doorkey --out {out} --seed -1", "greater than or equal to 0"),
         ("collect chess --out {out}", "unknown domain: chess"),
         ("collect nosuchmodule:DOMAIN --out {out}", "cannot be loaded"),
         ("run doorkey --out {out} --preset turbo", "no such preset: turbo"),

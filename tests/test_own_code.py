@@ -10,10 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import corridor_env
 import numpy as np
 import pytest
-import torch
 from command_line import fails, refuses, run, settings
 from corridor_env import SUB_GOALS, CorridorEnv
 from own_domain import CorridorDomain, TallCorridor
@@ -126,22 +124,6 @@ def test_what_is_raised_has_a_place(place: str, error: BaseException, told: Call
     domain, words = PLACES[place]
     line = told(domain(raising(error)), words, f"your code raised {type(error).__name__}: ")
     assert f": test_own_code.py, line {LINE}. --debug shows" in line and "and where" not in line
-
-
-HONEST = [
-    *(giving(1, kind) for kind in (np.array, torch.tensor, bool)),
-    *(giving(2, kind) for kind in (np.bool_, int)),
-]
-
-
-@pytest.mark.parametrize("own", HONEST)
-def test_numbers_of_any_library_are_numbers(own: GymnasiumDomain) -> None:
-    """Spec B6: the same states, rewards and ends as of Python's own."""
-    engine, plain = own.make_engine(0, 2, 9), corridor_env.DOMAIN.make_engine(0, 2, 9)
-    for row in np.random.default_rng(0).integers(2, size=(40, 2)):
-        for one, other in zip(plain.step(row)[:4], engine.step(row)[:4], strict=True):
-            assert one.dtype == other.dtype
-            np.testing.assert_array_equal(one, other)
 
 
 def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:

@@ -27,7 +27,8 @@ class Columns(Resumable):
     """Arrays (n, ...), one for each field."""
 
     def __len__(self) -> int:
-        first, *_ = vars(self).values()
+        columns = vars(self).values()
+        first, *_ = columns
         return len(first)
 
     @classmethod
@@ -63,7 +64,8 @@ class Columns(Resumable):
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all parts, one part after another."""
         each = [vars(part).values() for part in parts]
-        columns = map(np.concatenate, zip(*each, strict=True))
+        alike = zip(*each, strict=True)
+        columns = map(np.concatenate, alike)
         return cls(*columns)
 
     def at(self, rows: Any) -> Self:

@@ -45,10 +45,8 @@ def read_text(path: Path, subject: str, do: str) -> str:
     """The text of a file in UTF-8, with or without a byte order mark, with line feeds as line ends."""
     try:
         return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise UserError(f"{subject} not text in UTF-8", path, do) from None
-    except OSError as error:
-        raise UserError(f"{subject} not readable ({error.strerror})", path, do) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{subject} not readable ({error})", path, do) from None
 
 
 def read_json(path: Path, subject: str, do: str) -> Any:
@@ -92,8 +90,6 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def sync(path: Path) -> None:
     """Flush a file, or a folder's list of files, to the disk."""
-    if os.name == "nt":  # Windows cannot open folders
-        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -103,7 +99,7 @@ def sync(path: Path) -> None:
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a CSV file with a header."""
-    with replacing(path) as fresh, fresh.open("w", encoding="utf-8", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(rows)

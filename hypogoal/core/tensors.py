@@ -20,16 +20,16 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write tensors by name. NaN or Inf is a ``NumericalError`` and nothing is written (Spec G3)."""
     from safetensors.torch import save
 
-    if name := _not_finite(tensors):
-        raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
     weights = {}
     for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
         weights[name] = tensor.detach().cpu().contiguous()
     path.write_bytes(save(weights))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
-    """Read tensors by name. A file that is missing, cut or not safetensors, NaN and Inf are a ``UserError``."""
+    """Read tensors by name. A file that is missing, cut or not safetensors is a ``UserError``."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -37,19 +37,7 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
         tensors: dict[str, Tensor] = load_file(path)
     except (OSError, SafetensorError) as error:
         raise UserError(f"the weights cannot be read ({error})", path, AGAIN) from None
-    if name := _not_finite(tensors):
-        raise UserError(f"the weights hold NaN or Inf (at {name})", path, AGAIN)
     return tensors
-
-
-def _not_finite(tensors: Mapping[str, Tensor]) -> str:
-    """The name of the first tensor with NaN or Inf; empty if there is none."""
-    import torch
-
-    for name, tensor in tensors.items():
-        if not torch.isfinite(tensor).all():
-            return name
-    return ""
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -70,7 +58,13 @@ def load_into(module: M, weights: Mapping[str, Tensor], where: str, *, assign: b
     return module
 
 
-def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: str, *, custom: bool = False) -> M:
+def load_fitting(
+    make: Callable[[], M],
+    weights: Mapping[str, Tensor],
+    where: str,
+    *,
+    custom: bool = False,
+) -> M:
     """The module that ``make`` builds, with these weights; a ``UserError`` if they do not fit it.
 
     It is built without random numbers, which costs no time and no draws, unless it is ``custom``: the user's code.

@@ -49,7 +49,7 @@ Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet
 Preset = Annotated[str | None, Option("--preset", help="demo, paper, or your .toml file.")]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET)]
-Seed = Annotated[int, Option("--seed", help="Seed of all randomness.")]
+Seed = Annotated[int, Option("--seed", min=0, help="Seed of all randomness.")]
 Device = Annotated[str, Option("--device", help="Where to train: auto (the CPU), cpu or cuda.")]
 Force = Annotated[bool, Option("--force", metavar="", help="Replace what is at --out.")]
 RESUME = "Continue an unfinished output; keep a complete one."
@@ -73,10 +73,6 @@ class Call:
     force: Force = False
     resume: Resume = False
     quiet: Quiet = False
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise UserError("a seed is 0 or more", f"seed {self.seed}", "Give another one.")
 
     def settings(self, domain: str, inherited: Mapping[str, Any] | None = None) -> Any:
         """The stage's settings: defaults, the domain's, the preset's, those of continued options, the typed ones."""
@@ -136,8 +132,8 @@ class Done:
     """What a stage says at its end."""
 
     lines: Sequence[str] = ()
-    then: Sequence[object] = ()  # the words of the next command
     path: Path | None = None  # where to look, if not at the output or its page
+    then: str = ""  # the next command, if not the stage's
 
 
 def load_stage(name: str) -> "Stage":
@@ -165,6 +161,7 @@ class Stage:
         example: a command, with which ``--help`` ends.
         often: the settings changed most, options of the command.
         leaves_out: options of all stages that this one has not.
+        then: the next command, in which ``{source}``, ``{out}``, ``{run}`` are what it worked on, wrote, and in what.
         into: what it writes by default, a name within what it works on.
     """
 
@@ -172,14 +169,15 @@ class Stage:
     example: str
     often: Sequence[str] = ()
     leaves_out: Sequence[str] = ()
+    then: str = ""
     into: str = ""
 
     def __post_init__(self) -> None:
         self.name = self.function.__name__.replace("_", "-")
         _, self.source, *self.inputs = inspect.signature(self.function).parameters.values()
         _, self.out, _, *shared = inspect.signature(Call).parameters.values()
-        self.options = [option for option in shared if option.name not in self.leaves_out]
-        self.has_settings = "preset" not in self.leaves_out
+        options = [option for option in shared if option.name not in self.leaves_out]
+        self.options = [*self.inputs, *options]
         if self.into:
             by_default: Any = Option("--out", help=f"Default: {self.source.name.upper()}/{self.into}.")
             self.out = self.out.replace(default=None, annotation=Annotated[Path | None, by_default])
@@ -194,18 +192,43 @@ class Stage:
 
             own_code.allow([source, *arguments.values()])
             values = {}
-            for each in (*self.inputs, *self.options):
+            for each in self.options:
                 values[each.name] = _as_path(each, arguments.pop(each.name, each.default))
             with own_settings():
                 call, _ = self.run(_as_path(self.source, source), out, values, arguments)
             return Made(call.out)
 
-        out = Parameter("out", Parameter.POSITIONAL_OR_KEYWORD, default=None)
+        out = self.out.replace(kind=Parameter.POSITIONAL_OR_KEYWORD, default=None)
         settings = Parameter("settings", Parameter.VAR_KEYWORD)
-        parameters = [self.source, out, *self.inputs, *self.options, settings]
-        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__signature__ = inspect.Signature([self.source, out, *self.options, settings])  # type: ignore[attr-defined]
         called.stage = self  # type: ignore[attr-defined]
         return called
+
+    @functools.cached_property
+    def command(self) -> Any:
+        """The command of the command line."""
+
+        def called(**values: Any) -> None:
+            typed = self._typed(values)
+            source = values.pop(self.source.name)
+            call, done = self.run(source, values.pop("out"), values, typed)
+            if not call.quiet:
+                for line in done.lines:
+                    say(line)
+                if then := done.then or self.then:
+                    places = {"source": source, "out": call.out, "run": call.out.parent}
+                    words = [word.format(**places) for word in then.split()]
+                    say(f"next: {own_code.command(*words)}")
+            page = call.out / "index.html"
+            say(done.path or (page if page.is_file() else call.out))
+
+        source = self.source.replace(kind=Parameter.KEYWORD_ONLY)
+        parameters = [source, self.out, *self.options, *self._settings()]
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        example = f"Example:\n\n[bold]hypogoal {self.example}[/bold]"
+        alone = typer.Typer(add_completion=False)
+        alone.command(self.name, help=LISTED[self.name], epilog=example)(called)
+        return typer.main.get_command(alone)
 
     def parsed(self, words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
         """The arguments and options in the words of its command, and the settings that they give; nothing is run."""
@@ -221,60 +244,14 @@ class Stage:
         typed = {name: value for name, value in chosen.items() if value is not None}
         return typed | assigned(values.pop("set_", None) or ())
 
-    @functools.cached_property
-    def command(self) -> Any:
-        """The command of the command line."""
-
-        def called(**values: Any) -> None:
-            typed = self._typed(values)
-            source = values.pop(self.source.name)
-            out = values.pop("out")
-            call, done = self.run(source, out, values, typed)
-            if not call.quiet:
-                for line in done.lines:
-                    say(line)
-                if done.then:
-                    say(f"next: {own_code.command(*done.then)}")
-            page = call.out / "index.html"
-            say(done.path or (page if page.is_file() else call.out))
-
-        source = self.source.replace(kind=Parameter.KEYWORD_ONLY)
-        parameters = [source, *self.inputs, self.out, *self.options, *self._settings()]
-        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        example = f"Example:\n\n[bold]hypogoal {self.example}[/bold]"
-        alone = typer.Typer(add_completion=False)
-        alone.command(self.name, help=LISTED[self.name], epilog=example)(called)
-        return typer.main.get_command(alone)
-
-    def run(
-        self,
-        source: Any,
-        out: Place | None,
-        values: dict[str, Any],
-        typed: Mapping[str, Any],
-    ) -> tuple[Call, Done]:
-        """Call the function with the ``values`` of inputs and options. With ``resume`` what is complete is kept."""
-        if typed and not self.has_settings:
-            raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
-        inputs = {each.name: values.pop(each.name) for each in self.inputs}
-        place = Path(out) if out else Path(source, self.into)
-        call = Call(stage=self.name, out=place, typed=typed, **values)
-        try:
-            return call, self.function(call, source, **inputs)
-        except Complete as complete:
-            say(complete, err=True)
-            return call, Done()
-
     def _settings(self) -> Iterator[Parameter]:
         """``--set``, and options that are short for it; their values stay text, read as those of ``--set``."""
         from hypogoal.core.config import described, model_of
 
-        if not self.has_settings:
+        if "preset" in self.leaves_out:
             return
         yield Parameter("set_", Parameter.KEYWORD_ONLY, default=None, annotation=Set)
-        if not self.often:
-            return
-        rows = {row["name"]: row for row in described(model_of(self.name))}
+        rows = {row["name"]: row for row in described(model_of(self.name))} if self.often else {}
         panel = f"Settings, with doorkey's defaults (all: hypogoal config {self.name})"
         for name in self.often:
             row = rows[name]
@@ -284,6 +261,25 @@ class Stage:
             option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
             annotation = Annotated[str | None, option]
             yield Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+    def run(
+        self,
+        source: Any,
+        out: Place | None,
+        values: dict[str, Any],
+        typed: Mapping[str, Any],
+    ) -> tuple[Call, Done]:
+        """Call the function with the ``values`` of inputs and options. With ``resume`` what is complete is kept."""
+        if typed and "preset" in self.leaves_out:
+            raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
+        inputs = {each.name: values.pop(each.name) for each in self.inputs}
+        place = Path(out) if out else Path(source, self.into)
+        call = Call(stage=self.name, out=place, typed=typed, **values)
+        try:
+            return call, self.function(call, source, **inputs)
+        except Complete as complete:
+            say(complete, err=True)
+            return call, Done()
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:

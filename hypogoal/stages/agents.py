@@ -31,9 +31,7 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
     held: dict[str, Any] = {}
     if practice:
         _require_same(practice, source)
-        for name in fixed:
-            if name in practice.config:
-                held[name] = practice.config[name]
+        held = {name: practice.config[name] for name in fixed if name in practice.config}
         if practice.config["layouts"]:  # options of many layouts may be played in any
             held.pop("layout_seed", None)
     config = call.settings(source.config["domain"], held)

@@ -1,6 +1,5 @@
 """Spec A1, B3: collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Argument
@@ -12,14 +11,18 @@ from hypogoal.core.terminal import say
 from hypogoal.stages import DOMAINS, NO_TRAINING, Call, Done, stage
 
 
-@stage("collect doorkey --out data/doorkey.h5", leaves_out=NO_TRAINING)
+@stage(
+    "collect doorkey --out data/doorkey.h5",
+    leaves_out=NO_TRAINING,
+    then="train-ensemble {out} --out runs/{out.stem}/ensemble",
+)
 def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     """Collect labelled, unlabelled and held-out states.
 
     ``domain`` is a name, or in Python a ``Domain``, which later stages find by its own name, in this process only.
     ``out`` is an HDF5 file. ``resume`` keeps a complete one and begins an unfinished one anew.
     """
-    from hypogoal.data import open_dataset, require_names, write_dataset
+    from hypogoal.data import doubts_of, open_dataset, require_names, write_dataset
     from hypogoal.domains.base import BUILT_IN, load_domain
     from hypogoal.look import count_lines
 
@@ -39,12 +42,11 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
             seed=call.seed,
         )
     if name not in BUILT_IN:
-        for line in _doubts(played, collected):
+        labels = collected.labelled.labels, collected.heldout.labels
+        for line in doubts_of(*labels, collected.sub_goals):
             say(f"hypogoal: {line}", err=True)
-    run = call.out.parent if call.out.name == "data.h5" else Path("runs", call.out.stem)
     counts = open_dataset(call.out).counts()
-    then = ("train-ensemble", call.out, "--out", run / "ensemble")
-    return Done(count_lines(counts), then)
+    return Done(count_lines(counts))
 
 
 def _name_of(domain: Any) -> str:
@@ -57,24 +59,3 @@ def _name_of(domain: Any) -> str:
         raise UserError("this domain has the name of one of hypogoal's", domain.name, "Give it another name.")
     REGISTERED[domain.name] = domain
     return str(domain.name)
-
-
-def _doubts(domain: Any, collected: Any) -> list[str]:
-    """What may be hard about the states of a domain of the user's own."""
-    import numpy as np
-
-    from hypogoal.data import doubts_of
-    from hypogoal.options.config import OptionConfig
-
-    labelled = collected.labelled
-    lines = doubts_of(labelled.labels, collected.heldout.labels, collected.sub_goals)
-    steps = labelled.origins.get("step")
-    defaults = domain.defaults.get("train-options", {})
-    if steps is None or "option_timeout" in defaults:
-        return lines
-    soonest = [steps[holds].min() for holds in labelled.labels.T]
-    apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
-    if 2 * apart > OptionConfig().option_timeout:
-        fault = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
-        lines.append(f"{fault}: train-options --option-timeout {2 * apart} gives options time for that")
-    return lines

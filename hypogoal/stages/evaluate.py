@@ -14,7 +14,12 @@ from hypogoal.stages import NO_SETTINGS, WIDTH, Call, Done, stage
 PLAYED = "Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."
 
 
-@stage("evaluate runs/mine", leaves_out=NO_SETTINGS, into="evaluation")
+@stage(
+    "evaluate runs/mine",
+    leaves_out=NO_SETTINGS,
+    then="report {source}",
+    into="evaluation",
+)
 def evaluate(
     call: Call,
     run: Annotated[Path, Argument(help="A run: a folder with artefacts in it.")],
@@ -61,5 +66,4 @@ def evaluate(
         questions.write(draft.files, results)
         cells.write_results(run, draft.files)
     table = drawn(questions.summary(results), WIDTH).splitlines()
-    is_of_run = call.out == run / "evaluation"
-    return Done(table, ("report", run) if is_of_run else ("show", call.out))
+    return Done(table)

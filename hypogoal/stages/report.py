@@ -62,12 +62,17 @@ def report(
             small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
             shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
             page = render(results, every, shown)
-        (draft.files / "index.html").write_text(page, encoding="utf-8")
-        (draft.files / "figures").mkdir()
+        index = draft.files / "index.html"
+        index.write_text(page, encoding="utf-8")
+        pictures = draft.files / "figures"
+        pictures.mkdir()
         for _, drawn in every:
             for kind in ("svg", "png"):
-                (draft.files / "figures" / f"{drawn.name}.{kind}").write_bytes(to_file(drawn.figure, kind))
+                path = pictures / f"{drawn.name}.{kind}"
+                path.write_bytes(to_file(drawn.figure, kind))
+        moving = draft.files / "videos"
         for film in films:
-            (draft.files / "videos").mkdir(exist_ok=True)
-            (draft.files / "videos" / film.name).write_bytes(film.gif)
+            moving.mkdir(exist_ok=True)
+            path = moving / film.name
+            path.write_bytes(film.gif)
     return Done()

@@ -13,6 +13,7 @@ from hypogoal.stages import DOMAINS, Call, Done, outcome_of, stage
 @stage(
     "train-baseline doorkey --agent ppo --out runs/mine/ppo",
     often=["agent", "steps", "layout_seed", "setting"],
+    then="evaluate {run}",
 )
 def train_baseline(
     call: Call,
@@ -63,7 +64,7 @@ def train_baseline(
         save_tensors(files / "policy.safetensors", agents.weights(agent))
         world.write_layout(files, engine, config, call.seed)
     numbers = env.episodes.counts() | env.episodes.recent()
-    return Done(outcome_of(numbers), ("evaluate", call.out.parent))
+    return Done(outcome_of(numbers))
 
 
 def _states_of(domain: str, data: Path) -> Any:

@@ -23,6 +23,7 @@ ELSEWHERE = "Take unlabelled states from a data file, or options or a meta-polic
 @stage(
     "train-ensemble data/doorkey.h5 --out runs/mine/ensemble",
     often=["members", "diversity", "diversity_weight", "network", "steps"],
+    then="train-options {out} --out {run}/options",
 )
 def train_ensemble(
     call: Call,
@@ -37,6 +38,7 @@ def train_ensemble(
     """
     from hypogoal.core.processes import allowed, in_processes, prepare
     from hypogoal.data import open_dataset
+    from hypogoal.domains.base import installed_domain
     from hypogoal.hypotheses.sub_goals import checked, log_of, train_sub_goal
     from hypogoal.options.visited import unlabelled_file
 
@@ -64,11 +66,11 @@ def train_ensemble(
             jobs.append(job)
         accuracies: list[dict[str, float]] = [{} for _ in jobs]
         draft.checkpoint.mkdir(exist_ok=True)
-        workers = min(allowed(config.workers), len(jobs))
-        in_processes(jobs, workers, accuracies.__setitem__)
+        in_processes(jobs, allowed(config.workers), accuracies.__setitem__)
         texts = [log_of(draft, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
         (draft.files / LOG).write_text("".join(texts), encoding="utf-8")
-    return Done(_outcome(accuracies, call.out), _next(call.out, dataset.domain))
+    then = "" if installed_domain(dataset.domain) else "evaluate {run}"  # recorded states have no world to practise in
+    return Done(_outcome(accuracies, call.out), then=then)
 
 
 def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str, Any]:
@@ -94,16 +96,3 @@ def _outcome(accuracies: Sequence[dict[str, float]], out: Path) -> list[str]:
         if values:
             means[title] = fmean(values)
     return outcome_of(means or numbers_of(out))
-
-
-def _next(out: Path, domain: str) -> tuple[object, ...]:
-    """Options are learned where the domain practises them, else chosen at once; recorded data have no world."""
-    from hypogoal.domains.base import installed_domain
-
-    installed = installed_domain(domain)
-    if installed is None:
-        return "evaluate", out.parent
-    name = "options"
-    if "train-meta" in installed.defaults and "train-options" not in installed.defaults:
-        name = "meta"
-    return f"train-{name}", out, "--out", out.parent / name

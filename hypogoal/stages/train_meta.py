@@ -22,6 +22,7 @@ WORLD = ("domain_config", "cap", "max_episode_steps")  # where these differ, the
 @stage(
     "train-meta runs/mine/ensemble --out runs/mine/meta",
     often=["steps", "layout_seed", "network", "termination", "chooser"],
+    then="evaluate {run}",
 )
 def train_meta(
     call: Call,
@@ -54,7 +55,7 @@ def train_meta(
         agents.learn(work, setup, loop, steps)
     episodes = loop.recorder.episodes
     numbers = episodes.counts() | episodes.recent()
-    return Done(outcome_of(numbers), ("evaluate", call.out.parent))
+    return Done(outcome_of(numbers))
 
 
 def _steps_spent(practice: Artefact | None) -> dict[str, Any]:

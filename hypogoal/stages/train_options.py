@@ -14,6 +14,7 @@ FIXED = ("network", "recurrence", "embedding", "termination")  # as of the optio
 @stage(
     "train-options runs/mine/ensemble --out runs/mine/options",
     often=["steps", "layout_seed", "network", "termination", "option_timeout"],
+    then="train-meta {source} --options {out} --out {run}/meta",
 )
 def train_options(
     call: Call,
@@ -53,8 +54,4 @@ def train_options(
     numbers = counts | recorder.recent(restarted=config.restart_options)
     if config.until:
         numbers[f"until={config.until:g}"] = "reached" if solved else "not reached"
-    run = call.out.parent
-    if config.restart_options:  # no episodes are left to choose in
-        return Done(outcome_of(numbers), ("evaluate", run))
-    then = ("train-meta", ensemble, "--options", call.out, "--out", run / "meta")
-    return Done(outcome_of(numbers), then)
+    return Done(outcome_of(numbers))

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import TO_FILL_IN
 from hypogoal.core.errors import UserError
 from hypogoal.stages import Call, Done, stage
 
@@ -90,20 +90,12 @@ def _edges(config: Any, threshold: float) -> list[float]:
 
 def _on_recorded_data(call: Call, source: str, sub_goal: str | None, member: int | None) -> Done:
     """An audit where there is no simulator: all members of an ensemble, on the data that they were trained with."""
-    from hypogoal.core.artefacts import DATA, TO_FILL_IN
-    from hypogoal.data import open_dataset
     from hypogoal.tools.audit_recorded import audit_recorded
 
     if not Path(source).is_dir() or member is not None or call.typed or call.preset or call.resume:
         do = "Give --domain and --sub-goal; or an ensemble's folder alone."
         raise UserError("on recorded data an audit takes an ensemble, all members, without settings", source, do)
     lines = audit_recorded(call, Path(source), sub_goal)
-    data = open_artefact(call.out).input(DATA)
-    goal, *others = open_dataset(data).sub_goals
-    if others:
-        return Done(lines)
-    table = call.out / "next" / goal / TO_FILL_IN
-    lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it")
-    more = data.with_name(f"{data.stem}-more.h5")
-    then = ("import", data, "--label", f"{goal}={table}", "--out", more)  # which takes labels of one sub-goal
-    return Done(lines, then)
+    table = call.out / "next" / "SUB_GOAL" / TO_FILL_IN
+    lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it; see docs/audit.md")
+    return Done(lines)

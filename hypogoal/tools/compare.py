@@ -36,10 +36,13 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
                 do = "Choose runs of one experiment, evaluated alike."
                 raise UserError("these runs cannot be compared", reason, do)
             page, figures, tables = beside.page_of(results, [str(run) for run in runs])
-        (draft.files / "index.html").write_text(page, encoding="utf-8")
+        index = draft.files / "index.html"
+        index.write_text(page, encoding="utf-8")
         for name, table in tables.items():
             table.to_csv(draft.files / f"{name}.csv", index=False)
-        (draft.files / "figures").mkdir()
+        folder = draft.files / "figures"
+        folder.mkdir()
         for drawn in figures:
-            (draft.files / "figures" / f"{slug(drawn.name)}.svg").write_bytes(to_file(drawn.figure, "svg"))
+            path = folder / f"{slug(drawn.name)}.svg"
+            path.write_bytes(to_file(drawn.figure, "svg"))
     return out / "index.html"

@@ -155,7 +155,7 @@ def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress:
     place = meta.config["layouts"] or meta.config["layout_seed"]
     about = f"{meta.config['domain']}, layout seed {place}, seed {seed}"
     description = {
-        "dataset_id": dataset_id(out),
+        "dataset_id": out.name,
         "minari_version": __version__,
         "algorithm_name": "hypogoal",
         "description": f"Episodes of an agent that chooses among options ({about}).",
@@ -179,12 +179,3 @@ def _buffers(episodes: Iterable[Any], progress: Progress) -> Iterator[Any]:
             infos={"option": np.concatenate([[-1], episode.options])},
         )
         progress.advance()
-
-
-def dataset_id(out: Path) -> str:
-    """The id by which minari finds a dataset's folder: its path below minari's root folder, else its name."""
-    from minari.storage.datasets_root_dir import get_dataset_path
-
-    place = out.resolve()
-    root = get_dataset_path().resolve()
-    return place.relative_to(root).as_posix() if place.is_relative_to(root) else out.name

@@ -66,7 +66,7 @@ def printed(text: str, lead: str) -> str:
 
 
 def test_what_follows_a_stage_with_code_of_ones_own(shell: Shell) -> None:
-    """From collecting to the report nothing is typed but what was printed; paths have spaces and a quote in them."""
+    """From collecting to the report nothing is typed but what was printed; a path has spaces and a quote in it."""
     line = 'hypogoal collect tiny:DOMAIN --out "it\'s  mine/data.h5"'
     ran = []
     while line:
@@ -78,7 +78,7 @@ def test_what_follows_a_stage_with_code_of_ones_own(shell: Shell) -> None:
     stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
     assert [shlex.split(line)[1] for line in ran] == stages
     assert all("--trust" in line for line in ran[1:])
-    assert Path("it's  mine/report/index.html").is_file()
+    assert Path("runs/data/report/index.html").is_file()
 
 
 def test_what_an_error_says_to_do(shell: Shell) -> None:

@@ -87,7 +87,6 @@ def test_what_is_made_is_a_path_with_something_to_show(
         ({"diversity": "none:such"}, "cannot be loaded"),
         ({"preset": "none-such"}, "no such preset"),
         ({"device": "tpu"}, "unknown device"),
-        ({"seed": -1}, "a seed is 0 or more"),
     ],
 )
 def test_what_would_end_a_command_is_an_error(run: Path, tmp_path: Path, given: dict[str, object], words: str) -> None:

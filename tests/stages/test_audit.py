@@ -21,7 +21,6 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey.engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS, lines_of
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.options.termination import Terminations
 
 BLUE_FIRST = "101"  # a layout on which the blue key is nearer than the red one
 Pictures = NDArray[np.uint8]
@@ -140,21 +139,6 @@ def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> Non
     assert truth["mended"] is None
     assert (truth["random_play"]["accuracy"], truth["before"]["fires_far"]) == (1.0, 0.0)
     assert truth["before"]["there"] >= 50
-
-
-class Falling(Terminations):
-    """An execution that ends lowers all thresholds to a probability of three quarters."""
-
-    def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
-        self.thresholds = np.full_like(self.thresholds, np.log(3))
-
-
-def test_a_threshold_that_falls_is_told_as_it_ends(tmp_path: Path) -> None:
-    """From .9, which this classifier never says: where the rule that was typed lowers it, and not where it does not."""
-    where = [*CORRIDOR, *settings("steps=400", "mend=0", "warm_up=400", "threshold=0.9")]
-    for rule, told in (("learned", 0.9), (f"{__name__}:Falling", 0.75)):
-        report, _ = audited(tmp_path / rule.partition(":")[0], "too_soon", *where, *settings(f"termination={rule}"))
-        assert report["before"]["threshold"] == pytest.approx(told)
 
 
 def test_places_are_kinds_of_their_own(tmp_path: Path) -> None:

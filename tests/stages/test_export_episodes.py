@@ -11,7 +11,6 @@ from command_line import refuses, run
 
 import hypogoal  # noqa: F401 - registers the environments
 from hypogoal.importing.recordings import read_minari
-from hypogoal.tools.export import dataset_id
 
 LAYOUT = 100
 EPISODES = 3
@@ -52,22 +51,6 @@ def test_an_agents_episodes_are_a_minari_dataset(tiny_run: Path, there: Path) ->
     run("export", tiny_run / "meta", "--out", again, "--episodes", EPISODES, "-q")
     for one, other in zip(dataset.iterate_episodes(), minari.load_dataset("again-v0").iterate_episodes(), strict=True):
         np.testing.assert_array_equal(one.actions, other.actions)
-
-
-@pytest.mark.parametrize("place", ["keys/deep/toy-v0", "toy-v0"])
-def test_a_dataset_is_called_by_where_it_lies(
-    tiny_run: Path, there: Path, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Spec B6: in a namespace its id begins with that, whichever way its place is written; outside it is its name."""
-    monkeypatch.chdir(tmp_path)
-    run("export", tiny_run / "meta", "--out", f"minari/{place}", "--episodes", "1", "-q")
-    dataset = minari.load_dataset(place)
-    assert dataset.id == dataset.spec.dataset_id == place
-    assert place in minari.list_local_datasets()
-    assert dataset_id(tmp_path / "elsewhere" / "toy-v0") == "toy-v0"
-    monkeypatch.delenv("MINARI_DATASETS_PATH")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert dataset_id(tmp_path / ".minari" / "datasets" / place) == place
 
 
 def test_what_cannot_be_exported_is_one_line(tiny_run: Path, there: Path) -> None:
