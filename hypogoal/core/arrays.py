@@ -32,6 +32,7 @@ class Columns(Resumable):
         return len(first)
 
     @classmethod
+    @cache
     def names(cls) -> tuple[str, ...]:
         """Of the columns, in order."""
         return tuple(field.name for field in fields(cls))

@@ -354,7 +354,7 @@ def _manifest_of(out: Path) -> Manifest:
             name = domain if isinstance(domain, str) else domain.decode()
             config = {**json.loads(file.attrs["config"]), "domain": name}
             return Manifest(kind=DATA, config=config, seed=int(file.attrs["seed"]))
-    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+    except Exception as error:  # noqa: BLE001 - whatever h5py makes of a damaged file
         raise UserError(f"the data file is damaged ({error})", out, ANEW) from None
 
 

@@ -158,9 +158,8 @@ def restored(value: Any, saved: Any) -> Any:
     elif isinstance(value, deque):
         value.clear()
         value.extend(saved)
-    elif isinstance(value, list) and value and isinstance(value[0], Resumable | deque | np.random.Generator):
-        for item, saved_item in zip(value, saved, strict=True):
-            restored(item, saved_item)
+    elif isinstance(value, list) and len(value) == len(saved):
+        value[:] = map(restored, value, saved)
     elif isinstance(value, np.random.Generator):
         value.bit_generator.state = saved
     elif hasattr(value, "set_state"):

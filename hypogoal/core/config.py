@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
@@ -81,8 +82,8 @@ class Details:
 
     unit: str = ""
     source: str = ""
-    low: float | None = None
-    high: float | None = None
+    low: float = -inf
+    high: float = inf
     choices: Sequence[Any] | Mapping[Any, Any] = ()
     own: bool = False
 
@@ -90,9 +91,12 @@ class Details:
         """Whether the setting may have this value."""
         if self.choices:
             return value in self.choices or (self.own and ":" in value)
-        if self.low is not None and value < self.low:
-            return False
-        return self.high is None or value <= self.high
+        return not self.is_bounded or self.low <= value <= self.high
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether there is a lowest or a highest value."""
+        return self.low > -inf or self.high < inf
 
     def __str__(self) -> str:
         """The values allowed, in a few words; empty if all of the setting's type."""
@@ -101,10 +105,7 @@ class Details:
             if self.own:
                 choices.append(OWN)
             return "|".join(choices)
-        low = "" if self.low is None else self.low
-        high = "" if self.high is None else self.high
-        limits = f"{low} .. {high}".strip()
-        return limits if limits != ".." else ""
+        return f"{self.low} .. {self.high}" if self.is_bounded else ""
 
 
 def setting(default: Any, meaning: str, **details: Any) -> Any:
@@ -155,7 +156,7 @@ def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]
         raise UserError(f"the preset cannot be read ({error})", name, "Mend the file.") from None
     for key, table in tables.items():
         if key not in TABLES or not isinstance(table, dict):
-            do = f"{near(key, TABLES)}A preset has tables for {', '.join(TABLES)}."
+            do = f"A preset has tables for {', '.join(TABLES)}."
             raise UserError("no such table in a preset", f"{key} in {name}", do)
     return dict(tables.get(stage, {}))
 
@@ -193,26 +194,24 @@ def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str
     sources: dict[str, str] = {}
     for values, source in layers:
         sources |= dict.fromkeys(values, source)
-    classes = [*model.__mro__, *every.__mro__]
-    homes: dict[str, type] = {}
-    for home in classes:
-        homes = dict.fromkeys(inspect.get_annotations(home), home) | homes
-    rows = []
-    for name in sorted(every.model_fields, key=lambda name: classes.index(homes[name])):
-        field = every.model_fields[name]
-        details = _details(field)
-        row = {
-            "name": name,
-            "type": getattr(field.annotation, "__name__", str(field.annotation)),
-            "default": defaults[name],
-            "unit": details.unit,
-            "meaning": field.description or "",
-            "source": sources.get(name, details.source),
-            "allowed": str(details),
-            "part": (homes[name].__doc__ or "").partition(".")[0],
-        }
-        rows.append(row)
-    return rows
+    rows: dict[str, dict[str, Any]] = {}
+    for home in (*model.__mro__, *every.__mro__):
+        for name in inspect.get_annotations(home):
+            field = every.model_fields.get(name)
+            if field is None or name in rows:
+                continue
+            details = _details(field)
+            rows[name] = {
+                "name": name,
+                "type": getattr(field.annotation, "__name__", str(field.annotation)),
+                "default": defaults[name],
+                "unit": details.unit,
+                "meaning": field.description or "",
+                "source": sources.get(name, details.source),
+                "allowed": str(details),
+                "part": (home.__doc__ or "").partition(".")[0],
+            }
+    return [*rows.values()]
 
 
 def as_toml(stage: str, rows: Iterable[Values]) -> str:

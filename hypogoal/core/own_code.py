@@ -114,6 +114,8 @@ def message(error: BaseException) -> tuple[str, int]:
         return NO_MEMORY, 2
     if user_error := of_user(error):
         return str(user_error), 2
+    if isinstance(error, ModuleNotFoundError):
+        return f"the package {error.name} is needed. Install it: pip install {error.name}", 2
     if isinstance(error, OSError) and error.errno:
         where = f": {error.filename}" if error.filename else ""
         return f"{error.strerror}{where}. {REMEDIES.get(error.errno, '--debug shows more.')}", 2

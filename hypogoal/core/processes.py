@@ -111,14 +111,13 @@ def prepare(device: str = "auto") -> str:
     if device not in DEVICES:
         raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
     if device == "cuda" and not torch.cuda.is_available():
-        installed = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
-        raise UserError("torch finds no GPU", installed, "Use --device cpu, or see docs/cluster.md.")
+        raise UserError("torch finds no GPU", f"torch {torch.__version__}", "Use --device cpu, or see docs/cluster.md.")
     return "cuda" if device == "cuda" else "cpu"
 
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """torch as if nobody had changed its settings; afterwards they are the caller's again.
+    """torch with its own default type and device; afterwards they are the caller's again, and so are its threads.
 
     Most are of the whole process, so its threads take turns.
     """
@@ -129,8 +128,7 @@ def own_settings() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
         torch.set_default_device(None)
         try:
-            with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
-                yield
+            yield
         finally:
             torch.set_num_threads(threads)
             torch.set_flush_denormal(False)

@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-from hypogoal.core.errors import UserError
-
 LINE = "{desc}: {n_fmt}/{total_fmt} in {elapsed}, {remaining} left{postfix}"
 FIRST_SECONDS = 1.0  # nothing is said of what takes less
 REDRAW_SECONDS = 0.2  # in a terminal
@@ -66,12 +64,16 @@ class Progress:
 class MetricsLog:
     """``metrics.jsonl``: one JSON object per line; the file is not kept open.
 
-    With a folder ``tensorboard``, which may exist, TensorBoard gets the numbers too; without the extra a ``UserError``.
+    With a folder ``tensorboard``, which may exist, TensorBoard gets the numbers too, if it is installed.
     """
 
     def __init__(self, path: Path, tensorboard: Path | None = None):
         self._path = path
-        self._board = _board(tensorboard) if tensorboard else None
+        self._board: Any = None
+        if tensorboard:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._board = SummaryWriter(tensorboard)
         path.touch()
 
     def write(self, **values: Any) -> None:
@@ -98,13 +100,3 @@ class MetricsLog:
     def restore(self, snapshot: int) -> None:
         """Truncate the file to the length of a ``snapshot``."""
         os.truncate(self._path, snapshot)
-
-
-def _board(folder: Path) -> Any:
-    """A writer of TensorBoard's files, torch's; a ``UserError`` if TensorBoard is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        do = "Install it: pip install 'hypogoal[tensorboard]'."
-        raise UserError("TensorBoard is not installed", folder, do) from None
-    return SummaryWriter(folder)

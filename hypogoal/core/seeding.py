@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import zlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,20 +42,15 @@ def torch_generator(seed: int, *names: str | int) -> torch.Generator:
     return generator
 
 
-def global_state(device: torch.device) -> list[torch.Tensor]:
-    """The states of torch's global generators (CPU and a CUDA ``device``), for code that cannot be passed another."""
+@contextlib.contextmanager
+def drawing_from(generator: torch.Generator) -> Iterator[None]:
+    """What is drawn from torch's global generator comes from this one: modules cannot be passed any for their weights.
+
+    Afterwards the global one is as it was.
+    """
     import torch
 
-    states = [torch.get_rng_state()]
-    if device.type == "cuda":
-        states.append(torch.cuda.get_rng_state(device))
-    return states
-
-
-def restore_global(states: list[torch.Tensor], device: torch.device) -> None:
-    """Restore torch's global generators to a :func:`global_state`."""
-    import torch
-
-    torch.set_rng_state(states[0])
-    if device.type == "cuda":
-        torch.cuda.set_rng_state(states[1], device)
+    with torch.random.fork_rng(devices=[]):
+        torch.set_rng_state(generator.get_state())
+        yield
+        generator.set_state(torch.get_rng_state())

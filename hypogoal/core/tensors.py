@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -49,29 +48,19 @@ def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return found
 
 
-def load_into(module: M, weights: Mapping[str, Tensor], where: str, *, assign: bool = False) -> M:
-    """The module with these weights; a ``UserError`` if they do not fit it. ``assign``: in place of its own tensors."""
+def load_into(module: M, weights: Mapping[str, Tensor], where: str) -> M:
+    """The module with these weights; a ``UserError`` if they do not fit it."""
     try:
-        module.load_state_dict(weights, assign=assign)
+        module.load_state_dict(weights)
     except RuntimeError as error:
         raise UserError(f"the weights do not fit the network ({error})", where, AGAIN) from None
     return module
 
 
-def load_fitting(
-    make: Callable[[], M],
-    weights: Mapping[str, Tensor],
-    where: str,
-    *,
-    custom: bool = False,
-) -> M:
-    """The module that ``make`` builds, with these weights; a ``UserError`` if they do not fit it.
+def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: str) -> M:
+    """The module that ``make`` builds, with these weights; a ``UserError`` if they do not fit it."""
+    import torch
 
-    It is built without random numbers, which costs no time and no draws, unless it is ``custom``: the user's code.
-    """
-    from hypogoal.core.drawing import Undrawn
-
-    with contextlib.nullcontext() if custom else Undrawn():
+    with torch.random.fork_rng(devices=[]):  # the first weights, which are replaced
         module = make()
-    copies = {name: tensor.clone() for name, tensor in weights.items()}
-    return load_into(module, copies, where, assign=not custom)
+    return load_into(module, weights, where)

@@ -248,12 +248,11 @@ class Ensemble(nn.Module):
     ) -> Ensemble:
         """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit."""
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
-        own = not set(networks.names_in(network)) <= networks.NETWORKS.keys()
 
         def make() -> Ensemble:
             return cls(network, observation_shape, members, torch.Generator(), view)
 
-        return load_fitting(make, state, where, custom=own).eval()
+        return load_fitting(make, state, where).eval()
 
 
 def write_ensemble(

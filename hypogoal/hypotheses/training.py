@@ -117,14 +117,14 @@ class Training(Resumable):
         members = list(range(config.members))
         self.rounds = [[member] for member in members] if config.schedule == "sequential" else [members]
         self._begin(saved["number"] if saved else 0)
-        self._layers: list[Tensor] | None = None
+        self._layers: Tensor | None = None
         if saved:
             super().restore(saved)
             self._layers = saved["layers"]
 
     def snapshot(self) -> State:
         """All that the next steps depend on."""
-        return {**super().snapshot(), "layers": seeding.global_state(self.states.device)}
+        return {**super().snapshot(), "layers": torch.get_rng_state()}
 
     def steps(self) -> Iterator[tuple[int, Losses]]:
         """Take the steps that are left, then set thresholds; yields each step's number and losses.
@@ -168,7 +168,7 @@ class Training(Resumable):
         config, members, device = self.config, self.rounds[self.number], self.states.device
         torch.manual_seed(seeding.seed_for(self._round_seed, "layers"))
         if self._layers is not None:
-            seeding.restore_global(self._layers, device)
+            torch.set_rng_state(self._layers)
             self._layers = None
         earlier = self.ensemble.networks[: members[0]]
         taught = None if self.taught is None else self.taught[members].to(device)

@@ -19,9 +19,8 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
 from hypogoal.core.arrays import Columns
-from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import torch_generator
+from hypogoal.core.seeding import drawing_from, torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import Batch, DoubleDQN
@@ -151,7 +150,7 @@ class PaperLearner(Learner):
         self.members = []
         for option in range(self.options):
             shape, actions = self.engine.observation_shape, self.engine.n_actions
-            with DrawsFrom(torch_generator(seed, "option-weights", option)):
+            with drawing_from(torch_generator(seed, "option-weights", option)):
                 network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), config))
         self.windows = np.zeros((self.engine.count, config.recurrence), np.int64)  # of running executions
@@ -293,17 +292,19 @@ class PaperPolicies:
     """Greedy policies of saved options that have a network each (Spec D2, D8)."""
 
     def __init__(self, saved: SavedOptions):
-        self.saved, self.recurrence = saved, saved.config["recurrence"]
+        self.recurrence = saved.config["recurrence"]
         if not isinstance(self.recurrence, int):
             fault = "these options remember their executions in another way than this version's"
             raise UserError(fault, f"recurrence={self.recurrence}", "Train them again with --set recurrence=N.")
-        self.actions = saved.actions("0.values.2.bias", 1)
+        make = partial(PaperQNetwork, saved.shape, saved.actions("0.values.2.bias", 1))
+        self.networks = []
+        for option in range(saved.count):
+            network = load_fitting(make, below(f"{option}.", saved.weights), FILE)
+            self.networks.append(network.eval())
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
-        make = partial(PaperQNetwork, self.saved.shape, self.actions)
-        network = load_fitting(make, below(f"{option}.", self.saved.weights), FILE)
-        return _Execution(network.eval(), self.recurrence)
+        return _Execution(self.networks[option], self.recurrence)
 
 
 class _Execution:

@@ -14,12 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import torch_generator
+from hypogoal.core.seeding import drawing_from, torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.learners.double_dqn import Batch, DoubleDQN
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.observations import Observations, standard_of
@@ -80,7 +78,7 @@ class LightLearner(Learner):
     def network(self, config: LightConfig, seed: int) -> LightQNetwork:
         """One with fresh weights."""
         engine = self.engine
-        with DrawsFrom(torch_generator(seed, "option-weights")):
+        with drawing_from(torch_generator(seed, "option-weights")):
             shape, embedding = engine.observation_shape, config.embedding
             network = LightQNetwork(
                 shape,
@@ -238,12 +236,7 @@ class LightPolicies:
             standard,
             embedding,
         )
-        self.network = load_fitting(
-            make,
-            weights,
-            FILE,
-            custom=embedding not in (AUTO, *NETWORKS),
-        )
+        self.network = load_fitting(make, weights, FILE)
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""

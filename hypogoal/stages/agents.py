@@ -37,9 +37,9 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
     config = call.settings(source.config["domain"], held)
     for name, value in held.items():
         wanted = getattr(config, name, value)  # a part's, where the network has that part
-        if practice and wanted != value:
+        if wanted != value:
             fault = f"these options were trained with {name}={value}, not {wanted}"
-            raise UserError(fault, practice.path, f"Give --set {name}={value}, or leave it out.")
+            raise UserError(fault, None, f"Give --set {name}={value}, or leave it out.")
     return Setup(
         load_domain(source.config["domain"]),
         source.config,

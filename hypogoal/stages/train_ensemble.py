@@ -70,7 +70,7 @@ def train_ensemble(
         texts = [log_of(draft, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
         (draft.files / LOG).write_text("".join(texts), encoding="utf-8")
     then = "" if installed_domain(dataset.domain) else "evaluate {run}"  # recorded states have no world to practise in
-    return Done(_outcome(accuracies, call.out), then=then)
+    return Done(_outcome(accuracies), then=then)
 
 
 def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str, Any]:
@@ -86,13 +86,11 @@ def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str,
     }
 
 
-def _outcome(accuracies: Sequence[dict[str, float]], out: Path) -> list[str]:
-    """Best, mean and worst member, means over the sub-goals that can be judged; without any the last losses."""
-    from hypogoal.look import numbers_of
-
+def _outcome(accuracies: Sequence[dict[str, float]]) -> list[str]:
+    """Best, mean and worst member, means over the sub-goals that can be judged."""
     means = {}
     for name, title in TITLES.items():
         values = [each[name] for each in accuracies if not isnan(each[name])]
         if values:
             means[title] = fmean(values)
-    return outcome_of(means or numbers_of(out))
+    return outcome_of(means)

@@ -131,15 +131,11 @@ def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress:
     ``infos/option`` is the option that led to each state, -1 at the start.
     """
     from gymnasium import spaces
+    from minari import __version__
+    from minari.dataset.minari_storage import MinariStorage
 
     from hypogoal.core.processes import prepare
     from hypogoal.meta.episodes import agent_of, play_episodes
-
-    try:
-        from minari import __version__
-        from minari.dataset.minari_storage import MinariStorage
-    except ImportError:
-        raise UserError("episodes are written by minari", out, "Install it: pip install 'hypogoal[minari]'.") from None
 
     prepare()
     loop = agent_of(meta, seed)

@@ -150,7 +150,7 @@ def test_settings_are_described_with_their_parts() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[train_ensemble]\nsteps = 3", "no such table in a preset: train_ensemble in .*Did you mean 'train-ensemble'"),
+        ("[train_ensemble]\nsteps = 3", "no such table in a preset: train_ensemble in "),
         ("[trane]\nsteps = 3", "A preset has tables for collect, "),
         ("steps = 7\n[train-ensemble]\nmembers = 3", "no such table in a preset: steps in "),
         ("collect = 3", "no such table in a preset: collect in "),
@@ -199,7 +199,7 @@ def test_the_paper_preset_has_the_papers_tables() -> None:
     assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
     assert (meta.meta_network, meta.head) == ("paper", "gaussian")
     run: Any = resolve(config_class_of("run"), preset("paper", "run"), stage="run")
-    assert not run.pretrain and run.paired
+    assert not run.pretrain
     assert len(set(run.layout_seeds)) == len(set(run.seeds)) == 10, "ten agents, each with an ensemble of its own"
     assert settings_of("collect", "doorkey", "paper").door_label == "in-front"
 

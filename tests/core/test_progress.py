@@ -42,7 +42,7 @@ def test_a_result_without_a_whole_episode_has_no_success() -> None:
     assert outcome_of({"steps": 5, "episodes": 0, "success": math.nan}) == ["steps 5, episodes 0"]
 
 
-def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path) -> None:
     """Each number at its step, no text; the log's own lines are the same without it."""
     loader = pytest.importorskip("tensorboard.backend.event_processing.event_file_loader")
     plain, log = MetricsLog(tmp_path / "plain.jsonl"), MetricsLog(tmp_path / "log.jsonl", tmp_path / "board")
@@ -56,10 +56,6 @@ def test_tensorboard_gets_the_numbers_of_a_log(tmp_path: Path, monkeypatch: pyte
     for event in loader.EventFileLoader(str(file)).Load():
         found += [(event.step, value.tag, value.tensor.float_val[0]) for value in event.summary.value]
     assert found == [(10, "loss", 0.5), (20, "loss", 0.25), (20, "episodes", 3.0)]
-
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(UserError, match=r"pip install 'hypogoal\[tensorboard\]'"):
-        MetricsLog(tmp_path / "log.jsonl", tmp_path / "board")
 
 
 def test_an_error_is_one_line_of_signs_that_can_be_printed() -> None:

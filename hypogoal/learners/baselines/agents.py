@@ -17,7 +17,7 @@ from torch import Tensor
 from hypogoal.core.checkpoints import Checkpoints, State, restored, snapshot_of
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for
+from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import CELL, FEATURES, NETWORKS
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
@@ -235,7 +235,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> State:
         "values": {name: getattr(agent, name) for name in CHANGING if hasattr(agent, name)},
         "updated": _updated(agent),
         "env": env.snapshot(),
-        "generators": _generators(agent.device),
+        "generators": _generators(),
     }
     if isinstance(agent, ExploringDQN):
         buffer: Any = agent.replay_buffer
@@ -253,7 +253,7 @@ def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, A
         setattr(agent, name, value)
     agent.logger.name_to_value.update(snapshot["updated"])
     env.restore(snapshot["env"])
-    _set_generators(snapshot["generators"], agent.device)
+    _set_generators(snapshot["generators"])
     if isinstance(agent, ExploringDQN):
         buffer: Any = agent.replay_buffer
         replay = snapshot["replay"]
@@ -274,14 +274,14 @@ def _updated(agent: BaseAlgorithm) -> dict[str, float]:
     return {name: float(value) for name, value in logged.items() if name.startswith(UPDATED)}
 
 
-def _generators(device: torch.device) -> dict[str, Any]:
+def _generators() -> dict[str, Any]:
     """The states of all global generators."""
     numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002
-    return {"torch": global_state(device), "numpy": numpy_state, "python": random.getstate()}
+    return {"torch": torch.get_rng_state(), "numpy": numpy_state, "python": random.getstate()}
 
 
-def _set_generators(states: Mapping[str, Any], device: torch.device) -> None:
-    restore_global(states["torch"], device)
+def _set_generators(states: Mapping[str, Any]) -> None:
+    torch.set_rng_state(states["torch"])
     np.random.set_state(states["numpy"])  # noqa: NPY002
     version, numbers, gauss = states["python"]
     random.setstate((version, tuple(numbers), gauss))
@@ -290,12 +290,11 @@ def _set_generators(states: Mapping[str, Any], device: torch.device) -> None:
 @contextlib.contextmanager
 def own_randomness() -> Iterator[None]:
     """Lend stable-baselines3 the global generators it insists on, and put them back afterwards."""
-    device = torch.device("cpu")
-    before = _generators(device)
+    before = _generators()
     try:
         yield
     finally:
-        _set_generators(before, device)
+        _set_generators(before)
 
 
 def weights(agent: BaseAlgorithm) -> dict[str, Tensor]:
