@@ -1,37 +1,25 @@
 """How many seconds of play executions of options take on ladders."""
 
-import pandas as pd
-
-from hypogoal.evaluation.house import over, pairs, per_run
-from hypogoal.evaluation.page import Drawn, displayed, pairs_displayed, spread
+from hypogoal.evaluation.house import per_run
+from hypogoal.evaluation.page import Drawn
 from hypogoal.evaluation.plots import plot, styled
 
 TITLE = "How long options take"
 STEPS = 15  # in a second: 60 frames, four a step
+BY = ["method"]
+PAIRED = ["seconds"]
 
 
-def tables(results):
+def runs(results):
     """Of each run the mean member's seconds, from the steps that question 'distance' has put into the table."""
     numbers = results.numbers[results.numbers["ladder"] != ""]
-    runs = per_run(numbers, "duration", name="seconds")
-    runs = runs.assign(value=runs["value"] / STEPS)
-    return {"durations": over(runs, ["method"]), "durations-pairs": pairs(runs)}
+    found = per_run(numbers, "duration", name="seconds")
+    return found.assign(value=found["value"] / STEPS)
 
 
-def context(results):
-    """For the template: a table, and methods seed by seed."""
-    if not results.facts["ladders"]:
-        return None
-    made = tables(results)
-    table = displayed(made["durations"], {"method": "method"}, {"seconds": ("seconds", spread(1))})
-    return {"table": table, "printed": table, "pairs": pairs_displayed(made["durations-pairs"], {})}
-
-
-def figures(results):
+def figures(context):
     """A bar per method."""
-    table: pd.DataFrame = tables(results)["durations"]
-    if table.empty:
-        return
+    table = context["table"]
     with styled():
         figure, axes = plot(2)
         axes.barh(table["method"], table["mean"])

@@ -81,7 +81,7 @@ class Run:
 def read_run(artefact: Artefact) -> Run:
     """The episodes and the layout of one trained agent."""
     episodes = Episodes.read(artefact.path / "episodes.csv")
-    return Run(artefact.seed, artefact.config, episodes, read_layout(artefact.path / "layout.json"))
+    return Run(artefact.seed, artefact.config, episodes, read_layout(artefact.path / "layout.json").model_dump())
 
 
 def collect(run: Path, path: Path) -> None:
@@ -138,7 +138,7 @@ def training_numbers(run: Run) -> Iterator[tuple[str, str, float]]:
     reached = numbers["steps_to_95"]
     yield "agent", "steps", float(budget_of(run.config))
     yield "agent", "shortest_path", float(shortest)
-    yield "agent", "steps_to_95", math.inf if reached is None else float(reached)
+    yield "agent", "steps_to_95", math.inf if math.isnan(reached) else reached
     for name in ("success", "length_over_shortest", "near"):
         yield "agent", name, float(numbers[name] or 0.0)
     yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
@@ -162,7 +162,7 @@ def _frozen_numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, fl
 
 def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: float | None) -> float:
     """The lowest share solved of any ``LAST`` consecutive episodes that end after step ``since``; NaN if never."""
-    if since is None:
+    if since is None or math.isnan(since):
         return math.nan
     sums = np.concatenate([[0], np.cumsum(succeeded.astype(np.int64))])
     recent = (sums[LAST:] - sums[:-LAST]) / LAST

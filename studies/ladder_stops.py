@@ -19,10 +19,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from hypogoal.domains.montezuma.domain import DOMAIN
-from hypogoal.evaluation.distance import BEGAN_INSIDE, HIT, counted, fates, rooms_shown, stops_over_rooms
+from hypogoal.evaluation.distance import BEGAN_INSIDE, HIT, last_executions, stops_over_rooms
 from hypogoal.options.tables import Executions
 from studies.cells import table
 
@@ -41,9 +42,9 @@ def gather(executions: Path, path: Path) -> None:
         for kept in sorted(executions.iterdir()):
             if (match := NAME.fullmatch(kept.name)) and match[1] in METHODS:
                 every = Executions.read(kept)
-                members = [every.of(option) for option in np.unique(every.option)]
-                best = min(range(len(members)), key=lambda member: counted(members[member]).mean())
-                places = np.column_stack([members[best].positions(), fates(members[best])]).tolist()
+                last = last_executions(every)
+                best = last.groupby("option")["counted"].mean().idxmin()
+                places = last.loc[last["option"] == best, ["room", "x", "y", "fate"]].to_numpy().tolist()
                 for place, count in sorted(Counter(map(tuple, places)).items()):
                     writer.writerow([match[1], match[2], best, *place, count])
 
@@ -93,9 +94,12 @@ def draw(path: Path, seed: int, picture: Path) -> None:
     """One seed's stops over the rooms, as in the paper."""
     stops = read(path)
     shown = [(title, stops[method, seed]) for method, title in METHODS.items() if (method, seed) in stops]
-    rooms = rooms_shown([places[:, 0] for _, places in shown], DOMAIN.rooms_of(LADDER))
-    columns = [(title, places[:, 0], DOMAIN.pixel(places[:, :3]), places[:, 3]) for title, places in shown]
-    stops_over_rooms([(room, DOMAIN.picture(room)) for room in rooms], columns).savefig(picture, dpi=100)
+    options = {}
+    for title, places in shown:
+        options[title] = pd.DataFrame(places, columns=["room", "x", "y", "fate"])
+        options[title][["column", "row"]] = DOMAIN.pixel(places[:, :3])
+    rooms = {int(room) for _, places in shown for room in places[:, 0]}
+    stops_over_rooms({str(room): DOMAIN.picture(room) for room in rooms}, options).savefig(picture, dpi=100)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from hypogoal.evaluation.run import find_artefacts
 from hypogoal.look import describe, faults, lines, outcome, stale
 
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
-COMPARED = {"differences.csv", "agents.csv", "hypotheses.csv", "rooms.csv", "distance.csv"}
+COMPARED = {"differences.csv", "curves.csv", "hypotheses.csv", "rooms.csv", "distance.csv"}
 MAY = {"executions.csv", "exploits.csv", *COMPARED}, ("figures/", "videos/", "tables/", "before-", "mended-")
 
 

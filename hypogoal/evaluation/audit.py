@@ -18,7 +18,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.domains.base import Engine
-from hypogoal.evaluation.exploits import COLUMNS, TABLE, option_numbers
+from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.films import episode_gif
 from hypogoal.evaluation.selection import states_met
 from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
@@ -29,7 +29,7 @@ from hypogoal.meta.setup import Setup
 from hypogoal.observations import PICTURE, Observations, Standard, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
-from hypogoal.options.tables import read_table
+from hypogoal.options.tables import Exploits
 from hypogoal.options.termination import Terminations, rule_of
 
 POLICIES = ("before", "mended")
@@ -131,10 +131,10 @@ def findings(loop: OptionLoop, option: int, sub_goals: Sequence[str], folder: Pa
 
     Of each of the most frequent kinds of false positives a film is put into ``folder``, of pictures.
     """
-    table = read_table(folder / TABLE, COLUMNS)
+    table = Exploits.read(folder / Exploits.FILE)
     executions = list(loop.recorder.executions[option])
-    of_policy = table["option"] == option
-    positive, near = table["reached"][of_policy] > 0, table["near"][of_policy] > 0
+    of_policy = table.option == option
+    positive, near = table.reached[of_policy], table.near[of_policy]
     fooled = [executions[row] for row in np.flatnonzero(positive & ~near)]
     kinds = []
     for number, alike in enumerate(kinds_of(loop.engine, fooled)):
@@ -149,6 +149,7 @@ def findings(loop: OptionLoop, option: int, sub_goals: Sequence[str], folder: Pa
         kinds.append(of_kind | {"film": film if drawn else None})
     return {
         **option_numbers(table, option),
+        "executions": int(of_policy.sum()),
         "fooled": len(fooled),
         "there": int((positive & near).sum()),
         "positive_at_start": sum(row.inside_at_start for row in executions),

@@ -14,17 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.stats import spearmanr
 
+from hypogoal.core.arrays import Bools, Doubles, Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.curves import NEAR
-from hypogoal.evaluation.house import DIGITS, above, at_least, mean_of, over, per_run, tidy
+from hypogoal.evaluation import house
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.names import UNIFORM
-from hypogoal.evaluation.page import Results, displayed, spread
+from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.run import takes
 
 if TYPE_CHECKING:
@@ -37,11 +35,11 @@ MEMORYLESS = ("light", "planned")  # option policies that can be asked in any st
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
 FROZEN = "frozen"  # the scope of what is played after training
-SEVERAL = 5  # runs from which on a rank correlation of a few members is shown
 TITLE = "What choosing is worth"
+BY = ["method", "chooser"]
 
 
-def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.float64]:
+def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
     Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
@@ -50,37 +48,38 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
     """
     from hypogoal.options.planned import distances, places_of
 
-    plan = loop.engine.plan()
+    engine, timeout = loop.engine, loop.config.option_timeout
+    plan = engine.plan()
     assert plan is not None
-    place = places_of(plan, loop.engine)
-    truth = loop.engine.labels(plan.ids)
+    place = places_of(plan, engine)
+    truth = engine.labels(plan.ids)
     away = distances(truth, place[plan.following], plan.final)
-    column = np.full(loop.engine.n_actions, -1, dtype=np.int64)
+    column = np.full(engine.n_actions, -1)
     column[plan.actions] = np.arange(len(plan.actions))
-    lost = plan.final & ~plan.solved
+    good = truth & ~(plan.final & ~plan.solved)[:, None]
     distinct, counts = np.unique(states, return_counts=True)
     offered = ~loop.terminations.of(distinct)
     qualities = np.full(len(goals), np.nan)
-    for option, goal in enumerate(goals.tolist()):
+    for option, goal in enumerate(goals):
         steps = away[place[distinct], goal]
-        begins = offered[:, option] & (steps > 0) & (steps <= loop.config.option_timeout)
+        begins = offered[:, option] & (steps > 0) & (steps <= timeout)
         if not begins.any():
             continue
-        ids, going = distinct[begins], np.arange(begins.sum())
-        for age in range(loop.config.option_timeout):
+        ids = distinct[begins]
+        going = np.arange(len(ids))
+        for age in range(timeout):
             options = np.full(len(going), option)
             actions = loop.learner.act(ids[going], options, np.full(len(going), age), explore=False)
             ids[going] = plan.following[place[ids[going]], column[actions]]
-            over = loop.terminations.of_running(ids[going], options) | plan.final[place[ids[going]]]
-            going = going[~over]
+            ended = loop.terminations.of_running(ids[going], options) | plan.final[place[ids[going]]]
+            going = going[~ended]
             if not len(going):
                 break
-        rows = place[ids]
-        qualities[option] = np.average(truth[rows, goal] & ~lost[rows], weights=counts[begins])
+        qualities[option] = np.average(good[place[ids], goal], weights=counts[begins])
     return qualities
 
 
-def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
+def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
     ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
@@ -89,57 +88,55 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
     whose qualities differ by that, how often the better of those taken (.5 at random); ``score``: (quality taken - mean
     quality) / (best - mean), over decisions (0 at random).
     """
-    options = np.arange(len(quality))
-    of_goal = choices.offered & (options // members == (choices.options // members)[:, None])
-    several = of_goal.sum(axis=1) > 1
+    goals = np.arange(len(quality)) // members
+    of_goal = choices.offered & (goals == goals[choices.options][:, None])
+    counts = of_goal.sum(axis=1)
+    several = counts > 1
     taken, among = choices.options[several], of_goal[several]
-    expected = (among / among.sum(axis=1, keepdims=True)).sum(axis=0).round(DIGITS)  # in any order of decisions
+    shares = among / counts[several][:, None]
+    expected = shares.sum(axis=0).round(house.DIGITS)  # in any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
-    preference = np.where(at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
+    preference = np.where(house.at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
     return {
         "preference": preference,
-        "within_rho": _within_rho(quality, preference, members),
-        "pair": _better_of_two(quality, taken, among, members),
+        "within_rho": _within_rho(quality, preference, goals),
+        "pair": _better_of_two(quality, taken, among, goals),
         "score": _score(quality, taken, among),
     }
 
 
-def _within_rho(quality: NDArray[np.float64], preference: NDArray[np.float64], members: int) -> float:
+def _within_rho(quality: Doubles, preference: Doubles, goals: Ints) -> float:
+    both = pd.DataFrame({"quality": quality, "preference": preference}).dropna()
     rhos = []
-    for start in range(0, len(quality), members):  # of each sub-goal
-        alike = slice(start, start + members)
-        is_known = ~np.isnan(quality[alike]) & ~np.isnan(preference[alike])
-        good, preferred = quality[alike][is_known], preference[alike][is_known]
-        if len(good) > 1 and at_least(np.ptp(good), DIFFERENCE) and np.ptp(preferred) > 0:
-            rhos.append(spearmanr(good, preferred).statistic)
-    return mean_of(rhos)
+    for _, alike in both.groupby(goals[both.index]):
+        differ = house.at_least(np.ptp(alike["quality"]), DIFFERENCE)
+        if differ and alike["preference"].nunique() > 1:
+            rhos.append(alike["quality"].corr(alike["preference"], method="spearman"))
+    return pd.Series(rhos, dtype=float).mean()
 
 
-def _better_of_two(
-    quality: NDArray[np.float64], taken: NDArray[np.int64], among: NDArray[np.bool_], members: int
-) -> float:
-    better, worse = 0, 0
-    for start in range(0, len(quality), members):
-        for option, other in combinations(range(start, start + members), 2):
-            if not at_least(abs(quality[option] - quality[other]), DIFFERENCE):
-                continue
-            good, bad = (option, other) if quality[option] > quality[other] else (other, option)
-            both = among[:, option] & among[:, other]
-            better += int((taken[both] == good).sum())
-            worse += int((taken[both] == bad).sum())
-    return better / (better + worse) if better + worse else math.nan
+def _better_of_two(quality: Doubles, taken: Ints, among: Bools, goals: Ints) -> float:
+    better, both = 0, 0
+    for pair in combinations(range(len(quality)), 2):
+        bad, good = sorted(pair, key=lambda option: quality[option])
+        if goals[bad] != goals[good] or not house.at_least(quality[good] - quality[bad], DIFFERENCE):
+            continue
+        of_both = taken[among[:, good] & among[:, bad]]
+        better += (of_both == good).sum()
+        both += np.isin(of_both, pair).sum()
+    return better / both if both else math.nan
 
 
-def _score(quality: NDArray[np.float64], taken: NDArray[np.int64], among: NDArray[np.bool_]) -> float:
-    values = np.where(among & ~np.isnan(quality), quality, np.nan)
-    is_compared = (~np.isnan(values)).sum(axis=1) > 1
-    is_compared[is_compared] = ~np.isnan(quality[taken[is_compared]])
-    if not is_compared.any():
+def _score(quality: Doubles, taken: Ints, among: Bools) -> float:
+    judged = among & ~np.isnan(quality)
+    compared = (judged.sum(axis=1) > 1) & ~np.isnan(quality[taken])
+    if not compared.any():
         return math.nan
-    average = np.nanmean(values[is_compared], axis=1)
-    gain = float((np.nanmax(values[is_compared], axis=1) - average).sum())
-    gained = float((quality[taken[is_compared]] - average).sum())
-    return gained / gain if above(gain, 0.0) else math.nan
+    values = np.where(judged, quality, np.nan)[compared]
+    average = np.nanmean(values, axis=1)
+    gain = (np.nanmax(values, axis=1) - average).sum()
+    gained = (quality[taken[compared]] - average).sum()
+    return gained / gain if house.above(gain, 0.0) else math.nan
 
 
 def rows(work: Work) -> Iterator[pd.DataFrame]:
@@ -148,91 +145,69 @@ def rows(work: Work) -> Iterator[pd.DataFrame]:
     The agent's numbers, those of uniform-random choice, and every member's.
     """
     for artefact in work.contents.agents:
-        played = play_agent(artefact) if _is_playable(artefact) else None
+        played = play_agent(artefact)
         if played is None:
             continue
         place = {**work.place(artefact), "scope": FROZEN}
         agent, uniform, members = played
-        yield tidy(agent, **place)
-        yield tidy(uniform, **{**place, "method": UNIFORM})
-        for sub_goal, of_goal in members.groupby("sub_goal", sort=False):
-            columns = of_goal[["member", "quality", "conditional_preference"]]
-            yield columns.melt("member", var_name="quantity").assign(**place, sub_goal=sub_goal)
+        yield house.tidy(agent, **place)
+        yield house.tidy(uniform, **(place | {"method": UNIFORM}))
+        yield members.melt(["sub_goal", "member"], var_name="quantity").assign(**place)
 
 
-def _is_playable(artefact: Artefact) -> bool:
+def is_playable(artefact: Artefact) -> bool:
+    """Whether it chose to learn among options that can be asked in any state, of one layout of a known domain."""
     config = artefact.config
-    learned = artefact.kind == "meta" and takes(artefact) and config["chooser"] != "random"
-    playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest.files
+    if artefact.kind != "meta" or not takes(artefact) or config["chooser"] == "random":
+        return False
     # Of many layouts the states are too many to say what follows in each.
-    return learned and playable and not config.get("layouts")
+    if config["network"] not in MEMORYLESS or config.get("layouts"):
+        return False
+    sub_goals = load_domain(config["domain"]).sub_goals
+    return set(config["sub_goals"]) <= set(sub_goals) and "options.safetensors" in artefact.manifest.files
 
 
 def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], pd.DataFrame] | None:
     """A trained agent played on, frozen, and uniform-random choice among its own options.
 
     Returns ``OF_PLAY`` and ``OF_CHOICE`` of both, and a row per member: sub_goal, member, quality and
-    conditional_preference. None where the engine does not know what each action leads to, or the sub-goals are not the
-    domain's.
+    conditional_preference. None where it is not playable, or the engine does not know what each action leads to.
     """
     from hypogoal.evaluation.frozen import ENVIRONMENTS, play  # with PyTorch, which a report does not need
     from hypogoal.meta.episodes import agent_of
     from hypogoal.options.choosers import RandomChooser
 
     config, seed = artefact.config, artefact.seed
-    sub_goals = load_domain(config["domain"]).sub_goals
-    if not set(config["sub_goals"]) <= set(sub_goals):
-        return None
-    if agent_of(artefact, seed).engine.plan() is None:  # one game, since many take long to begin
+    # one game first, since many take long to begin
+    if not is_playable(artefact) or agent_of(artefact, seed).engine.plan() is None:
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
-    members = config["members"]
-    goals = np.repeat([sub_goals.index(goal) for goal in config["sub_goals"]], members)
+    sub_goals, members = config["sub_goals"], config["members"]
+    table = pd.MultiIndex.from_product([sub_goals, range(members)], names=["sub_goal", "member"]).to_frame(index=False)
+    in_domain = load_domain(config["domain"]).sub_goals
+    goals = table["sub_goal"].map(in_domain.index).to_numpy()
     uniform = RandomChooser(rng_for(seed, "uniform-choice"))
     of_both = [play(loop, chooser) for chooser in (loop.chooser, uniform)]
     quality = qualities(loop, goals, of_both[0].choices.states)  # where the agent itself decides
     numbers = []
     for episodes in of_both:
         scores = episodes.scores(loop.engine.shortest_path()) | {"length": episodes.length}
-        played = {name: mean_of(scores[name].ravel()) for name in OF_PLAY}
-        numbers.append(played | judge(episodes.choices, quality, members))
-    preference = numbers[0].pop("preference")
-    del numbers[1]["preference"]
-    of_members = pd.DataFrame(
-        {
-            "sub_goal": np.repeat(config["sub_goals"], members),
-            "member": np.tile(np.arange(members), len(config["sub_goals"])),
-            "quality": quality,
-            "conditional_preference": preference,
-        }
+        means = {name: scores[name].mean() for name in OF_PLAY}
+        numbers.append(means | judge(episodes.choices, quality, members))
+    preference, _ = [of_one.pop("preference") for of_one in numbers]
+    return numbers[0], numbers[1], table.assign(quality=quality, conditional_preference=preference)
+
+
+def runs(results: Results) -> pd.DataFrame:
+    """Each agent (``chooser`` its own), and uniform-random choice among its own options."""
+    return with_choosers(house.per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN))
+
+
+def with_choosers(runs: pd.DataFrame) -> pd.DataFrame:
+    """The same with a column ``chooser``; the method of uniform-random choice is the agent whose options it has."""
+    uniform = runs["method"] == UNIFORM
+    agents = runs[~uniform].drop_duplicates("artefact").set_index("artefact")["method"]
+    return runs.assign(
+        chooser=runs["method"].where(uniform, "the agent's"),
+        method=runs["artefact"].map(agents),
     )
-    return numbers[0], numbers[1], of_members
-
-
-def tables(results: Results) -> dict[str, pd.DataFrame]:
-    """Over runs each agent (``chooser`` its own), and uniform-random choice among its own options."""
-    numbers = results.of(scope=FROZEN, sub_goal="")
-    agents = numbers[numbers["method"] != UNIFORM].drop_duplicates("artefact").set_index("artefact")["method"]
-    runs = pd.concat([per_run(numbers, name, FROZEN) for name in (*OF_PLAY, *OF_CHOICE)])
-    chooser = runs["method"].where(runs["method"] == UNIFORM, "the agent's")
-    runs = runs.assign(chooser=chooser, method=runs["artefact"].map(agents))
-    return {"choosing": over(runs, ["method", "chooser"])}
-
-
-def context(results: Results) -> dict[str, Any] | None:
-    """For the template: each agent, and below it uniform-random choice among its own options."""
-    if results.of(scope=FROZEN).empty:
-        return None
-    table = tables(results)["choosing"]
-    columns = {
-        "solved": ("success", spread(2)),
-        f"within {NEAR} shortest paths": ("near", spread(2)),
-        "steps": ("length", spread(1)),
-        "better of two taken": ("pair", spread(2)),
-        "quality gained": ("score", spread(2)),
-        "runs": ("success", lambda row: str(row["n"])),
-    }
-    if table["n"].max() >= SEVERAL:
-        columns["within-rho"] = ("within_rho", spread(2))
-    shown = displayed(table, {"method": "agent", "chooser": "choice"}, columns)
-    return {"table": shown, "printed": shown[["solved", "runs"]], "has_rho": "within-rho" in shown}

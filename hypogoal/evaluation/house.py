@@ -5,38 +5,39 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from pydantic_core import to_json
 from scipy.special import stdtrit
 from scipy.stats import binomtest, bootstrap, trim_mean
 
 from hypogoal.core.errors import UserError
 
 EVALUATE_AGAIN = "Evaluate the run again, with --force."
-TEXTS = ("method", "sub_goal", "scope", "ladder", "artefact")  # columns, empty where they do not apply
-WHOLE = ("member", "N", "layout", "seed", "step")  # columns of whole numbers, missing where they do not apply
-COLUMNS = (
-    "quantity",
-    "value",
-    "method",
-    "sub_goal",
-    "member",
-    "scope",
-    "N",
-    "ladder",
-    "layout",
-    "seed",
-    "step",
-    "artefact",
-)
-RUN = ["method", "artefact", "layout", "seed", "sub_goal", "ladder", "N"]  # tells one run's numbers from another's
+WHOLE: Final = "Int64"  # missing where it does not apply
+TYPES = {  # of the table's columns; a text is empty where it does not apply
+    "quantity": "str",
+    "value": "float",
+    "method": "str",
+    "sub_goal": "str",
+    "member": WHOLE,
+    "scope": "str",
+    "N": WHOLE,
+    "ladder": "str",
+    "layout": WHOLE,
+    "seed": WHOLE,
+    "step": WHOLE,
+    "artefact": "str",
+}
+TEXTS = [name for name, kind in TYPES.items() if kind == "str"]
+NUMBERS = [name for name, kind in TYPES.items() if kind != "str"]
 SHARED = ["layout", "ladder", "sub_goal", "seed"]  # of two runs that are a pair
+RUN = ["method", "artefact", "N", *SHARED]  # tells one run's numbers from another's
 MEMBERS = {"best": "max", "mean": "mean", "worst": "min"}  # how the values of members become one
 LOWER_IS_BETTER = ("length", "solved_length", "distance")
 DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
@@ -44,48 +45,57 @@ ROUNDING = 10.0**-DIGITS
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
 BOOTSTRAP_FROM = 8  # values: of 2 a bootstrap would hold in 49 % of cases, of 5 in 85 %
-STATISTICS = ("mean", "standard_error", "standard_deviation", "iqm", "low", "high", "interval_over", "n")
-STUDENT, BOOTSTRAP, NOTHING = "Student's t of the mean", "bootstrap of the interquartile mean", "no interval"
+# Spec F5: the mean of the middle half: a quarter of the values, rounded down, is cut off at either end.
+interquartile_mean = partial(trim_mean, proportiontocut=0.25)
 
 
 @cache
-def units() -> dict[str, str]:
-    """The unit of each quantity."""
+def is_share(quantity: str) -> bool:
+    """Whether it lies within 0 and 1."""
     text = resources.files("hypogoal.evaluation").joinpath("quantities.toml").read_text(encoding="utf-8")
-    return {name: unit for name, (unit, _) in tomllib.loads(text).items()}
+    unit, _ = tomllib.loads(text).get(quantity, ("", ""))
+    return unit == "fraction"
 
 
 def tidy(numbers: Mapping[str, float | None], **place: Any) -> pd.DataFrame:
-    """A row for each number, all of one place (fields of ``COLUMNS``)."""
-    rows = pd.DataFrame({"quantity": list(numbers), "value": list(numbers.values())})
+    """A row for each number, all of one place (columns of the table)."""
+    rows = pd.DataFrame(numbers.items(), columns=["quantity", "value"])
     return rows.assign(**place)
 
 
-def tidy_members(columns: Mapping[str, NDArray[Any]], **place: Any) -> pd.DataFrame:
+def tidy_members(columns: Any, **place: Any) -> pd.DataFrame:
     """A row for each of K members' value of each column, (K,)."""
     members = pd.DataFrame(columns).rename_axis("member").reset_index()
     return members.melt("member", var_name="quantity").assign(**place)
 
 
+def of_options(columns: Any, config: Mapping[str, Any], **place: Any) -> pd.DataFrame:
+    """A row for each option's value of each column, (G*K,), by its sub-goal and member, of an artefact's ``config``."""
+    goals, members = config["sub_goals"], range(config["members"])
+    options = pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])
+    table = pd.DataFrame(columns).set_axis(options).reset_index()
+    return table.melt(["sub_goal", "member"], var_name="quantity").assign(**place)
+
+
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """Rows of several parts, with every column; a number that is not defined has no row."""
-    filled = [part for part in parts if len(part)]
-    rows = pd.concat(filled) if filled else pd.DataFrame()
-    return typed(rows.reindex(columns=list(COLUMNS)))
+    """The table of rows of several parts; a number that is not defined has no row."""
+    return typed(pd.concat([pd.DataFrame(columns=[*TYPES]), *parts]))
 
 
 def typed(rows: pd.DataFrame) -> pd.DataFrame:
-    """The same rows, their columns of the types that all others here expect."""
-    for name in TEXTS:
-        rows[name] = rows[name].astype(object).fillna("")
-    rows = rows.astype({"value": float, **dict.fromkeys(TEXTS, "str"), **dict.fromkeys(WHOLE, "Int64")})
+    """The same rows, with the columns and types that all others here expect."""
+    rows = rows.reindex(columns=[*TYPES]).astype(object)
+    rows[TEXTS] = rows[TEXTS].fillna("")
+    rows = rows.astype(TYPES)
     return rows[np.isfinite(rows["value"])].reset_index(drop=True)
 
 
 def read_numbers(path: Path) -> pd.DataFrame:
-    """``numbers.csv``, whichever columns a later version has added; a ``UserError`` where it is missing or damaged."""
+    """``numbers.csv`` of this version, or of one with other columns; a ``UserError`` where it is missing or damaged."""
+    nothing = dict.fromkeys(NUMBERS, "")
     try:
-        return typed(pd.read_csv(path, keep_default_na=False, na_values=dict.fromkeys(("value", *WHOLE), "")))
+        rows = pd.read_csv(path, keep_default_na=False, na_values=nothing)
+        return typed(rows.dropna(subset=["quantity", "value"]))
     except OSError as error:
         raise UserError(f"the table of numbers cannot be read ({error.strerror})", path, EVALUATE_AGAIN) from None
     except (ValueError, KeyError, TypeError) as error:
@@ -93,87 +103,89 @@ def read_numbers(path: Path) -> pd.DataFrame:
 
 
 def per_run(
-    numbers: pd.DataFrame, quantity: str, scope: str = "", member: str = "mean", name: str = ""
+    numbers: pd.DataFrame,
+    *quantities: str,
+    scope: str = "",
+    member: str = "mean",
+    name: str = "{}",
 ) -> pd.DataFrame:
-    """A quantity's final value in each run: columns ``RUN``, ``value``, ``of``, and ``quantity``, what tables call it.
+    """Quantities' final values in each run: columns ``RUN``, ``value``, ``quantity`` as tables call it, ``of`` which.
 
     ``member``: which of a run's members, ``best`` (the highest), ``mean`` or ``worst``, or the quantity whose value is
-    the member's number, such as ``validated_member``.
+    the member's number, such as ``validated_member``. ``name``: what ``{}``, the quantity, is called.
     """
     final = numbers[numbers["step"].isna()]
-    rows = final[(final["quantity"] == quantity) & (final["scope"] == scope)]
+    rows = final[final["quantity"].isin(quantities) & (final["scope"] == scope)]
     if member not in MEMBERS:
         picked = final[final["quantity"] == member].drop_duplicates(RUN)
-        picked = picked[RUN].assign(member=picked["value"].astype("Int64"))
+        picked = picked[RUN].assign(member=picked["value"].astype(WHOLE))
         rows = rows.merge(picked, on=[*RUN, "member"])
-    how = MEMBERS.get(member, "mean")
-    runs = rows.groupby(RUN, dropna=False, sort=False)["value"].agg(how).reset_index()
-    return runs.assign(of=quantity, quantity=name or quantity)
+    values = rows.groupby([*RUN, "quantity"], dropna=False, sort=False)["value"]
+    runs = values.agg(MEMBERS.get(member, "mean")).reset_index()
+    return runs.assign(
+        of=runs["quantity"],
+        quantity=runs["quantity"].map(name.format),
+    )
 
 
-def student_interval(values: NDArray[Any]) -> tuple[float, float]:
+def student_interval(values: Any) -> tuple[float, float]:
     """Spec F5: Student's 95 % interval of the mean of (n,) independent values; NaN for fewer than two."""
-    if len(values) < 2:
-        return math.nan, math.nan
-    error = values.std(ddof=1) / np.sqrt(len(values))
-    wide = float(stdtrit(len(values) - 1, (1 + CONFIDENCE) / 2) * error)
-    return float(values.mean()) - wide, float(values.mean()) + wide
+    numbers = pd.Series(values, dtype=float)
+    wide = stdtrit(len(numbers) - 1, (1 + CONFIDENCE) / 2) * numbers.sem()
+    return numbers.mean() - wide, numbers.mean() + wide
 
 
-def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> Any:
-    """Spec F5: the mean of the middle half: a quarter of the values, rounded down, is cut off at either end."""
-    return trim_mean(values, 0.25, axis=axis)
-
-
-def interval(values: NDArray[np.float64]) -> tuple[float, float, str]:
-    """Spec F5: a 95 % interval of (n,) independent values, and its kind; NaN for fewer than two.
+def interval(values: Any) -> tuple[float, float]:
+    """Spec F5: a 95 % interval of (n,) independent values; NaN for fewer than two.
 
     Below 8 values Student's, of the mean. From 8 on a percentile bootstrap of the interquartile mean.
     """
     if len(values) < BOOTSTRAP_FROM:
-        return *student_interval(values), STUDENT if len(values) > 1 else NOTHING
+        return student_interval(values)
     drawn = bootstrap(
         [values],
         interquartile_mean,
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
-        vectorized=True,
         rng=np.random.default_rng(0),
     )
-    bounds = drawn.confidence_interval
-    return float(bounds.low), float(bounds.high), BOOTSTRAP
+    low, high = drawn.confidence_interval
+    return float(low), float(high)
 
 
 def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Spec F5: a row of statistics for each combination of ``by`` and each quantity of :func:`per_run`.
 
     The values are layouts, each by the mean of its runs or, with one layout, the runs. Columns: ``by``, ``quantity``,
-    mean, standard_error and standard_deviation (n - 1), iqm, low, high (95 %), interval_over (what the values are and
-    the interval's kind), n (runs). Bounds of shares lie within 0 and 1.
+    mean, standard_error and standard_deviation (n - 1), iqm, low, high (95 %), n (runs), units (values). Bounds of
+    shares lie within 0 and 1.
     """
-    rows = []
     names = [*by, "quantity"]
+    rows = []
     for key, cell in runs.groupby(names, dropna=False, sort=False):
-        several = cell["layout"].nunique() > 1
-        column = cell.groupby("layout", sort=False)["value"].mean() if several else cell["value"]
-        values = column.to_numpy(np.float64)
-        low, high, kind = interval(values)
-        if units().get(cell["of"].iloc[0]) == "fraction":
-            low, high = np.clip([low, high], 0, 1).tolist()
-        deviation = values.std(ddof=1) if len(values) > 1 else math.nan
-        statistics = {
-            "mean": values.mean(),
-            "standard_error": deviation / np.sqrt(len(values)),
-            "standard_deviation": deviation,
-            "iqm": interquartile_mean(values),
-            "low": low,
-            "high": high,
-            "interval_over": f"{'layouts' if several else 'runs'}: {kind}",
-            "n": len(cell),
-        }
-        rows.append(dict(zip(names, key, strict=True)) | statistics)
-    return pd.DataFrame(rows, columns=[*names, *STATISTICS])
+        labels = dict(zip(names, key, strict=True))
+        rows.append(labels | statistics(cell))
+    return pd.DataFrame(rows)
+
+
+def statistics(runs: pd.DataFrame) -> dict[str, float]:
+    """See :func:`over`: of runs that are alike."""
+    several = runs["layout"].nunique() > 1
+    values = runs.groupby("layout", sort=False)["value"].mean() if several else runs["value"]
+    low, high = interval(values.to_numpy())
+    if is_share(runs["of"].iloc[0]):
+        low, high = np.clip([low, high], 0, 1)
+    return {
+        "mean": values.mean(),
+        "standard_error": values.sem(),
+        "standard_deviation": values.std(),
+        "iqm": interquartile_mean(values.to_numpy()),
+        "low": low,
+        "high": high,
+        "n": len(runs),
+        "units": len(values),
+    }
 
 
 def pairs(runs: pd.DataFrame) -> pd.DataFrame:
@@ -182,56 +194,67 @@ def pairs(runs: pd.DataFrame) -> pd.DataFrame:
     Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Runs alike in
     all of ``SHARED`` are paired in order. Columns: N, quantity, first, second, and those of :func:`compare`.
     """
+    alike = runs.groupby(["method", "quantity", "N", *SHARED], dropna=False)
+    numbered = runs.assign(copy=alike.cumcount())
     rows = []
-    copies = runs.groupby(["method", "quantity", "N", *SHARED], dropna=False).cumcount()
-    runs = runs.assign(copy=copies)
-    for (groups, quantity), alike in runs.groupby(["N", "quantity"], dropna=False, sort=False):
-        methods = alike["method"].unique()
-        first = alike[alike["method"] == methods[0]]
-        for method in methods[1:]:
-            second = alike[alike["method"] == method]
-            both = first.merge(second, on=[*SHARED, "copy"], suffixes=("", "_second"))
-            if both.empty:
-                continue
-            several = both["layout"].nunique() > 1
-            of_unit = both["layout"] if several else both["seed"].astype(str) + "/" + both["copy"].astype(str)
-            higher = alike["of"].iloc[0] not in LOWER_IS_BETTER
-            compared = compare(both["value"], both["value_second"], of_unit, higher=higher)
-            rows.append({"N": groups, "quantity": quantity, "first": methods[0], "second": method} | compared)
-    return pd.DataFrame(rows) if rows else pd.DataFrame(columns=["N", "quantity", "first", "second"])
+    for (groups, quantity), cell in numbered.groupby(["N", "quantity"], dropna=False, sort=False):
+        place = {"N": groups, "quantity": quantity}
+        (_, first), *others = cell.groupby("method", sort=False)
+        for _, second in others:
+            both = paired(first, second, [*SHARED, "copy"])
+            if len(both):
+                rows.append(place | compare(both))
+    return pd.DataFrame(rows)
 
 
-def compare(first: pd.Series, second: pd.Series, unit: pd.Series, *, higher: bool = True) -> dict[str, Any]:
-    """Spec F5: the first of two methods against the second over n pairs of runs, (n,) each, ``unit`` whose they are.
+def paired(first: pd.DataFrame, second: pd.DataFrame, on: Sequence[str]) -> pd.DataFrame:
+    """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
+    return first.merge(second, on=list(on), suffixes=("", "_second"))
 
-    Pairs of one unit (one ensemble on several ladders, one layout with several seeds) are not independent: everything
-    but the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.
+
+def compare(both: pd.DataFrame, unit: str = "layout") -> dict[str, Any]:
+    """Spec F5: the first of two methods against the second over n pairs of runs, see :func:`paired`.
+
+    Pairs of one unit (a column: the layout, or the seed where there is one layout) are not independent: everything but
+    the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.
 
     Returns:
-        n, units (how many), wins, ties, probability (of improvement) with probability_low and _high, difference (mean
-        of first - second) with difference_low and _high (Student's 95 %), sign_test (two-sided p, ties left out), and
-        higher, whether that is better. Intervals are NaN for one unit.
+        first and second, their names and mean_first and mean_second; n, units (how many), wins, ties, probability (of
+        improvement) with probability_low and _high, difference (mean of first - second) with difference_low and _high
+        (Student's 95 %, of shares cut at -1 and 1), sign_test (two-sided p, ties left out), and higher, whether that is
+        better. Intervals are NaN for one unit.
     """
-    difference = first - second
-    better = pd.Series(np.sign(difference.round(DIGITS))) * (1 if higher else -1)
-    marks = unit.to_numpy()
-    scores = ((1 + better) / 2).groupby(marks, sort=False).mean().to_numpy(np.float64)
-    differences = difference.groupby(marks, sort=False).mean().to_numpy(np.float64)
-    won, lost = int((scores > 0.5).sum()), int((scores < 0.5).sum())
-    low, high = np.clip(np.array(student_interval(scores)), 0, 1).tolist()
-    difference_low, difference_high = student_interval(differences)
+    units = [unit] if both[unit].nunique() > 1 else ["seed", "copy"]
+    quantity = both["of"].iloc[0]
+    higher = quantity not in LOWER_IS_BETTER
+    difference = both["value"] - both["value_second"]
+    better = np.sign(difference.round(DIGITS)) * (1 if higher else -1)
+    scored = both.assign(difference=difference, score=(1 + better) / 2)
+    names = ["value", "value_second", "difference", "score"]
+    by_unit = scored.groupby(units, sort=False)[names].mean()
+    means = by_unit.mean()
+    won = int((by_unit["score"] > 0.5).sum())
+    decided = won + int((by_unit["score"] < 0.5).sum())
+    low, high = np.clip(student_interval(by_unit["score"]), 0, 1)
+    difference_low, difference_high = student_interval(by_unit["difference"])
+    if is_share(quantity):
+        difference_low, difference_high = np.clip([difference_low, difference_high], -1, 1)
     return {
-        "n": len(difference),
-        "units": len(scores),
+        "first": both["method"].iloc[0],
+        "second": both["method_second"].iloc[0],
+        "mean_first": means["value"],
+        "mean_second": means["value_second"],
+        "n": len(both),
+        "units": len(by_unit),
         "wins": int((better > 0).sum()),
         "ties": int((better == 0).sum()),
-        "probability": scores.mean(),
+        "probability": means["score"],
         "probability_low": low,
         "probability_high": high,
-        "difference": differences.mean(),
+        "difference": means["difference"],
         "difference_low": difference_low,
         "difference_high": difference_high,
-        "sign_test": float(binomtest(won, won + lost).pvalue) if won + lost else math.nan,
+        "sign_test": binomtest(won, decided).pvalue if decided else math.nan,
         "higher": higher,
     }
 
@@ -246,18 +269,6 @@ def above(values: Any, bound: Any) -> Any:
     return values > bound + ROUNDING
 
 
-def plain(value: Any) -> Any:
-    """JSON-ready: NaN becomes null, NumPy numbers become Python's."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def mean_of(values: Any) -> float:
-    """The mean of (n,), NaN where there are none."""
-    numbers = np.asarray(values)
-    return float(numbers.mean()) if len(numbers) else math.nan
+def as_json(facts: Any) -> str:
+    """Text of facts and numbers, NumPy's too; NaN becomes null."""
+    return to_json(facts, indent=1, inf_nan_mode="null", fallback=np.generic.item).decode()

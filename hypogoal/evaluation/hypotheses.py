@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from hypogoal.evaluation.house import at_least, over, pairs, per_run, tidy, tidy_members
+from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
+from hypogoal.evaluation import plots
+from hypogoal.evaluation.house import at_least, per_run, tidy, tidy_members
 from hypogoal.evaluation.judging import Judged, Judgement, Work
-from hypogoal.evaluation.page import Drawn, Results, displayed, mean, pairs_displayed, spans, spread
-from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, legend_below, plot, styled
-from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, mean_disagreement, member_scores, ranking
+from hypogoal.evaluation.page import Drawn, Results
+from hypogoal.hypotheses import scores
 
 TITLE = "Hypotheses"
-WHICH = ("best", "mean", "worst")
 HELDOUT = "heldout"
 PLANTED = "planted_"  # begins the names of origins that say whether a state has a planted feature
 OWNED_FROM, IGNORED_TO = 0.95, 0.6  # areas under the ROC curve
-BY = {"method": "ensemble", "sub_goal": "sub-goal"}
-COLUMNS = {which: (which, spread(3)) for which in WHICH} | {"disagree": ("disagreement_heldout", spread(3))}
+BY = ["method", "sub_goal"]
+WHICH = ("best", "mean", "worst")
+PAIRED = ("best", "mean")
 KNOWN = ("ranking", "cross_fitted_ranking", "cross_fitted_accuracy", "at_best_threshold", "calibration_gap")
 
 
@@ -32,167 +32,117 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     """Spec F1, F2: each member on held-out states, pooled over layouts, and how much members disagree."""
     split, judged = judgement.split, judgement.judged
     place = work.place_of(judgement)
-    unlabelled = judged.unlabelled
-    if len(unlabelled):
-        positive = unlabelled.mean(axis=0)
-    else:
-        positive = np.full(unlabelled.shape[1], math.nan)
-    columns = {"positive_unlabelled": positive, "threshold": judged.thresholds.astype(np.float64)}
-    columns |= member_scores(judged.predictions, split.labels)
-    yield tidy_members(columns, **place, scope=HELDOUT)
-    counts = {
+    count = np.array(len(judged.unlabelled))
+    columns = scores.member_scores(judged.predictions, split.labels)
+    columns["threshold"] = judged.thresholds.astype(np.float64)
+    columns["positive_unlabelled"] = scores.ratio(judged.unlabelled.sum(axis=0), count)
+    numbers = {
         "states": len(split.labels),
-        "positives": int(split.labels.sum()),
+        "positives": split.labels.sum(),
         "layouts": len(np.unique(split.origins.get("layout_seed", []))),
-        "disagreement": mean_disagreement(judged.predictions),
+        "disagreement": scores.mean_disagreement(judged.predictions),
     }
-    yield tidy(counts, **place, scope=HELDOUT)
-    yield tidy({"disagreement": mean_disagreement(unlabelled)}, **place, scope="unlabelled")
-    yield from _knowledge_of(judgement, place)
-    planted = {name.removeprefix(PLANTED): values for name, values in split.origins.items() if name.startswith(PLANTED)}
+    planted = {name: values for name, values in split.origins.items() if name.startswith(PLANTED)}
     if planted:
-        yield tidy({"coverage": coverage(judged.probabilities, planted)}, **place, scope=HELDOUT)
+        numbers["coverage"] = coverage(judged.probabilities, planted)
+    yield tidy_members(columns, **place, scope=HELDOUT)
+    yield tidy(numbers, **place, scope=HELDOUT)
+    yield tidy({"disagreement": scores.mean_disagreement(judged.unlabelled)}, **place, scope="unlabelled")
+    yield from (rows.assign(**place) for rows in _knowledge_of(judgement))
 
 
-def _knowledge_of(judgement: Judgement, place: Mapping[str, Any]) -> Iterator[pd.DataFrame]:
+def _knowledge_of(judgement: Judgement) -> Iterator[pd.DataFrame]:
     """What members know of contexts that training did not see."""
-    origins = judgement.split.origins
+    labels, origins = judgement.split.labels, judgement.split.origins
     by_room = "seen" in origins
-    unseen = origins["seen"] == 0 if by_room else np.ones(len(judgement.split.labels), dtype=np.bool_)
-    contexts = next((origins[name][unseen] for name in ("layout_seed", "room") if name in origins), None)
-    columns, crossed = knowledge(judgement.judged, unseen, judgement.split.labels, contexts)
+    unseen = origins["seen"] == 0 if by_room else np.full(len(labels), fill_value=True)
+    contexts = origins.get("layout_seed", origins.get("room"))
+    columns, crossed = knowledge(judgement.judged, unseen, labels, contexts)
     if by_room:  # ``rooms`` has their ranking
         del columns["ranking"]
     scope = "unseen" if by_room else HELDOUT
-    yield tidy_members(columns, **place, scope=scope)
-    yield tidy(crossed, **place, scope=scope)
+    yield tidy_members(columns, scope=scope)
+    yield tidy(crossed, scope=scope)
 
 
 def knowledge(
-    judged: Judged, inside: NDArray[np.bool_], labels: NDArray[np.bool_], contexts: NDArray[np.int64] | None
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
-    """What K members know of the states ``inside`` (N,), n of them; ``contexts`` (n,): layouts or rooms.
+    judged: Judged,
+    inside: Bools,
+    labels: Bools,
+    contexts: Ints | None,
+) -> tuple[dict[str, Doubles], dict[str, float]]:
+    """What K members know of the states ``inside``, (N,) like ``labels`` and ``contexts``, layouts or rooms.
 
     Returns of each member (K,) ``ranking``, ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much
     of that its own threshold loses); and of the best member, picked on half of the contexts and scored on the other,
     ``cross_fitted_ranking`` and ``cross_fitted_accuracy``, NaN for fewer than two contexts.
     """
-    probabilities, predictions = judged.probabilities[inside], judged.predictions[inside]
-    labels = labels[inside]
-    accuracy = member_scores(predictions, labels)["balanced_accuracy"]
-    best = best_threshold(probabilities, labels)[1]
-    columns = {
-        "ranking": ranking(probabilities, labels),
-        "at_best_threshold": best,
-        "calibration_gap": best - accuracy,
-    }
-    first = None if contexts is None else halves(contexts)
+
+    def scored(where: Bools | Ints) -> tuple[Doubles, Doubles]:
+        areas = scores.ranking(judged.probabilities[where], labels[where])
+        return areas, scores.member_scores(judged.predictions[where], labels[where])["balanced_accuracy"]
+
+    areas, accuracies = scored(inside)
+    _, best = scores.best_threshold(judged.probabilities[inside], labels[inside])
+    columns = {"ranking": areas, "at_best_threshold": best, "calibration_gap": best - accuracies}
+    first = None if contexts is None else scores.halves(contexts[inside])
     if first is None:
         return columns, {"cross_fitted_ranking": math.nan, "cross_fitted_accuracy": math.nan}
-    ranked, accuracies = [], []
-    for half in (first, ~first):
-        ranked.append(ranking(probabilities[half], labels[half]))
-        accuracies.append(member_scores(predictions[half], labels[half])["balanced_accuracy"])
-    crossed = {"cross_fitted_ranking": cross_fitted(*ranked), "cross_fitted_accuracy": cross_fitted(*accuracies)}
+    states = np.flatnonzero(inside)
+    in_first, in_second = scored(states[first]), scored(states[~first])
+    crossed = {
+        "cross_fitted_ranking": scores.cross_fitted(in_first[0], in_second[0]),
+        "cross_fitted_accuracy": scores.cross_fitted(in_first[1], in_second[1]),
+    }
     return columns, crossed
 
 
-def coverage(probabilities: NDArray[np.float32], planted: Mapping[str, NDArray[np.int64]]) -> float:
+def coverage(probabilities: Floats, planted: Mapping[str, Ints]) -> float:
     """Spec H1: the share of planted features (N,) that some member (N, K) has found: it ranks by it, and by no other.
 
     Every combination of features is equally frequent, so an area under the ROC curve of .5 is blindness to a feature.
     """
-    areas = np.stack([ranking(probabilities, values > 0) for values in planted.values()], axis=1)
+    areas = np.stack([scores.ranking(probabilities, values > 0) for values in planted.values()], axis=1)
     ranks = at_least(areas, OWNED_FROM)
     ignored = at_least(IGNORED_TO - 0.5, np.abs(areas - 0.5))
-    owned = ranks & (ignored.sum(axis=1, keepdims=True) == areas.shape[1] - 1)
-    return float(owned.any(axis=0).mean())
+    alone = ignored.sum(axis=1, keepdims=True) == areas.shape[1] - 1
+    return float((ranks & alone).any(axis=0).mean())
 
 
-def of_layouts(results: Results) -> pd.DataFrame:
+def runs(results: Results) -> pd.DataFrame:
     """The numbers of ensembles but those judged room by room, which ``rooms`` has."""
-    numbers = results.of(scope=[HELDOUT, "unlabelled"])
-    return numbers[~numbers["artefact"].isin(results.of(scope="unseen")["artefact"])]
+    by_room = results.of(scope="unseen")["artefact"]
+    numbers = results.numbers[~results.numbers["artefact"].isin(by_room)]
+    values = [per_run(numbers, "balanced_accuracy", scope=HELDOUT, member=which, name=which) for which in WHICH]
+    values.append(per_run(numbers, *KNOWN, "coverage", scope=HELDOUT))
+    for states in ("unlabelled", HELDOUT):
+        values.append(per_run(numbers, "disagreement", scope=states, name=f"{{}}_{states}"))
+    return pd.concat(values)
 
 
-def tables(results: Results) -> dict[str, pd.DataFrame]:
-    """Per kind of ensemble and sub-goal, over seeds; the first against the others."""
-    numbers = of_layouts(results)
-    accuracies = [per_run(numbers, "balanced_accuracy", HELDOUT, which, which) for which in WHICH]
-    others = [per_run(numbers, name, HELDOUT) for name in (*KNOWN, "coverage")]
-    others.append(per_run(numbers, "disagreement", HELDOUT, name="disagreement_heldout"))
-    others.append(per_run(numbers, "disagreement", "unlabelled", name="disagreement_unlabelled"))
-    runs = pd.concat([*accuracies, *others])
-    return {"hypotheses": over(runs, ["method", "sub_goal"]), "hypotheses-pairs": pairs(compared(results))}
-
-
-def compared(results: Results) -> pd.DataFrame:
-    """The numbers of runs by which ensembles are compared."""
-    numbers = of_layouts(results)
-    parts = []
-    for which in ("best", "mean"):
-        name = f"balanced accuracy, {which} member"
-        parts.append(per_run(numbers, "balanced_accuracy", HELDOUT, which, name))
-    return pd.concat(parts)
-
-
-def context(results: Results) -> dict[str, Any] | None:
-    """For the template: the members' table, pairs, and whether held-out states are of layouts."""
-    if of_layouts(results).empty:
-        return None
-    computed = tables(results)
-    more = {
-        "disagree, unlabelled": ("disagreement_unlabelled", spread(3)),
-        "ranking": ("ranking", spread(3)),
-        "ranking, cross-fitted best": ("cross_fitted_ranking", spread(3)),
-        "cross-fitted best": ("cross_fitted_accuracy", spread(3)),
-        "at best threshold": ("at_best_threshold", spread(3)),
-    }
-    has_coverage = (computed["hypotheses"]["quantity"] == "coverage").any()
-    first = COLUMNS | ({"coverage": ("coverage", spread(2))} if has_coverage else {})
-    printed = {title: (quantity, mean(3)) for title, (quantity, _) in COLUMNS.items()}
-    return {
-        "table": displayed(computed["hypotheses"], BY, first),
-        "more": displayed(computed["hypotheses"], BY, more),
-        "printed": displayed(computed["hypotheses"], BY, printed),
-        "pairs": pairs_displayed(computed["hypotheses-pairs"], {}),
-        "has_layouts": bool(results.of(quantity="layouts")["value"].max() > 0),
-        "seeds": spans(of_layouts(results)["seed"]),
-    }
-
-
-def figures(results: Results) -> Iterator[Drawn]:
+def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
     """Figure 3's quantity for one labelled context."""
-    if of_layouts(results).empty:
-        return
-    table = tables(results)["hypotheses"]
-    if table["quantity"].isin(WHICH).any():
-        yield Drawn("members", "Members' balanced accuracy on held-out states", members_figure(table))
+    table = context["table"]
+    means = table[table["quantity"].isin(WHICH)].pivot_table("mean", BY, "quantity", sort=False)
+    if len(means):
+        yield Drawn("members", "Members' balanced accuracy on held-out states", members_figure(means))
 
 
-def members_figure(table: pd.DataFrame) -> Figure:
-    """Balanced accuracy by sub-goal and kind of ensemble: the best member filled, a bar the mean, hollow the worst."""
-    means = table[table["quantity"].isin(WHICH)].pivot_table(
-        index=["method", "sub_goal"], columns="quantity", values="mean", sort=False
-    )
-    sub_goals = list(means.index.unique("sub_goal"))
-    methods = list(means.index.unique("method"))
-    step = 0.8 / len(methods)
-    with styled():
-        figure, axes = plot(1.2 + len(sub_goals) * max(0.42, 0.2 * len(methods)))
-        for index, method in enumerate(methods):
-            values = means.loc[method].reindex(sub_goals)
-            y = np.arange(len(sub_goals)) + (index - (len(methods) - 1) / 2) * step
-            colour, marker = PALETTE[index % len(PALETTE)], MARKERS[index % len(MARKERS)]
-            axes.hlines(y, values["worst"], values["best"], color=colour, linewidth=1.6, alpha=0.6)
-            axes.plot(values["best"], y, marker, color=colour, markersize=7, label=method)
-            axes.plot(values["mean"], y, "|", color=colour, markersize=10, markeredgewidth=1.8)
-            axes.plot(values["worst"], y, marker, color=colour, markersize=5, fillstyle="none")
-        axes.axvline(0.5, color=GREY, linewidth=1.2, linestyle=":")
+def members_figure(means: pd.DataFrame) -> Figure:
+    """Balanced accuracy by method and sub-goal, the index of ``best``, ``mean`` and ``worst``: a range of members."""
+    methods = plots.looks(means.index.unique("method"))
+    sub_goals = means.index.unique("sub_goal")
+    with plots.styled():
+        figure, axes = plots.plot(1.2 + len(sub_goals) * max(0.42, 0.2 * len(methods)))
+        for index, (method, look) in enumerate(methods.items()):
+            rows = means.loc[method].reindex(sub_goals)
+            y = np.arange(len(rows)) + 0.6 * index / len(methods)
+            below, beyond = rows["mean"] - rows["worst"], rows["best"] - rows["mean"]
+            points = look | {"linestyle": "none", "marker": "o"}
+            axes.errorbar(rows["mean"], y, xerr=[below, beyond], capsize=3, label=method, **points)
+        axes.axvline(0.5, **plots.DOTTED)
         axes.set_yticks(range(len(sub_goals)), sub_goals)
         axes.invert_yaxis()
-        axes.grid(visible=False, axis="y")
-        axes.set_xlim(min(0.45, means["worst"].min() - 0.03), 1.02)
         axes.set_xlabel("balanced accuracy on held-out states")
-        legend_below(figure, [axes], 3)
+        plots.legend_below(figure, [axes], 3)
     return figure

@@ -108,7 +108,7 @@ class Work:
     layouts: tuple[int, ...] = ()  # on which trained agents are to play
     facts: dict[str, Any] = field(default_factory=dict)  # what is not a number, for ``run.json``
     # The member that labelled rooms pick, by the ensemble's path and the sub-goal.
-    validated: dict[tuple[str, str], int] = field(default_factory=dict)
+    validated: dict[tuple[Path | None, str], float | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.places = places_of(self.contents)

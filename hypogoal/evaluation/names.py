@@ -4,18 +4,17 @@ Runs that were not made alike are never averaged: they have different names.
 """
 
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.evaluation.run import Contents, takes, within
+from hypogoal.evaluation.run import Contents, takes
 
 # Settings that may differ between two runs that are averaged, or that follow from others.
 NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
-        *("world", "members", "observation_dtype", "groups"),  # which the names or the column N say
+        *("world", "members", "observation_dtype", "groups", "domain_config"),  # which the names or the column N say
         *("ended_at", "until_reached", "options_ended_at", "options_steps"),  # which came out
     }
 )
@@ -61,37 +60,40 @@ def rank(name: str) -> int:
     return ORDER.index(max(starts, key=len)) if starts else len(ORDER)
 
 
-def names_apart(titles: Sequence[str], configs: Sequence[Mapping[str, Any]], groups: Sequence[Any] = ()) -> list[str]:
+def names_apart(
+    titles: Sequence[str],
+    configs: Sequence[Mapping[str, Any]],
+    groups: Sequence[Any] = (),
+) -> list[str]:
     """A name for each of n things: its title, and the settings by which it differs from most of that title.
 
     ``domain_config`` inside the settings is looked into. Of several ``groups`` (N) only things of the same are named
     apart. An ensemble stands without the setting's name, and in place of ``LEARNED``.
     """
-    flat = [{**(config.get("domain_config") or {}), **config, "domain_config": None} for config in configs]
-    kinds = list(zip(titles, groups or [None] * len(titles), strict=True))
+    settings = [_texts(config) for config in configs]
+    kinds = list(zip(titles, groups or titles, strict=True))
     names = []
-    for kind, config in zip(kinds, flat, strict=True):
-        alike = [other for other, others_kind in zip(flat, kinds, strict=True) if others_kind == kind]
-        parts = [kind[0]]
-        for key in sorted({*config} - NOT_A_VARIANT, key=lambda key: (key != "ensemble", key)):
-            texts = [_text(other[key]) for other in alike if key in other]
-            usual, count = Counter(texts).most_common(1)[0]
-            text = _text(config[key])
-            if text != usual or 2 * count <= len(texts):
-                parts.append(text if key == "ensemble" else f"{key}={text}")
-        names.append(", ".join(parts))
-    return [_with_its_ensemble(name) for name in names]
+    for kind, settings_of_it in zip(kinds, settings, strict=True):
+        alike = [other for other, others_kind in zip(settings, kinds, strict=True) if others_kind == kind]
+        name = kind[0]
+        for key, text in settings_of_it.items():
+            texts = [other[key] for other in alike if key in other]
+            if 2 * texts.count(text) <= len(texts):
+                name += f", {text}" if key == "ensemble" else f", {key}={text}"
+        rest = name.removeprefix(f"{LEARNED}, ")
+        names.append(rest if rest.startswith(METHODS) else name)
+    return names
 
 
-def _with_its_ensemble(name: str) -> str:
-    rest = name.removeprefix(f"{LEARNED}, ")
-    return rest if rest.startswith((*METHODS, *OBJECTIVES)) else name
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return "unset"
-    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+def _texts(config: Mapping[str, Any]) -> dict[str, str]:
+    """The settings that tell runs apart, the ensemble first."""
+    flat = {**(config.get("domain_config") or {}), **config}
+    texts = {}
+    for key in sorted(flat, key=lambda key: (key != "ensemble", key)):
+        value = "unset" if flat[key] is None else flat[key]
+        if key not in NOT_A_VARIANT:
+            texts[key] = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+    return texts
 
 
 def groups_of(config: Mapping[str, Any]) -> int | None:
@@ -102,19 +104,33 @@ def groups_of(config: Mapping[str, Any]) -> int | None:
 
 def places_of(contents: Contents) -> dict[str, dict[str, Any]]:
     """Of each of a run's artefacts, by path, what stands in the table of numbers: method, N, ladder, layout, seed."""
-    ensembles = contents.ensembles
-    settings = [_effective(artefact.config) for artefact in ensembles]
-    names = names_apart([ensemble_title(artefact.config) for artefact in ensembles], settings)
-    of_ensemble = dict(zip(map(contents.name, ensembles), names, strict=True))
-    places = {
-        contents.name(artefact): {"method": name, "N": groups_of(artefact.config)}
-        for artefact, name in zip(ensembles, names, strict=True)
-    }
-    places |= _of_agents(contents, of_ensemble) | _of_ladders(contents, of_ensemble)
-    for artefact in contents.everything():
+    titles = [ensemble_title(artefact.config) for artefact in contents.ensembles]
+    names = names_apart(titles, [_effective(artefact.config) for artefact in contents.ensembles])
+    named = {artefact.path.resolve(): name for artefact, name in zip(contents.ensembles, names, strict=True)}
+    places = [{"N": groups_of(artefact.config)} for artefact in contents.ensembles]
+    titles, configs = [], []
+    for artefact in (*contents.agents, *contents.ladders):
+        config, source, number = artefact.config, "", None
+        if artefact.kind != "baseline":
+            ensemble = Artefact(artefact.input("ensemble"))
+            source = named.get(ensemble.path.resolve(), ensemble_title(ensemble.config))
+            number = groups_of(ensemble.config)
+        if artefact in contents.agents:
+            titles.append(agent_title(artefact.kind, config))
+            configs.append({**config, "ensemble": source})
+            places.append({"layout": config["layout_seed"]})
+        else:
+            learned = takes(artefact)
+            titles.append(source if learned else ORACLE)
+            configs.append({**config, **dict.fromkeys(ON_LADDERS, "")})
+            places.append({"N": number if learned else None, "ladder": config["start"]})
+    groups = [place.get("N") for place in places[len(names) :]]
+    names += names_apart(titles, configs, groups)
+    by_path = {}
+    for artefact, name, place in zip(contents.everything(), names, places, strict=True):
         path = contents.name(artefact)
-        places[path] |= {"seed": artefact.seed, "artefact": path}
-    return places
+        by_path[path] = {"method": name, **place, "seed": artefact.seed, "artefact": path}
+    return by_path
 
 
 def _effective(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -122,35 +138,3 @@ def _effective(config: Mapping[str, Any]) -> dict[str, Any]:
     if config["diversity"] == "none":
         idle = (*idle, "diversity_weight")
     return {key: value for key, value in config.items() if key not in idle}
-
-
-def _of_agents(contents: Contents, of_ensemble: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    titles = [agent_title(artefact.kind, artefact.config) for artefact in contents.agents]
-    configs = []
-    for artefact in contents.agents:
-        more = {} if artefact.kind == "baseline" else {"ensemble": _ensemble_of(contents, artefact, of_ensemble)}
-        configs.append(artefact.config | more)
-    names = names_apart(titles, configs)
-    return {
-        contents.name(artefact): {"method": name, "layout": artefact.config["layout_seed"]}
-        for artefact, name in zip(contents.agents, names, strict=True)
-    }
-
-
-def _of_ladders(contents: Contents, of_ensemble: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    titles, groups, configs = [], [], []
-    for artefact in contents.ladders:
-        learned = takes(artefact)
-        titles.append(_ensemble_of(contents, artefact, of_ensemble) if learned else ORACLE)
-        groups.append(groups_of(Artefact(artefact.input("ensemble")).config) if learned else None)
-        configs.append({key: value for key, value in artefact.config.items() if key not in ON_LADDERS})
-    names = names_apart(titles, configs, groups)
-    return {
-        contents.name(artefact): {"method": name, "N": number, "ladder": artefact.config["start"]}
-        for artefact, name, number in zip(contents.ladders, names, groups, strict=True)
-    }
-
-
-def _ensemble_of(contents: Contents, artefact: Artefact, of_ensemble: Mapping[str, str]) -> str:
-    source = Artefact(artefact.input("ensemble"))
-    return of_ensemble.get(within(contents, source) or "", ensemble_title(source.config))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from hypogoal.core.artefacts import versions
-from hypogoal.evaluation.house import STUDENT
+from hypogoal.evaluation.house import BOOTSTRAP_FROM
 from hypogoal.evaluation.pictures import encoded
 from hypogoal.evaluation.plots import to_file
 
@@ -103,32 +103,36 @@ def bounded(digits: int = 2, scale: float = 1.0) -> Show:
     """Writes the mean or the interquartile mean, whichever the 95 % interval beside it is of."""
 
     def show(row: Any) -> str:
-        value = row["mean"] if STUDENT in row["interval_over"] else row["iqm"]
+        value = row["mean"] if row["units"] < BOOTSTRAP_FROM else row["iqm"]
         return fixed(value, digits, scale) + between(row["low"], row["high"], digits, scale)
 
     return show
+
+
+def counted(row: Any) -> str:
+    """Writes how many runs there are."""
+    return str(row["n"])
 
 
 def displayed(
     table: pd.DataFrame,
     by: Mapping[str, str],
     columns: Mapping[str, tuple[str, Show]],
-    keys: pd.DataFrame | None = None,
 ) -> pd.DataFrame:
     """A table of :func:`house.over` as people read it: a row for each combination of ``by``, whose titles it gives.
 
-    ``columns`` are by title a quantity and how its statistics are written; ``keys`` the combinations, by default those
-    of the table.
+    ``columns`` are by title a quantity and how its statistics are written. Labels that are
+    the same everywhere are left out but the method's.
     """
-    names = [*by]
-    keys = table[names].drop_duplicates() if keys is None else keys
-    shown = keys.copy()
+    names = [name for name in by if name == "method" or table[name].nunique(dropna=False) > 1]
+    shown = table[names].drop_duplicates()
     for title, (quantity, show) in columns.items():
         rows = table[table["quantity"] == quantity]
-        texts = rows[names].assign(text=[show(row) for _, row in rows.iterrows()])
-        shown[title] = keys.merge(texts, on=names, how="left")["text"].astype(object).fillna(DASH).to_numpy()
-    shown[names] = shown[names].astype(object).where(shown[names].notna(), DASH)
-    return shown.rename(columns=dict(by)).set_index(list(by.values()))
+        texts = rows[names].assign(**{title: [show(row) for _, row in rows.iterrows()]})
+        if len(texts):
+            shown = shown.merge(texts, on=names, how="left")
+    shown = shown.astype(object).where(shown.notna(), DASH)
+    return shown.rename(columns=dict(by)).set_index([by[name] for name in names])
 
 
 def pairs_displayed(pairs: pd.DataFrame, digits: Mapping[str, int]) -> pd.DataFrame:
@@ -172,7 +176,11 @@ def rows_of(frame: pd.DataFrame) -> Iterable[list[str]]:
 
 
 def terminal(title: str, frame: pd.DataFrame) -> Table:
-    """A displayed table for a terminal, 80 columns wide."""
+    """A displayed table for a terminal, 80 columns wide: of its first columns as many as fit, means alone."""
+    frame = frame.map(lambda text: text.partition(" ±")[0].partition(" [")[0])
+    labels = min(40, max(len(" | ".join(map(str, np.atleast_1d(key)))) for key in frame.index))
+    wide = [3 + max(len(str(name)), *map(len, frame[name])) for name in frame]
+    frame = frame.loc[:, labels + np.cumsum(wide) < WIDTH]
     printed = Table(title=title, title_justify="left", width=WIDTH)
     for name in frame.index.names:
         printed.add_column(str(name), overflow="fold")
@@ -231,8 +239,9 @@ def templates() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    tools = {function.__name__: function for function in (rows_of, listed, spans, picture, svg, fixed, percent)}
-    environment.globals |= tools
+    tools = (rows_of, listed, spans, picture, svg, fixed, percent, mean, spread, bounded, counted, displayed)
+    environment.globals |= {function.__name__: function for function in tools}
+    environment.globals |= {"deviation": deviation, "pairs_displayed": pairs_displayed}
     return environment
 
 
@@ -241,10 +250,14 @@ def section(name: str, context: Mapping[str, Any]) -> Markup:
     return Markup(templates().get_template(f"{name}.html").render(context))
 
 
-def caption(name: str, context: Mapping[str, Any], drawn: Drawn) -> str:
-    """A figure's caption, which is a macro in its question's template."""
-    module: Any = templates().get_template(f"{name}.html").make_module(dict(context))
-    return " ".join(Markup(module.caption(drawn)).unescape().split())
+def module(name: str, context: Mapping[str, Any]) -> Any:
+    """What a question's template sets, and its macros."""
+    return templates().get_template(f"{name}.html").make_module(dict(context))
+
+
+def caption(words: Any, drawn: Drawn) -> str:
+    """A figure's caption, a macro in its question's template, see :func:`module`."""
+    return " ".join(Markup(words.caption(drawn)).unescape().split())
 
 
 def draw_page(title: str, sections: Sequence[tuple[str, str, Markup, bool]], template: str, **lead: Any) -> str:

@@ -2,15 +2,17 @@
 
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import blake2b
 from importlib import resources
+from itertools import cycle
 from typing import Any
 
 import matplotlib
 import matplotlib.style
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
@@ -25,6 +27,7 @@ MARKERS = "osD^vPX*<>p"  # 11, so that a colour has the same one again late
 STYLES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))  # of lines; dotted is what is no method
 WIDTH = 5.6  # inches; readable on a phone, where it is scaled to the screen
 KINDS = ("svg", "pdf", "png")
+DOTTED: dict[str, Any] = {"color": GREY, "linestyle": ":", "linewidth": 1.2}  # a line of what is no method
 
 
 @contextmanager
@@ -39,6 +42,25 @@ def plot(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
     """A figure with one plot."""
     figure = Figure(figsize=(width, height))
     return figure, figure.subplots()
+
+
+def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Each method's colour and line."""
+    distinct = dict.fromkeys(methods)
+    kinds = zip(distinct, cycle(PALETTE), cycle(STYLES))
+    return {method: {"color": colour, "linestyle": style} for method, colour, style in kinds}
+
+
+def banded(axes: Axes, middle: pd.Series, wide: pd.Series, **look: Any) -> None:
+    """A line against its index with a band around it."""
+    axes.plot(middle.index, middle, linewidth=1.6, **look)
+    axes.fill_between(middle.index, middle - wide, middle + wide, color=look["color"], alpha=0.18, linewidth=0)
+
+
+def whiskers(axes: Axes, table: pd.DataFrame, **look: Any) -> None:
+    """The means of a table of :func:`house.over` against its index, with their standard deviations."""
+    wide = table["standard_deviation"].fillna(0)
+    axes.errorbar(table.index, table["mean"], yerr=wide, marker="o", markersize=4, capsize=3, alpha=0.8, **look)
 
 
 def legend_below(figure: Figure, axes: Sequence[Axes], columns: int) -> None:

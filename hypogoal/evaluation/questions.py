@@ -1,16 +1,21 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own, its template, and a line here.
 
-A question is a module with ``TITLE`` and ``context(results)``, what its template and the terminal show (None: nothing),
-and any of: ``look(work, judgement)`` and ``rows(work)``, its numbers; ``facts(work)``, what else it needs to know;
-``tables(results)``, means, intervals and pairs; ``figures(results)`` and what they need, ``NEEDED``; ``missing(work)``,
-lines about what the run has no artefacts for.
+A question is a module with ``TITLE`` and any of:
+
+- ``look(work, judgement)`` and ``rows(work)``: its numbers, rows of the table; ``facts(work)``: what else it needs to
+  know; ``missing(work)``: lines about what the run has no artefacts for.
+- ``runs(results)``: each run's numbers, of :func:`house.per_run`. Its table is over these by the columns ``BY``, and
+  quantities that are ``PAIRED`` are compared, of ``compared(results)`` where these are other runs.
+- ``context(results)``: what else its template needs; None where the run has nothing of it.
+- ``figures(context)``, of what the template is given, and what they need, ``NEEDED``.
+
+Its template gets ``results``, ``table``, ``pairs`` and ``figures``, and sets ``shown``, what a terminal prints.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 from rich.console import Group
@@ -22,7 +27,9 @@ from hypogoal.evaluation import (
     curves,
     distance,
     exploits,
+    house,
     hypotheses,
+    judging,
     page,
     provenance,
     rooms,
@@ -31,82 +38,143 @@ from hypogoal.evaluation import (
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.house import joined, plain
-from hypogoal.evaluation.judging import Case, Work, judgements, processes_for
 from hypogoal.evaluation.names import rank
 from hypogoal.evaluation.page import Drawn, Results
 from hypogoal.evaluation.run import FORMAT
-from hypogoal.learners.episodes import LAST
 
 QUESTIONS: list[ModuleType] = [  # in the order of the page
-    *(curves, rooms, distance, exploits, hypotheses, saliency, selection, choosing, zero_shot)
+    curves,
+    rooms,
+    distance,
+    exploits,
+    hypotheses,
+    saliency,
+    selection,
+    choosing,
+    zero_shot,
 ]
-FOLDED = (exploits, saliency, selection)  # until asked for
-SETTINGS = {"window": LAST, "solved": curves.SOLVED}
-LADDERS = {"executions": LAST, "inside_counts": distance.INSIDE, "near": distance.NEAR}  # of runs with ladders alone
+FOLDED = (exploits, saliency, selection, provenance)  # until asked for
 
 
-def asked(name: str) -> Iterator[tuple[ModuleType, Any]]:
-    """The questions that have this, and it."""
+class Answer(NamedTuple):
+    """What a run says about a question."""
+
+    question: ModuleType
+    name: str  # of its template, its table and its section
+    context: dict[str, Any]  # for the template
+
+    def words(self) -> Any:
+        """What the template sets and says."""
+        return page.module(self.name, self.context)
+
+
+def answers(results: Results, *, drawn: bool = False) -> list[Answer]:
+    """Of every question that the run has something of, in the order of the page; with its figures if ``drawn``."""
+    every = []
+    for question in (*QUESTIONS, provenance):
+        context = context_of(question, results)
+        if context is None:
+            continue
+        if drawn and hasattr(question, "figures"):
+            context["figures"] = list(question.figures(context))
+        every.append(Answer(question, name_of(question), context))
+    return every
+
+
+def context_of(question: ModuleType, results: Results) -> dict[str, Any] | None:
+    """A question's numbers, without its figures; None where the run has nothing of it."""
+    table, compared = pd.DataFrame(), pd.DataFrame()
+    if hasattr(question, "runs"):
+        runs = question.runs(results)
+        if runs.empty:
+            return None
+        table = house.over(runs, question.BY)
+    if hasattr(question, "PAIRED"):
+        compared = house.pairs(paired_runs(question, results))
+    more = question.context(results) if hasattr(question, "context") else {}
+    if more is None:
+        return None
+    return {"results": results, "table": table, "pairs": compared, "figures": []} | more
+
+
+def paired_runs(question: ModuleType, results: Results) -> pd.DataFrame:
+    """Each run's numbers that are compared."""
+    runs = getattr(question, "compared", question.runs)(results)
+    return runs[runs["quantity"].isin(question.PAIRED)]
+
+
+def name_of(question: ModuleType) -> str:
+    """What its template, its table and its section are called."""
+    return question.__name__.rpartition(".")[-1].replace("_", "-")
+
+
+def asked(name: str) -> Iterator[Any]:
+    """This part of every question that has it."""
     for question in (*QUESTIONS, verdict):
         if hasattr(question, name):
-            yield question, getattr(question, name)
+            yield getattr(question, name)
 
 
-def answer(work: Work, cases: Sequence[tuple[int, Case]], settings: Mapping[str, Any], data: Sequence[Path]) -> Results:
+def answer(
+    work: judging.Work,
+    cases: Sequence[tuple[int, judging.Case]],
+    settings: Mapping[str, Any],
+    data: Sequence[Path],
+) -> Results:
     """Every number of a run, and what else its page needs: ensembles are judged, then all questions asked."""
-    of_ensembles = _judge(work, cases)
-    parts = [*of_ensembles]
-    for _, rows in asked("rows"):
+    parts = _judge(work, cases)
+    for rows in asked("rows"):
         parts += rows(work)
     facts: dict[str, Any] = {
         "format": FORMAT,
         "run": work.contents.run.resolve().name,
-        "settings": {**settings, **(LADDERS if work.contents.ladders else {})},
+        "settings": settings,
         "provenance": provenance.provenance(work.contents, data),
     }
-    for _, facts_of in asked("facts"):
+    for facts_of in asked("facts"):
         facts |= facts_of(work)
     lines = [] if work.contents.ensembles else ["no ensemble"]
-    for _, missing in asked("missing"):
+    for artefact in work.contents.silent:
+        lines.append(f"no executions.csv in {work.contents.name(artefact)}: its domain tells no distance")
+    for missing in asked("missing"):
         lines += missing(work)
-    return Results(joined(parts), facts | work.facts | {"missing": lines})
+    return Results(house.joined(parts), facts | work.facts | {"missing": lines})
 
 
-def _judge(work: Work, cases: Sequence[tuple[int, Case]]) -> list[pd.DataFrame]:
+def _judge(work: judging.Work, cases: Sequence[tuple[int, judging.Case]]) -> list[pd.DataFrame]:
     """What the questions say of every ensemble's members, the paper's method first."""
-    ensembles = work.contents.ensembles
-    parts: dict[int, list[pd.DataFrame]] = {number: [] for number in range(len(ensembles))}
-    workers = processes_for([case for _, case in cases], cores())
-    for judgement in judgements(cases, workers, work.progress.advance):
-        for _, look in asked("look"):
-            parts[judgement.number] += look(work, judgement)
+    parts: list[tuple[int, int, pd.DataFrame]] = []
+    workers = judging.processes_for([case for _, case in cases], cores())
+    for judgement in judging.judgements(cases, workers, work.progress.advance):
+        method = work.place_of(judgement)["method"]
+        for look in asked("look"):
+            parts += [(rank(method), judgement.number, rows) for rows in look(work, judgement)]
         work.progress.advance()
-    order = sorted(parts, key=lambda number: rank(work.place(ensembles[number])["method"]))
-    return [part for number in order for part in parts[number]]
+    parts.sort(key=lambda part: part[:2])
+    return [rows for *_, rows in parts]
 
 
 def write(folder: Path, results: Results) -> None:
     """Write ``numbers.csv``, ``run.json`` and ``tables/*.csv``."""
     results.numbers.to_csv(folder / "numbers.csv", index=False)
-    text = json.dumps(plain(results.facts), indent=1)
-    (folder / "run.json").write_text(text + "\n", encoding="utf-8")
+    (folder / "run.json").write_text(house.as_json(results.facts) + "\n", encoding="utf-8")
+    tables = {"verdict": pd.DataFrame(verdict.findings(results))}
+    for each in answers(results):
+        tables[each.name] = each.context["table"]
+        tables[f"{each.name}-pairs"] = each.context["pairs"]
     (folder / "tables").mkdir()
-    for question, tables in asked("tables"):
-        if question.context(results) is None:
-            continue
-        for name, table in tables(results).items():
-            if not table.empty:
-                table.to_csv(folder / "tables" / f"{name}.csv", index=False)
+    for name, table in tables.items():
+        if not table.empty:
+            table.to_csv(folder / "tables" / f"{name}.csv", index=False)
 
 
 def summary(results: Results) -> Group:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
     tables: list[Any] = []
-    for question in (*QUESTIONS[1:], curves):
-        context = question.context(results)
-        if context and context.get("printed") is not None:
-            tables.append(page.terminal(question.TITLE, context["printed"]))
+    for each in answers(results):
+        shown = getattr(each.words(), "shown", None)
+        if shown is not None:
+            tables.append(page.terminal(each.question.TITLE, shown))
     lines = Table.grid()
     lines.width = page.WIDTH
     if results.facts["missing"]:
@@ -122,53 +190,35 @@ def sentences(results: Results) -> list[str]:
     return [line for line in text.splitlines() if line]
 
 
-def render(results: Results, drawn: Sequence[tuple[ModuleType, Drawn]], films: Iterable[Mapping[str, str]]) -> str:
-    """Spec F7: the page of a run, self-contained, with figures of :func:`all_figures`."""
+def render(results: Results, every: Sequence[Answer], films: Iterable[Mapping[str, str]]) -> str:
+    """Spec F7: the page of a run, self-contained, with the figures of drawn :func:`answers`."""
     sections = []
-    for question in (*QUESTIONS, provenance):
-        context = question.context(results)
-        if context is None:
-            continue
-        name = _name(question)
-        figures = [figure for source, figure in drawn if source is question]
-        folded = question in (*FOLDED, provenance)
-        part = page.section(name, context | {"figures": figures, "is_papers": results.facts["is_papers"]})
-        sections.append((name, question.TITLE, part, folded))
-    sections.sort(key=lambda section: section[-1])  # what is open comes first
+    for each in sorted(every, key=lambda each: each.question in FOLDED):  # what is open comes first
+        part = page.section(each.name, each.context)
+        sections.append((each.name, each.question.TITLE, part, each.question in FOLDED))
     lead = verdict.context(results) | {
         "sentences": sentences(results),
         "films": films,
-        "missing": results.facts["missing"],
         "domains": provenance.domains_of(results.facts),
-        "artefacts": len(results.facts["provenance"]["artefacts"]),
     }
     return page.draw_page(f"hypogoal: {results.facts['run']}", sections, "run.html", **lead)
 
 
-def _name(question: ModuleType) -> str:
-    return question.__name__.rpartition(".")[-1].replace("_", "-")
+def captions(every: Iterable[Answer]) -> dict[str, tuple[Drawn, str]]:
+    """Figures and their captions, by their names."""
+    by_name = {}
+    for each in every:
+        words = page.module(each.name, each.context | {"figures": []})
+        for figure in each.context["figures"]:
+            by_name[figure.name] = figure, page.caption(words, figure)
+    return by_name
 
 
-def all_figures(results: Results) -> list[tuple[ModuleType, Drawn]]:
-    """Every figure that the run has artefacts for, with its question."""
-    return [(question, drawn) for question, figures in asked("figures") for drawn in figures(results)]
-
-
-def captions(results: Results, drawn: Sequence[tuple[ModuleType, Drawn]]) -> dict[str, str]:
-    """The figures' captions by their names."""
-    texts = {}
-    for question, figure in drawn:
-        context = question.context(results) | {"figures": [], "is_papers": results.facts["is_papers"]}
-        texts[figure.name] = page.caption(_name(question), context, figure)
-    return texts
-
-
-def not_drawn(drawn: Iterable[Drawn]) -> list[str]:
-    """A line for each of the paper's Figures 2 to 9 that the run lacks."""
-    names = [figure.name for figure in drawn]
-    lines = []
-    for _, needed in asked("NEEDED"):
-        for name, requirement in needed.items():
-            if not any(other == name or other.startswith(f"{name}-") for other in names):
-                lines.append(f"{name.replace('figure', 'Figure ')}: not drawn. It needs {requirement}.")
-    return sorted(lines)
+def not_drawn(names: Iterable[str]) -> list[str]:
+    """A line for each of the paper's Figures 2 to 9 that is not among a run's figures."""
+    kinds = [name.partition("-")[0] for name in names]
+    needed: dict[str, str] = {}
+    for of_question in asked("NEEDED"):
+        needed |= of_question
+    absent = sorted(set(needed).difference(kinds))
+    return [f"{name.replace('figure', 'Figure ')}: not drawn. It needs {needed[name]}." for name in absent]

@@ -7,13 +7,14 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
 from hypogoal.core.artefacts import AGAIN, MANIFEST, Artefact, open_artefact, sha256_of
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import UserError, reason
 from hypogoal.core.files import read_json, visible
 from hypogoal.core.own_code import command
 from hypogoal.data import opened
@@ -104,27 +105,21 @@ def thresholds_of(artefact: Artefact) -> NDArray[np.float64]:
     return 1 / (1 + np.exp(-thresholds_in(saved, options).astype(np.float64)))
 
 
-def within(contents: Contents, source: Artefact) -> str | None:
-    """An ensemble's path within the run; None where it is not one of the run's."""
-    same = (artefact for artefact in contents.ensembles if artefact.path.resolve() == source.path.resolve())
-    return next(map(contents.name, same), None)
+class Layout(BaseModel, strict=True):
+    """``layout.json``: what is known of the layout that an agent was trained on."""
+
+    layout_seed: Annotated[int, Field(ge=0, lt=MAX_INTEGER)]
+    shortest_path: int | None  # steps
+    random_success: float | None  # share of random play's episodes
+    layouts: str | None = None  # where there were many
 
 
-def read_layout(path: Path) -> dict[str, Any]:
-    """``layout.json``: layout_seed, shortest_path, random_success, random_episodes; of many layouts also layouts."""
-    facts = read_json(path, "the layout's file is", AGAIN)
-    wanted = {"layout_seed": int, "shortest_path": int | None, "random_success": float | int | None}
-    fits = isinstance(facts, dict) and all(isinstance(facts.get(key, ...), kind) for key, kind in wanted.items())
-    if not fits or not 0 <= facts["layout_seed"] < MAX_INTEGER or type(facts.get("random_episodes")) is not int:
-        raise UserError("the layout's file is damaged", path, AGAIN)
-    more = {"layouts": facts["layouts"]} if isinstance(facts.get("layouts"), str) else {}
-    return {key: facts[key] for key in (*wanted, "random_episodes")} | more
-
-
-def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
-    """``terminations.h5``: option -> the last states in which its classifier ended it, (n, *obs)."""
-    with opened(path, AGAIN, "the file of terminations") as file:
-        return {int(name): states[()] for name, states in file.items()}
+def read_layout(path: Path) -> Layout:
+    """``layout.json``; a ``UserError`` where it is missing or damaged."""
+    try:
+        return Layout.model_validate_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise UserError(f"the layout's file cannot be read ({reason(error)})", path, AGAIN) from None
 
 
 @contextlib.contextmanager

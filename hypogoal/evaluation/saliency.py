@@ -198,11 +198,11 @@ def _gallery(arrays: Mapping[str, NDArray[Any]], sub_goal: str, facts: Mapping[s
         }
 
 
-def figures(results: Results) -> Iterator[Drawn]:
+def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
     """Figures 2 and 9 of each sub-goal, a true positive where there is one; of numbers, which features members use."""
-    of_sub_goals = explained(results)
+    of_sub_goals = explained(context["results"])
     for sub_goal, facts in of_sub_goals.items():
-        arrays = results.within(f"saliency/{sub_goal}")
+        arrays = context["results"].within(f"saliency/{sub_goal}")
         suffix = f"-{sub_goal}" if len(of_sub_goals) > 1 else ""
         about = {"sub_goal": sub_goal}
         if "features" in facts:

@@ -1,7 +1,6 @@
 """Figures 7 and 8: which members the meta-policy prefers, and where their options stop (Spec F6)."""
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,19 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bytes, Doubles, Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain
-from hypogoal.evaluation.curves import is_learned
-from hypogoal.evaluation.house import tidy_members
+from hypogoal.domains import base
+from hypogoal.evaluation import page, plots
+from hypogoal.evaluation.curves import chosen_by
+from hypogoal.evaluation.house import of_options
 from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.page import Drawn, Results, fixed, listed, percent
 from hypogoal.evaluation.pictures import STATES, overlay
-from hypogoal.evaluation.plots import GREY, pictures, show_picture, styled
 from hypogoal.evaluation.run import takes, thresholds_of
-from hypogoal.hypotheses.scores import member_scores, most_and_least, ratio
+from hypogoal.hypotheses import scores
 from hypogoal.meta.config import layout_seeds
 from hypogoal.observations import PICTURE
 from hypogoal.options.tables import Choices
@@ -30,8 +28,8 @@ TITLE = "Which hypotheses are chosen, and where they stop"
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
 SCOPE = "layout"  # of choices, and of the match with the truth, on a run's layout
-COUNTS = ("offered", "chosen", "reached")
-NUMBERS = (*COUNTS, "expected", "duration", "preference", "match", "threshold")
+COUNTS = ("offered", "chosen", "reached", "expected")
+NUMBERS = (*COUNTS, "duration", "preference", "match", "threshold")  # of an option
 NEEDED = {
     "figure7": "a meta artefact with the sub-goal open-red-door: train-meta",
     "figure8": "a meta artefact with the sub-goal go-to-goal: train-meta",
@@ -54,22 +52,19 @@ def rows(work: Work) -> Iterator[pd.DataFrame]:
         choices = Choices.read(artefact.path / "choices.csv")
         columns = numbers_of_choices(choices, len(members.match))
         columns |= {"match": members.match, "threshold": thresholds_of(artefact)}
-        for index, sub_goal in enumerate(config["sub_goals"]):
-            part = slice(index * config["members"], (index + 1) * config["members"])
-            of_goal = {name: values[part] for name, values in columns.items()}
-            yield tidy_members(of_goal, **work.place(artefact), sub_goal=sub_goal, scope=SCOPE)
+        yield of_options(columns, config, **work.place(artefact), scope=SCOPE)
 
 
-def numbers_of_choices(choices: Choices, options: int) -> dict[str, NDArray[np.float64]]:
+def numbers_of_choices(choices: Choices, options: int) -> dict[str, Doubles]:
     """Spec F6: how often each option was offered, chosen, reached; its mean duration in steps; ``preference``, (O,).
 
     A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered
     always. Preference is chosen / expected, 1 for a chooser that does not care, NaN for an option never offered;
     ``expected``: the sum of 1 / (options offered) over the decisions that offered it.
     """
-    columns = {name: choices.total(name, options) for name in (*COUNTS, "expected")}
-    columns["duration"] = ratio(choices.total("duration", options), columns["chosen"])
-    columns["preference"] = ratio(columns["chosen"], columns["expected"])
+    columns = {name: choices.total(name, options) for name in COUNTS}
+    columns["duration"] = scores.ratio(choices.total("duration", options), columns["chosen"])
+    columns["preference"] = scores.ratio(columns["chosen"], columns["expected"])
     return columns
 
 
@@ -81,9 +76,9 @@ class OnLayout(NamedTuple):
     positive. ``sets``, of pictures only, has for options that are positive anywhere an :func:`overlay` of these.
     """
 
-    match: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    sets: dict[int, NDArray[np.uint8]]
+    match: Doubles
+    counts: Ints
+    sets: dict[int, Bytes]
 
 
 def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
@@ -91,29 +86,34 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
     source = Artefact(path)
-    domain, members = load_domain(source.config["domain"]), source.config["members"]
-    arguments = domain.world(source.config["domain_config"])
-    arguments |= {"layouts": Layouts(layouts)} if len(layouts) > 1 else {}
-    engine = domain.make_engine(layouts[0], len(layouts), 500, **arguments)
-    reachable = engine.reachable()
-    ids = states_met(engine, 2_000, rng_for(0, "states-of-layout")) if reachable is None else reachable
-    images, labels = engine.images(ids), dict(zip(domain.sub_goals, engine.labels(ids).T, strict=True))
-    match, sets = np.full(len(source.config["sub_goals"]) * members, np.nan), {}
-    counts = np.zeros(len(match), np.int64)
-    for index, sub_goal in enumerate(source.config["sub_goals"]):
+    domain = base.load_domain(source.config["domain"])
+    world = domain.world(source.config["domain_config"])
+    if len(layouts) > 1:
+        world["layouts"] = base.Layouts(layouts)
+    engine = domain.make_engine(layouts[0], len(layouts), 500, **world)
+    ids = engine.reachable()
+    if ids is None:
+        ids = states_met(engine, 2_000, rng_for(0, "states-of-layout"))
+    images, labels = engine.images(ids), engine.labels(ids)
+    matches, verdicts = [], []
+    for sub_goal in source.config["sub_goals"]:
         ensemble = read_ensemble(source.path, source.config, sub_goal)
-        verdicts = ensemble.predictions(images)
-        options = range(index * members, (index + 1) * members)
-        if sub_goal in labels:
-            match[options] = member_scores(verdicts, labels[sub_goal])["balanced_accuracy"]
-        counts[options] = verdicts.sum(axis=0)
-        for option, positives in zip(options, verdicts.T, strict=True):
-            if positives.any() and images.dtype == PICTURE:
-                sets[option] = overlay(images[positives])
-    return OnLayout(match, counts, sets)
+        predictions = ensemble.predictions(images)
+        match = np.full(predictions.shape[1], np.nan)
+        if sub_goal in domain.sub_goals:
+            truth = labels[:, domain.sub_goals.index(sub_goal)]
+            match = scores.member_scores(predictions, truth)["balanced_accuracy"]
+        matches.append(match)
+        verdicts.append(predictions)
+    positive = np.concatenate(verdicts, axis=1)
+    sets = {}
+    for option, states in enumerate(positive.T):
+        if states.any() and images.dtype == PICTURE:
+            sets[option] = overlay(images[states])
+    return OnLayout(np.concatenate(matches), positive.sum(axis=0), sets)
 
 
-def states_met(engine: Engine, steps: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def states_met(engine: base.Engine, steps: int, rng: np.random.Generator) -> Ints:
     """The states that random play of an engine meets in so many steps, each once."""
     met = [engine.ids]
     for _ in range(steps // engine.count):
@@ -123,119 +123,60 @@ def states_met(engine: Engine, steps: int, rng: np.random.Generator) -> NDArray[
 
 def missing(work: Work) -> list[str]:
     """Sub-goals of which the domain does not know where they are reached, and where to say it."""
-    lines = []
-    for artefact in work.contents.agents:
-        if not takes(artefact):
-            continue
+    lines = {}
+    for artefact in filter(takes, work.contents.agents):
         name = artefact.config["domain"]
-        domain = load_domain(name)
-        do = "import them under one of these names, if it is one of them"
+        domain = base.load_domain(name)
         for sub_goal in artefact.config["sub_goals"]:
-            if sub_goal not in domain.sub_goals:
-                do = do if name in BUILT_IN else f"add {sub_goal} to the domain's sub_goals"
-                has = f"{name} has {listed(domain.sub_goals)}"
-                lines.append(f"no truth of {sub_goal} to match members with: {has}; {do}, then evaluate again")
-    return list(dict.fromkeys(lines))
+            if sub_goal in domain.sub_goals:
+                continue
+            do = f"add {sub_goal} to the domain's sub_goals"
+            if name in base.BUILT_IN:
+                do = "import them under one of these names, if it is one of them"
+            has = f"{name} has {page.listed(domain.sub_goals)}"
+            lines[f"no truth of {sub_goal} to match members with: {has}; {do}, then evaluate again"] = True
+    return [*lines]
 
 
-def tables(results: Results) -> dict[str, pd.DataFrame]:
-    """Of each run and sub-goal its members, a column for each number."""
+def context(results: page.Results) -> dict[str, Any] | None:
+    """A row of ``table`` for each run's member; ``members``: those of the first run that learned to choose, if any."""
     numbers = results.of(scope=SCOPE)
-    place = ["method", "layout", "seed", "artefact", "sub_goal", "member"]
-    wide = numbers.pivot_table(index=place, columns="quantity", values="value", sort=False, dropna=False)
-    wide = wide.dropna(how="all").reset_index()
-    return {"choices": wide.reindex(columns=[*place, *NUMBERS])}
-
-
-def context(results: Results) -> dict[str, Any] | None:
-    """For the template: of the first run how often each member was chosen, over what a uniform choice would have."""
-    if results.of(scope=SCOPE).empty:
+    if numbers.empty:
         return None
-    table = tables(results)["choices"]
-    learned = [name for name, agent in results.facts["agents"].items() if is_learned(agent)]
-    first = _first_run(results, table)
-    practised = _practised(table)
-    if first is None:
-        return {"printed": practised, "table": practised, "run": None}
-    shown = pd.DataFrame(
-        {
-            "sub-goal": first["sub_goal"],
-            "member": first["member"].astype(str) + first["marks"],
-            "offered": first["offered"].map("{:.0f}".format),
-            "chosen": first["chosen"].map("{:.0f}".format),
-            "expected": [fixed(value, 0) for value in first["expected"]],
-            "preference": [fixed(value) for value in first["preference"]],
-            "steps": [fixed(value, 1) for value in first["duration"]],
-            "match": [fixed(value) for value in first["match"]],
-        }
-    )
-    run = {name: first[name].iloc[0] for name in ("artefact", "layout", "seed", "method")}
-    return {"table": shown.set_index(["sub-goal", "member"]), "run": run, "agents": len(learned)}
+    place = ["artefact", "method", "layout", "seed", "sub_goal", "member"]
+    wide = numbers.pivot_table(index=place, columns="quantity", values="value", sort=False).reset_index()
+    table = wide.reindex(columns=[*place, *NUMBERS])
+    learned = table[table["method"].isin([*chosen_by(results, "learned")])]
+    shown = table if learned.empty else learned
+    members = shown[shown["artefact"] == shown["artefact"].min()]
+    return {"table": table, "members": members.reset_index(drop=True)}
 
 
-def _practised(table: pd.DataFrame) -> pd.DataFrame:
-    """How often the options of each sub-goal were executed, how often they reached it, and their mean duration."""
-    rows = []
-    for sub_goal, members in table.groupby("sub_goal", sort=False):
-        count = members["chosen"].sum()
-        steps = (members["chosen"] * members["duration"].fillna(0)).sum()
-        share = members["reached"].sum() / count if count else math.nan
-        mean_steps = fixed(steps / count if count else math.nan, 1)
-        cells = {"executions": f"{count:.0f}", "reached": percent(share), "steps": mean_steps}
-        rows.append({"options of": sub_goal, **cells})
-    return pd.DataFrame(rows).set_index("options of")
-
-
-def _first_run(results: Results, table: pd.DataFrame) -> pd.DataFrame | None:
-    """The members of the first run that learned to choose; ``marks``: whether one is preferred most or least."""
-    learned = [name for name, agent in results.facts["agents"].items() if is_learned(agent)]
-    of_learned = table[table["method"].isin(learned)]
-    if of_learned.empty:
-        return None
-    first = of_learned[of_learned["artefact"] == of_learned["artefact"].iloc[0]]
-    marks = pd.Series("", first.index)
-    for _, members in first.groupby("sub_goal", sort=False):
-        for word, member in zip(("most", "least"), most_and_least(members["preference"].to_numpy()), strict=True):
-            if member is not None:
-                marks[members.index[member]] = f" ({word})"
-    return first.assign(marks=marks, option=np.arange(len(first)))
-
-
-def figures(results: Results) -> Iterator[Drawn]:
-    """Figures 7 and 8 and the other sub-goals', of the first agent's first run; none of numbers."""
-    first = None if results.of(scope=SCOPE).empty else _first_run(results, tables(results)["choices"])
-    if first is None:
-        return
-    path = first["artefact"].iloc[0]
-    if not any(name.startswith(f"terminations/{path}/") for name in results.arrays):
-        return
-    counts = results.arrays[f"{STATES}/{path}/counts"]
-    for sub_goal, members in first.groupby("sub_goal", sort=False):
+def figures(context: Mapping[str, Any]) -> Iterator[page.Drawn]:
+    """Figures 7 and 8 and the other sub-goals', of the run that is shown; none of numbers."""
+    members, arrays = context["members"], context["results"].arrays
+    path = members["artefact"].min()
+    for sub_goal, of_goal in members.groupby("sub_goal", sort=False):
+        preference = of_goal["preference"].dropna()
         sides = []
-        for word in ("most", "least"):
-            for _, member in members[members["marks"] == f" ({word})"].iterrows():
-                numbers = f"preference {fixed(member['preference'])}, match {fixed(member['match'])}"
-                title = f"{word} preferred: member {member['member']}\n{numbers}\n{counts[member['option']]:,} states"
-                sides.append((title, results.arrays.get(f"terminations/{path}/{member['option']}")))
-        if not sides:
-            continue
-        name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
-        details = {"sub_goal": sub_goal, "path": path, "layout": first["layout"].iloc[0], "seed": first["seed"].iloc[0]}
-        label = f"Termination states of {sub_goal}"
-        yield Drawn(name, label, termination_states(sides), details)
+        for word, option in (("most", preference.idxmax()), ("least", preference.idxmin())) if len(preference) else ():
+            states = arrays.get(f"terminations/{path}/{option}")
+            if states is not None:
+                count = arrays[f"{STATES}/{path}/counts"][option]
+                sides.append((f"{word} preferred: member {members['member'][option]}\n{count:,} states", states))
+        if sides:
+            name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
+            label = f"Termination states of {sub_goal}"
+            yield page.Drawn(name, label, termination_states(sides), {"sub_goal": sub_goal})
 
 
-def termination_states(sides: list[tuple[str, NDArray[np.uint8] | None]]) -> Figure:
+def termination_states(sides: Sequence[tuple[str, Bytes]]) -> Figure:
     """Figures 7 and 8: overlaid termination states of some members, the most preferred first.
 
-    A side is a title and an overlay uint8 (H, W, C), None where the member is positive nowhere.
+    A side is a title and an overlay uint8 (H, W, C).
     """
-    with styled():
-        figure, places = pictures(1, max(2, len(sides)), titles=0.6)
+    with plots.styled():
+        figure, places = plots.pictures(1, 2, titles=0.6)
         for place, (title, image) in zip(places, sides, strict=False):
-            if image is None:
-                place.set_title(title, fontsize=9, loc="center")
-                place.text(0.5, 0.5, "positive\nnowhere", ha="center", va="center", color=GREY)
-            else:
-                show_picture(place, image, title)
+            plots.show_picture(place, image, title)
     return figure

@@ -40,7 +40,7 @@ def evaluate(
     from hypogoal.meta.config import layout_seeds
 
     prepare()
-    settings: dict[str, Any] = {**questions.SETTINGS}
+    settings: dict[str, Any] = {}
     played: tuple[int, ...] = ()
     if layouts:
         settings["layouts"] = layouts

@@ -40,7 +40,7 @@ def report(
     from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
     from hypogoal.evaluation.page import source
     from hypogoal.evaluation.plots import to_file
-    from hypogoal.evaluation.questions import all_figures, render
+    from hypogoal.evaluation.questions import answers, render
     from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation, with_missing
 
     evaluation = evaluation_of(run)
@@ -58,7 +58,7 @@ def report(
                 raise
             results = with_missing(results, [f"no film of an episode: {error}"])
         with fitting(evaluation.path):
-            every = all_figures(results)
+            every = answers(results, drawn=True)
             small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
             shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
             page = render(results, every, shown)
@@ -66,10 +66,11 @@ def report(
         index.write_text(page, encoding="utf-8")
         pictures = draft.files / "figures"
         pictures.mkdir()
-        for _, drawn in every:
-            for kind in ("svg", "png"):
-                path = pictures / f"{drawn.name}.{kind}"
-                path.write_bytes(to_file(drawn.figure, kind))
+        for each in every:
+            for drawn in each.context["figures"]:
+                for kind in ("svg", "png"):
+                    path = pictures / f"{drawn.name}.{kind}"
+                    path.write_bytes(to_file(drawn.figure, kind))
         moving = draft.files / "videos"
         for film in films:
             moving.mkdir(exist_ok=True)

@@ -1,6 +1,5 @@
 """Spec H5: how often policies fool a success classifier, where, and what a mend changes."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,7 +41,7 @@ def audit(
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation import audit as played
-    from hypogoal.evaluation.house import plain
+    from hypogoal.evaluation.house import as_json
     from hypogoal.learners.world import columns_of
     from hypogoal.meta.setup import Setup
     from hypogoal.meta.training import assemble
@@ -70,8 +69,7 @@ def audit(
         rng = rng_for(call.seed, "random-play")
         report = played.report_of(loop, edges, world.sub_goals, files)
         report["random_play"] = played.random_play(loop, column, rng)
-        text = json.dumps(plain(report), indent=1)
-        (files / "audit.json").write_text(text + "\n", encoding="utf-8")
+        (files / "audit.json").write_text(as_json(report) + "\n", encoding="utf-8")
     return Done([*played.lines_of(report)])
 
 

@@ -1,23 +1,17 @@
 """Results of made-up runs, and their rows."""
 
+from types import ModuleType
 from typing import Any
 
 import pandas as pd
 
+from hypogoal.evaluation import page
 from hypogoal.evaluation.house import joined
 from hypogoal.evaluation.page import Results
+from hypogoal.evaluation.questions import context_of
 
-NOTHING: dict[str, Any] = {
-    "agents": {},
-    "ladders": [],
-    "stops": [],
-    "tasks": [],
-    "caps": [],
-    "cap": None,
-    "missing": [],
-    "is_papers": False,
-}
-LEARNED = {"kind": "meta", "members": 3, "chooser": "ppo", "termination": "learned", "layouts": ""}
+NOTHING: dict[str, Any] = {"agents": {}, "ladders": [], "tasks": [], "cap": None, "missing": []}
+LEARNED = {"members": 3, "choice": "learned", "layouts": ""}
 
 
 def numbers_of(*rows: dict[str, Any]) -> pd.DataFrame:
@@ -33,3 +27,15 @@ def row(quantity: str, value: float, **place: Any) -> dict[str, Any]:
 def results_of(*rows: dict[str, Any], **facts: Any) -> Results:
     """Results with these rows; facts that are not given are of a run with nothing else."""
     return Results(numbers_of(*rows), NOTHING | facts)
+
+
+def shown(question: ModuleType, results: Results) -> pd.DataFrame:
+    """The table that a terminal prints."""
+    words = page.module(question.__name__.rpartition(".")[-1], context_of(question, results) or {})
+    return words.shown
+
+
+def figures(question: ModuleType, results: Results) -> list[page.Drawn]:
+    """A question's figures."""
+    context = context_of(question, results)
+    return [] if context is None else list(question.figures(context))

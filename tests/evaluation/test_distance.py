@@ -3,26 +3,23 @@
 import numpy as np
 import pytest
 from ladder_run import COLUMNS, executions
-from made_up import results_of, row
+from made_up import figures, results_of, row, shown
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
+from hypogoal.evaluation import distance
 from hypogoal.evaluation.distance import (
     BEGAN_INSIDE,
     BEST,
     HIT,
     MISS,
     WORST,
-    at_base,
-    context,
-    counted,
-    fates,
-    figures,
+    last_executions,
     option_numbers,
     rows_of_ladder,
-    tables,
 )
 from hypogoal.evaluation.house import joined
+from hypogoal.evaluation.questions import context_of
 from hypogoal.options.tables import Executions
 
 
@@ -44,16 +41,16 @@ def test_the_columns_are_those_that_are_written():
 
 def test_an_execution_that_begins_inside_counts_300(read):
     """Spec F3: wherever it stops, even at a base; within 4 of a base is there, 5 is not."""
-    own = read(executions(0, [0, 4, 4, 5, 200], inside=2))
-    assert counted(own).tolist() == [300, 300, 4, 5, 200]
-    assert at_base(own).tolist() == [False, False, True, False, False]
-    assert fates(own).tolist() == [BEGAN_INSIDE, BEGAN_INSIDE, HIT, MISS, MISS]
+    own = last_executions(read(executions(0, [0, 4, 4, 5, 200], inside=2)))
+    assert own["counted"].tolist() == [300, 300, 4, 5, 200]
+    assert own["reached_base"].tolist() == [False, False, True, False, False]
+    assert own["fate"].tolist() == [BEGAN_INSIDE, BEGAN_INSIDE, HIT, MISS, MISS]
 
 
 def test_one_option_by_hand(read):
     """Spec F3: ten executions: one began inside, two timed out, one died; the shares of all ten."""
     own = read(executions(0, [9, 0, 2, 4, 5, 11, 40, 50, 60, 3], inside=1, died=1, timed_out=2))
-    found = option_numbers(own)
+    found = option_numbers(own).loc[0]
     distances = np.array([300, 0, 2, 4, 5, 11, 40, 50, 60, 3])
     assert found["executions"] == 10
     assert found["distance"] == pytest.approx(distances.mean())
@@ -66,12 +63,10 @@ def test_one_option_by_hand(read):
 def test_the_last_hundred_of_each_option_count(read):
     """Spec F3: earlier ones do not, and other options' are not mixed in."""
     rows = executions(0, [50] * 30 + [10] * 100) + executions(1, [7])
-    own = read(rows).of(0)
-    assert len(own.step) == 100
-    assert option_numbers(own)["distance"] == 10
-    one = option_numbers(read(rows).of(1))
-    assert one["distance"] == 7
-    assert np.isnan(one["executions_deviation"])
+    found = option_numbers(read(rows))
+    assert found["executions"].tolist() == [100, 1]
+    assert found["distance"].tolist() == [10, 7]
+    assert np.isnan(found["executions_deviation"][1])
 
 
 def of_ladder(read, rows, sub_goals=("down",), members=1, **more):
@@ -108,8 +103,8 @@ def stopped(ladder, seed, *distances, method="D-BAT", groups=2, validated=0, num
     place = {"method": method, "N": groups, "sub_goal": "down", "ladder": ladder, "seed": seed}
     place["artefact"] = f"{method}-{ladder}-{seed}-{number}"
     rows = []
-    for member, distance in enumerate(distances):
-        numbers = {"distance": distance, "executions_deviation": 2.0, "reached_base": 0.5, "timed_out": 0.25}
+    for member, away in enumerate(distances):
+        numbers = {"distance": away, "executions_deviation": 2.0, "reached_base": 0.5, "timed_out": 0.25}
         rows += [row(name, value, member=member, **place) for name, value in numbers.items()]
     picked = {BEST: np.nanargmin(distances), WORST: np.nanargmax(distances), "validated_member": validated}
     return rows + [row(name, value, **place) for name, value in picked.items()]
@@ -125,29 +120,29 @@ def test_mean_over_ladders_then_over_seeds():
     ]
     rows += stopped("1L", 0, 2, method="oracle termination", groups=None)
     results = results_of(*rows, ladders=["1L", "2-6"])
-    table = tables(results)["distance"].set_index(["method", "quantity"])
+    table = context_of(distance, results)["table"].set_index(["method", "quantity"])
     assert {*table.index.get_level_values("method")} == {"D-BAT"}, "the oracle lacks a ladder"
     found = table.loc["D-BAT"]
     means = [found["mean"][which] for which in ("best", "validated", "mean", "worst", "executions_deviation")]
     assert means == [20, 31, 30, 40, 2]
     assert found["standard_deviation"]["best"] == pytest.approx(np.sqrt(50))
     assert (found["mean"]["reached_base"], found["mean"]["timed_out"], found["n"]["best"]) == (0.5, 0.25, 2)
-    assert context(results)["table"].loc[(2, "D-BAT"), "best"] == "20.0 ± 7.1"
-    assert [drawn.name for drawn in figures(results)] == ["figure4"]
-    assert context(results_of()) is None
+    assert shown(distance, results).loc["D-BAT", "best"] == "20.0 ± 7.1"
+    assert [drawn.name for drawn in figures(distance, results)] == ["figure4"]
+    assert context_of(distance, results_of()) is None
 
 
 def test_options_of_several_ensembles_with_one_seed_all_count():
     """Spec F3: three artefacts alike in seed and ladder are three, not the last one read."""
     rows = [each for away in (10, 200, 90) for each in stopped("1L", 0, away, number=away)]
-    found = tables(results_of(*rows, ladders=["1L"]))["distance"].set_index("quantity")
+    found = context_of(distance, results_of(*rows, ladders=["1L"]))["table"].set_index("quantity")
     assert (found["n"]["best"], found["mean"]["best"]) == (3, 100)
 
 
 def test_unlike_ladders_are_not_averaged():
     """Spec F3: a seed that lacks one of the ladders is left out of the mean over ladders."""
     rows = [*stopped("1L", 0, 10), *stopped("2-6", 0, 30), *stopped("1L", 1, 1)]
-    found = tables(results_of(*rows, ladders=["1L", "2-6"]))["distance"].set_index("quantity")
+    found = context_of(distance, results_of(*rows, ladders=["1L", "2-6"]))["table"].set_index("quantity")
     assert (found["mean"]["best"], found["n"]["best"]) == (20, 1)
 
 
@@ -156,8 +151,8 @@ def test_options_are_paired_by_ladder_and_seed():
     rows = [*stopped("1L", 0, 10, np.nan), *stopped("1R", 0, 20, np.nan)]
     rows += [*stopped("1L", 0, 40, method="one"), *stopped("1R", 0, 10, method="one")]
     rows += stopped("1L", 0, 0, method="oracle termination", groups=None)
-    pairs = tables(results_of(*rows, ladders=["1L", "1R"]))["distance-pairs"].set_index("quantity")
-    best = pairs.loc["distance, best member"]
+    pairs = context_of(distance, results_of(*rows, ladders=["1L", "1R"]))["pairs"].set_index("quantity")
+    best = pairs.loc["best"]
     assert (best["first"], best["second"], best["n"], best["wins"], best["units"]) == ("D-BAT", "one", 2, 1, 1)
     assert pairs["difference"].tolist() == [-10, -10, -10]
 

@@ -10,7 +10,6 @@ from made_up import numbers_of, row
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.house import (
     BOOTSTRAP_FROM,
-    STUDENT,
     above,
     at_least,
     compare,
@@ -20,6 +19,7 @@ from hypogoal.evaluation.house import (
     pairs,
     per_run,
     read_numbers,
+    student_interval,
 )
 
 
@@ -36,9 +36,9 @@ def test_runs_of_a_layout_count_once() -> None:
     """Two layouts, of one of which there are three runs: 1 and 5, not 0, 1, 2 and 5."""
     (found,) = over(runs_of(0, 1, 2, 5, layouts=[8, 8, 8, 9]), ["method"]).to_dict("records")
     assert (found["mean"], found["standard_error"], found["n"]) == (3, 2, 4)
-    assert found["interval_over"] == f"layouts: {STUDENT}"
+    assert found["units"] == 2
     (alone,) = over(runs_of(0, 1, 2, 5), ["method"]).to_dict("records")
-    assert (alone["mean"], alone["interval_over"]) == (2, f"runs: {STUDENT}")
+    assert (alone["mean"], alone["units"]) == (2, 4)
 
 
 def test_mean_and_standard_error_by_hand() -> None:
@@ -67,8 +67,8 @@ def test_the_interquartile_mean_by_hand() -> None:
 def test_a_bootstrap_is_of_eight_values_at_least() -> None:
     """And the same each time."""
     values = np.arange(8.0)
-    assert interval(values[:7])[2] == STUDENT
-    assert interval(values) == interval(values) and "bootstrap" in interval(values)[2]
+    assert interval(values[:7]) == student_interval(values[:7])
+    assert interval(values) == interval(values) != student_interval(values)
 
 
 @pytest.mark.parametrize(("runs", "least"), [(2, 0.93), (3, 0.93), (5, 0.93), (7, 0.93), (10, 0.9)])
@@ -77,7 +77,7 @@ def test_intervals_hold_as_often_as_they_say(runs: int, least: float) -> None:
     rng = np.random.default_rng(runs)
     count, held = 1_000 if runs < BOOTSTRAP_FROM else 300, 0
     for _ in range(count):
-        low, high, _ = interval(rng.normal(3, 1, runs))
+        low, high = interval(rng.normal(3, 1, runs))
         held += low <= 3 <= high
     assert least <= held / count <= 0.98
 
@@ -100,9 +100,12 @@ def test_points_of_curves_are_no_final_numbers() -> None:
     assert per_run(numbers, "success")["value"].tolist() == [1]
 
 
-def compared(first, second, units=None, **more):
-    units = pd.Series(units if units is not None else range(len(first)))
-    return compare(pd.Series(first, dtype=float), pd.Series(second, dtype=float), units, **more)
+def compared(first, second, units=None, *, higher=True):
+    """Of pairs of runs of a layout each, or of those that ``units`` says."""
+    units = range(len(first)) if units is None else units
+    both = pd.DataFrame({"value": first, "value_second": second, "layout": units, "seed": units})
+    of = "success" if higher else "length"
+    return compare(both.assign(of=of, copy=0, method="a", method_second="b"))
 
 
 def test_probability_of_improvement_by_hand() -> None:
@@ -183,7 +186,7 @@ def test_ensembles_of_no_layout_are_paired_at_each_n() -> None:
         for groups in (1, 2):
             place = {"method": method, "N": groups, "seed": 0, "artefact": f"{method}-{groups}", "sub_goal": "down"}
             rows.append(row("balanced_accuracy", best + groups / 10, member=0, scope="unseen", **place))
-    found = pairs(per_run(numbers_of(*rows), "balanced_accuracy", "unseen"))
+    found = pairs(per_run(numbers_of(*rows), "balanced_accuracy", scope="unseen"))
     assert found["N"].tolist() == [1, 2] and found["n"].tolist() == [1, 1]
     assert found["difference"].tolist() == pytest.approx([0.1, 0.1])
 

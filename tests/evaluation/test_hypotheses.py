@@ -10,6 +10,7 @@ from made_up import results_of, row
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.hypotheses import coverage, knowledge
 from hypogoal.evaluation.judging import Judged
+from hypogoal.evaluation.questions import context_of
 from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
 
 RNG = np.random.default_rng(0)
@@ -84,9 +85,10 @@ def test_best_mean_and_worst_member_over_seeds() -> None:
     """And the first method against the second, by seed and sub-goal."""
     rows = accuracies("D-BAT, 2 members", 0, red=[0.8, 0.6]) + accuracies("D-BAT, 2 members", 1, red=[0.9, 0.5])
     results = results_of(*rows, *accuracies("one classifier", 1, red=[0.7]))
-    table = hypotheses.tables(results)["hypotheses"].set_index(["method", "quantity"])["mean"]
+    context = context_of(hypotheses, results)
+    table = context["table"].set_index(["method", "quantity"])["mean"]
     found = [table["D-BAT, 2 members", which] for which in ("best", "mean", "worst")]
     assert found == pytest.approx([0.85, 0.7, 0.55])
-    (best,) = hypotheses.tables(results)["hypotheses-pairs"].query("quantity.str.contains('best')").to_dict("records")
+    best = context["pairs"].set_index("quantity").loc["best"]
     assert (best["n"], best["difference"]) == (1, pytest.approx(0.2))
-    assert hypotheses.context(results_of()) is None
+    assert context_of(hypotheses, results_of()) is None

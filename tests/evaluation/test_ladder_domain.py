@@ -6,7 +6,7 @@ from ladder_run import COLUMNS
 
 from hypogoal.core.files import write_table
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.distance import at_base, rows_of_ladder
+from hypogoal.evaluation.distance import last_executions, rows_of_ladder
 from hypogoal.evaluation.house import joined
 from hypogoal.options.tables import Executions
 
@@ -22,7 +22,7 @@ def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
     own = Executions.read(tmp_path / "executions.csv")
     assert own.distance[1] == 0
     assert own.distance[0] > own.distance[2] > 4
-    assert at_base(own).tolist() == [False, True, False, True, False]
+    assert last_executions(own)["reached_base"].tolist() == [False, True, False, True, False]
     config = {"sub_goals": domain.usual_sub_goals, "members": 1, "mask_reached": False, "start": "2-6"}
     place = {"method": "one classifier", "N": 2, "ladder": "2-6", "seed": 0, "artefact": "options"}
     rows = joined(rows_of_ladder(own, config, {}, np.full(1, 0.5), place))

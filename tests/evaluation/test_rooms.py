@@ -1,15 +1,14 @@
 """Spec F1, F2: Figure 3's numbers against values worked by hand: unseen rooms, validation."""
 
-import math
-
 import numpy as np
 import pandas as pd
 import pytest
-from made_up import results_of, row
+from made_up import figures, results_of, row, shown
 
-from hypogoal.evaluation.distance import rooms_shown
+from hypogoal.evaluation import rooms
 from hypogoal.evaluation.judging import Judged
-from hypogoal.evaluation.rooms import VALIDATED, choose, context, figures, lacking, rows_by_room, tables
+from hypogoal.evaluation.questions import context_of
+from hypogoal.evaluation.rooms import VALIDATED, choose, rows_by_room
 
 YES, NO = True, False
 # Rooms 1 (labelled), 9 (unlabelled), 6 (unseen): two positives and two negatives each; 20 (unseen): two negatives.
@@ -62,7 +61,7 @@ def test_the_validated_member_is_the_best_in_labelled_rooms() -> None:
     assert choose(VERDICTS, LABELS, SEEN) == {VALIDATED: 0, "validation": 1}
     assert choose(VERDICTS[:, [1, 0, 0]], LABELS, SEEN)[VALIDATED] == 1
     nothing = choose(VERDICTS, LABELS & False, SEEN)
-    assert nothing[VALIDATED] is None and math.isnan(nothing["validation"])
+    assert nothing == {VALIDATED: None, "validation": None}
 
 
 def ensemble(method: str, groups: int, seed: int, *accuracies: float, validated: int = 0) -> list[dict]:
@@ -82,33 +81,17 @@ def test_a_row_for_each_method_and_n_over_seeds() -> None:
     rows = ensemble("D-BAT, 2 members", 1, 0, 0.9, 0.5, validated=1) + ensemble("D-BAT, 2 members", 1, 1, 0.7, 0.5)
     rows += ensemble("D-BAT, 2 members", 2, 0, 0.8, 0.6) + ensemble("one classifier", 1, 0, 0.6)
     results = results_of(*rows)
-    table = tables(results)["rooms"].set_index(["method", "N", "quantity"])["mean"]
+    context = context_of(rooms, results)
+    table = context["table"].set_index(["method", "N", "quantity"])["mean"]
     means = [
         table["D-BAT, 2 members", 1, f"balanced_accuracy, unseen, {which}"]
         for which in ("best", "validated", "mean", "worst")
     ]
     assert means == pytest.approx([0.8, 0.6, 0.65, 0.5])
-    shown = context(results)
-    assert shown["table"].index.tolist() == [("D-BAT, 2 members", 1), ("D-BAT, 2 members", 2), ("one classifier", 1)]
-    assert shown["never"][0]["all_negative"] == 0.75
-    pairs = tables(results)["rooms-pairs"]
+    order = [("D-BAT, 2 members", 1), ("D-BAT, 2 members", 2), ("one classifier", 1)]
+    assert shown(rooms, results).index.tolist() == order
+    assert table["one classifier", 1, "accuracy, all, never positive"] == 0.75
+    pairs = context["pairs"]
     assert pairs["N"].tolist() == [1, 1, 1] and pairs["difference"].tolist() == pytest.approx([0.3, -0.1, 0.1])
-    assert [drawn.name for drawn in figures(results)] == ["figure3"]
-    assert context(results_of()) is None and not list(figures(results_of()))
-
-
-def test_what_is_lacking_is_named() -> None:
-    """Of the paper's three methods; any number of members does."""
-    assert lacking(["D-BAT, 6 members", "no diversity, 6 members, steps=9", "one classifier"], "ensemble", "3") == []
-    assert lacking(["one classifier"], "options", "Figure 4") == [
-        "no options of D-BAT (Figure 4)",
-        "no options of no diversity (Figure 4)",
-    ]
-
-
-def test_the_rooms_that_are_drawn() -> None:
-    """Figure 5: the ladder's own rooms first, then those with the most stops, three in all."""
-    where = [np.array([7, 7, 6, 6, 6]), np.array([9, 9, 9, 9, 3])]
-    assert rooms_shown(where) == [9, 6, 7]
-    assert rooms_shown(where, (2, 6)) == [2, 6, 9]
-    assert rooms_shown([]) == []
+    assert [drawn.name for drawn in figures(rooms, results)] == ["figure3"]
+    assert context_of(rooms, results_of()) is None

@@ -46,8 +46,8 @@ def page_of(folder, **how):
 
 
 def test_the_page_opens_with_the_task_and_a_verdict_of_its_numbers(tiny_run):
-    """Spec I1: recomputed from ``numbers.csv``, with what a baseline was given beside it."""
-    agrees(tiny_run, "Take the red key, open the red door and reach the goal", "One run is not", "On primitive actions")
+    """Spec I1: recomputed from ``numbers.csv``."""
+    agrees(tiny_run, "Take the red key, open the red door and reach the goal", "One run is not")
 
 
 def test_agents_are_grouped_and_counted_whole(tiny_run, results):
@@ -121,7 +121,7 @@ def test_thresholds_are_those_of_members_and_of_options(tiny_run, tmp_path):
 
 def test_selection_counts_every_decision(tiny_run, results):
     """Spec F6: what was chosen and offered, and the random chooser's control beside it; oracle has no members."""
-    table = pd.read_csv(tiny_run / "evaluation/tables/choices.csv")
+    table = pd.read_csv(tiny_run / "evaluation/tables/selection.csv")
     assert [*table["method"].unique()] == ["option agent", "random choice"]
     choices = np.genfromtxt(tiny_run / "meta-random" / "choices.csv", delimiter=",", names=True)
     random = table[table["method"] == "random choice"]
