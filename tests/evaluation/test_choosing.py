@@ -51,16 +51,27 @@ def test_the_agent_finds_the_planted_truth() -> None:
     assert abs(at_random["score"]) < 0.15
 
 
-def test_right_members_have_quality_one() -> None:
-    """Where their sub-goal can be had within the timeout and no other key comes into their way."""
-    engine = DoorKeyEngine(220, 1)
+def qualities_of(engine: DoorKeyEngine) -> NDArray[np.float64]:
+    """Of the planted members, begun in every state that can be reached."""
     terminations = planted(engine)
     config = TrainMetaConfig.of(network="planned")
     learner = PlannedLearner(engine, terminations, config, seed=0)
     loop = OptionLoop(engine, terminations, learner, Silent(), Recorder(15, engine), config, GAMMA)
-    quality = qualities(loop, GOALS, engine.reachable())
+    return qualities(loop, GOALS, engine.reachable())
+
+
+def test_right_members_have_quality_one() -> None:
+    """Where their sub-goal can be had within the timeout and no other key comes into their way."""
+    quality = qualities_of(DoorKeyEngine(220, 1))
     assert (quality[RIGHT] == 1).all()
     assert (np.delete(quality, RIGHT) < 1).all()
+
+
+def test_an_option_that_loses_the_episode_is_not_good() -> None:
+    """Where a wrong key ends the episode, the member that knows the blue key brings it about, and with it the end."""
+    quality = qualities_of(harsh(220, 1))
+    assert quality[0] == 0
+    assert quality[6] == 1, "the red key"
 
 
 class Silent(Chooser):
