@@ -140,9 +140,11 @@ def test_pairs_of_one_unit_are_one_piece_of_evidence() -> None:
     once = compared([1] * 9, [0] * 9, [0] * 9)
     assert (once["n"], once["units"], once["wins"], once["sign_test"]) == (9, 1, 9, 1.0)
     assert math.isnan(once["probability_low"])
-    found = compared([1, 1, 0, 1, 1, 1, 0, 0, 0], [0] * 2 + [1] + [0] * 3 + [1] * 3, [5, 5, 5, 6, 6, 6, 7, 7, 7])
+    several = [1, 1, 0, 1, 1, 1, 0, 0, 0], [0] * 2 + [1] + [0] * 3 + [1] * 3, [5, 5, 5, 6, 6, 6, 7, 7, 7]
+    found = compared(*several)
     assert (found["units"], found["wins"], found["n"], found["sign_test"]) == (3, 5, 9, 1.0)
-    assert found["difference_low"] == pytest.approx(1 / 9 - 2.5297, abs=1e-3)
+    assert compared(*several, higher=False)["difference_low"] == pytest.approx(1 / 9 - 2.5297, abs=1e-3)
+    assert (found["difference_low"], found["difference_high"]) == (-1, 1), "of shares"
     assert (found["probability_low"], found["probability_high"]) == (0, 1)
 
 
