@@ -111,21 +111,21 @@ class _Played:
             place = Path(folder, "data.h5")
             for _ in range(2):
                 try:
-                    found = domain.collect(self.config, self.seed, progress)
+                    collected = domain.collect(self.config, self.seed, progress)
                 except Unmet as error:
                     warnings.warn(str(error), stacklevel=1)
                     return "not looked at: play did not reach the states"
-                write_dataset(place, found, domain=domain.name, config={}, seed=self.seed)
+                write_dataset(place, collected, domain=domain.name, config={}, seed=self.seed)
                 files.append(place.read_bytes())
         fault = f"states differ when collected again with seed {self.seed}"
         promise(files[0] == files[1], fault, SEEDED)
-        fault = f"sub_goals are {found.sub_goals}, not {goals}"
-        promise(tuple(found.sub_goals) == goals, fault, "Give the domain's, in their order.")
+        fault = f"sub_goals are {collected.sub_goals}, not {goals}"
+        promise(tuple(collected.sub_goals) == goals, fault, "Give the domain's, in their order.")
         for name in ("labelled", "unlabelled", "heldout"):
-            observations = getattr(found, name).observations
+            observations = getattr(collected, name).observations
             count = max(len(observations), 1)
             _require_array(name, observations, domain.observation_dtype, count, *domain.observation_shape)
-        labels = found.labelled.labels
+        labels = collected.labelled.labels
         require_classes(labels, goals, "collect", GET_MORE)
         return f"{len(labels)} labelled states, positives of each sub-goal: {labels.sum(0)}"
 

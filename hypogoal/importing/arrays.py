@@ -59,8 +59,8 @@ def episodes_of(
                 seen[key] = values
                 rest.remove(full)
         count = max(map(len, seen.values()), default=0)
-        known = 0 if role != UNLABELLED else count
-        labels = arrays.get(f"{prefix}labels", np.zeros((known, len(sub_goals))))
+        unlabelled = 0 if role != UNLABELLED else count
+        labels = arrays.get(f"{prefix}labels", np.zeros((unlabelled, len(sub_goals))))
         columns = np.atleast_2d(labels.T)
         if columns.shape != (len(sub_goals), count) or not np.isin(columns, (0, 1)).all():
             fault = f"labels of {count} {role} states and {len(sub_goals)} sub-goals are not 0 or 1 for each"

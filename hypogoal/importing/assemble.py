@@ -116,14 +116,14 @@ def apart(
         learned = [LABELLED]
         lines.append(REMARK.format(len(held)))
     for role, others in ((HELDOUT, learned), (UNLABELLED, [HELDOUT])):
-        own = table[table["role"] == role]
+        candidates = table[table["role"] == role]
         other = table[table["role"].isin(others)]
-        is_known = own["look"].isin(other["look"])
-        is_grouped = own["group"].isin(groups.intersection(other["group"]))
-        alike = own.index[is_known | is_grouped]
+        is_known = candidates["look"].isin(other["look"])
+        is_grouped = candidates["group"].isin(groups.intersection(other["group"]))
+        alike = candidates.index[is_known | is_grouped]
         if len(alike):
             like = " or ".join(others)
-            count = f"{len(alike)} of {len(own)} {role} states"
+            count = f"{len(alike)} of {len(candidates)} {role} states"
             lines.append(f"{count} look like {like} ones, or are of their groups: they are left out")
             table = table.drop(alike)
     return table, lines

@@ -67,12 +67,12 @@ def _by_table(table: pd.DataFrame, path: Path) -> Array:
     is_listed = table["episode"].isin(spans["episode"])
     marks[is_listed] = 0
     for name, first, end in spans[[*SPANS]].itertuples(index=False):
-        own = table.index[table["episode"] == name]
-        fits = 0 <= first <= end <= len(own)
-        if not fits or own.empty:
-            fault = f"a label is of frames {first} up to {end} of {len(own)} in {name!r}"
+        rows = table.index[table["episode"] == name]
+        fits = 0 <= first <= end <= len(rows)
+        if not fits or rows.empty:
+            fault = f"a label is of frames {first} up to {end} of {len(rows)} in {name!r}"
             raise UserError(fault, path, "Give an episode's name and 0 <= from <= to <= its frames.")
-        marks[own[first:end]] = 1
+        marks[rows[first:end]] = 1
     return marks
 
 
@@ -105,11 +105,11 @@ def add_labels(source: Path, file: Path, sub_goal: str, path: Path, seed: int) -
     for place, state in enumerate(unlabelled.observations):
         places[digest(state).hex()] = place
     table = read_table(path, {"label": str, "digest": str})
-    given = table[table["label"] != ""]
+    filled = table[table["label"] != ""]
     with reading(path, "Give states of these data, each once, with 1 or 0; or audit an ensemble of these data again."):
-        found = [places.pop(look) for look in given["digest"]]
-        labels = [TRUTHS[label] for label in given["label"]]
-    rows = np.array(found, np.int64)
+        numbers = [places.pop(look) for look in filled["digest"]]
+        labels = [TRUTHS[label] for label in filled["label"]]
+    rows = np.array(numbers, np.int64)
     marked = replace(unlabelled.where(rows), labels=np.array(labels, np.bool_))
     every = np.arange(len(unlabelled.labels))
     others = np.delete(every, rows)

@@ -69,10 +69,10 @@ def frames_of(
             if seen and seen.keys() != parts.keys():
                 raise UserError("episodes have different observations", episode.name, "Choose some by --key.")
             for key, states in parts.items():
-                own = seen.setdefault(key, [])
+                so_far = seen.setdefault(key, [])
                 for name, state in zip(names[kept], states, strict=True):
                     taken, stacked = take(state, f"{name} {key}", resize, stack)
-                    own.append(taken)
+                    so_far.append(taken)
                     if stacked:
                         channels[key] = stacked
     if not seen:
