@@ -22,8 +22,7 @@ from hypogoal.importing.episodes import HELDOUT, LABELLED, UNLABELLED, Array, Ep
 from hypogoal.importing.files import files_of
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP", "TIFF", "PPM", "AVIF")  # for PostScript, Pillow runs a program
-ARRAY = ".npy"  # a state that no format of pictures holds, such as a stack of four frames
-SUFFIXES = {ARRAY, ".mpo"}  # that is JPEG
+SUFFIXES = {".mpo"}  # that is JPEG
 for suffix, name in PIL.Image.registered_extensions().items():
     if name in FORMATS:
         SUFFIXES.add(suffix)
@@ -84,7 +83,6 @@ def read_pictures(folder: Path, sub_goal: str, left: Counter[str]) -> Iterator[E
 
 
 def _state(file: Path, _: Integers) -> list[Array]:
-    """The picture in a file, or the array, as it is."""
-    with reading(file):
-        is_array = file.suffix.lower() == ARRAY
-        return [np.load(file) if is_array else picture_of(file.read_bytes(), file)]
+    """The picture in a file."""
+    data = file.read_bytes()
+    return [picture_of(data, file)]

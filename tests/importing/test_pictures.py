@@ -116,19 +116,3 @@ def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
     refuses("states differ in size", "import", sources[0], "--out", tmp_path / "x.h5")
     run("import", sources[0], "--out", tmp_path / "x.h5", "--resize", "30", "-q")
     assert open_dataset(tmp_path / "x.h5").observation_shape == (30, 30, 3)
-
-
-def test_stacks_of_frames_are_files_of_arrays(tmp_path: Path) -> None:
-    """Spec B6: a ``.npy`` file each; what their channels are is kept, and they are made smaller like pictures."""
-    states = np.random.default_rng(0).integers(0, 255, (6, 4, 64, 48, 3), dtype=np.uint8)
-    for number, state in enumerate(states):
-        folder = tmp_path / "goal" / ("positive", "negative", "unlabelled")[number % 3]
-        folder.mkdir(parents=True, exist_ok=True)
-        np.save(folder / f"{number}.npy", state)
-    given = ["import", tmp_path / "goal", "--out", tmp_path / "goal.h5", "--heldout", "0.4", "--resize", "16", "-q"]
-    refuses("stacks of pictures: uint8 (4, 64, 48, 3). Give pictures as uint8", *given)
-    run(*given, "--stack")
-    found = open_dataset(tmp_path / "goal.h5")
-    whole = states[[2, 5]].transpose(0, 2, 3, 1, 4).reshape(2, 16, 4, 12, 4, 12).mean((2, 4))
-    assert np.abs(found.unlabelled() - whole).max() <= 1
-    assert found.channels == {"": [4, 3]}

@@ -246,8 +246,8 @@ def test_what_channels_mean_is_kept(tmp_path: Path) -> None:
         for demo, frames in enumerate(states):
             file[f"data/demo_{demo}/obs/front"] = frames
             file[f"data/demo_{demo}/rewards"] = np.arange(6) > 2
-    data = imported(tmp_path / "x.hdf5", tmp_path / "data.h5", "--label", "on=rewards", "--stack")
-    assert data.observation_shape == (24, 28, 12) and data.channels == {"": [4, 3]}
+    data = imported(tmp_path / "x.hdf5", tmp_path / "data.h5", "--label", "on=rewards", "--stack", "--resize", "14")
+    assert data.observation_shape == (12, 14, 12) and data.channels == {"": [4, 3]}
     (tmp_path / "t.csv").write_text(f"row,label,digest\n1,1,{digest(data.unlabelled()[1]).hex()}\n")
     more = imported(tmp_path / "data.h5", tmp_path / "more.h5", "--label", f"on={tmp_path / 't.csv'}")
     assert more.channels == data.channels
