@@ -85,7 +85,7 @@ def as_numbers(values: Array, subject: str) -> NDArray[np.float32]:
     columns = np.flatnonzero(lost.any(axis=0) | merged)
     if len(columns):
         named = ", ".join(map(str, columns[:NAMED]))
-        where = f"columns {named}, {len(columns)} in all"
+        where = f"{len(columns)} columns, such as {named}"
         do = "Give finite ones; subtract an offset, change the unit, or leave these columns out."
         raise UserError(f"{subject} {IN_FLOAT32}", where, do)
     return cast
