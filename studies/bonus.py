@@ -8,6 +8,7 @@ python -m studies.bonus runs/figure6 docs/results/figure6-doorkey.csv
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 
 from examples.figure6 import PLAYED, STEPS, TRAINED
 from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.processes import prepare
+from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.learners.baselines.agents import train
@@ -78,7 +81,9 @@ def paid(ensemble: Artefact, layout: int, steps: int) -> Run:
     engine = DOMAIN.make_engine(layout, chosen.environments, BaselineConfig.max_episode_steps, **world)
     setup = Setup(DOMAIN, ensemble.config, ensemble.path, TrainMetaConfig.of(), ensemble.seed, device)
     env = PaidEnv(engine, of_ensemble(setup, engine))
-    train(env, chosen, steps, ensemble.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        log, progress = MetricsLog(Path(folder) / "metrics.jsonl"), Progress("", steps, quiet=True)
+        train(env, chosen, steps, ensemble.seed, log, progress, Checkpoints(None))
     place = {"layout_seed": layout, "shortest_path": engine.shortest_path()}
     return Run(ensemble.seed, {"steps": steps}, Episodes.of_rows(env.episodes), place)
 

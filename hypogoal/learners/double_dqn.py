@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 from torch.nn.utils import clip_grad_norm_
 
+from hypogoal.core.arrays import Bools, Doubles, Floats, Ints, tensor
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.tensors import load_into
@@ -53,14 +53,14 @@ def double_q_targets(
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions of O policies to learn from, n of each."""
+    """Transitions that the policies of O options learn from."""
 
-    actions: Tensor  # int64 (n,)
-    rewards: Tensor  # float (n, O)
-    terminal: Tensor  # bool (n, O), nothing follows
-    discounts: float | Tensor  # of what follows, float or (n, 1)
-    weights: Tensor  # float (n,)
-    learns: Tensor  # bool (n, O), which policies learn from which transitions
+    actions: Ints  # (n,)
+    steps: Ints  # (n,), on which the next state is
+    reached: Bools  # (n, O), the option's sub-goal holds in the next state
+    terminated: Bools  # (n,), the task is over there
+    learns: Bools  # (n, O), which policies learn from which transitions
+    weights: Floats  # (n,)
 
 
 class DoubleDQN(Resumable):
@@ -85,22 +85,28 @@ class DoubleDQN(Resumable):
         batch: Batch,
         options: Sequence[int],
         step: int,
-    ) -> tuple[float, NDArray[np.float32]]:
+    ) -> tuple[float, Floats]:
         """Spec D2: a step down the Huber loss of a batch; then the target network follows.
 
         ``values`` are the online network's in the states, with gradients; ``next_online`` and ``next_target`` both
         networks' in the next states; all float (n, O, A). ``options`` (O,) and ``step`` are for errors. Returns the
         loss, and each transition's largest absolute error (n,).
         """
-        gamma, bounded = batch.discounts, self.config.bounded_values
-        targets = double_q_targets(batch.rewards, batch.terminal, next_online, next_target, gamma, bounded=bounded)
-        taken = values.gather(2, batch.actions[:, None, None].expand(-1, len(options), 1)).squeeze(2)
-        errors = (taken - targets) * batch.learns
+        actions, steps, reached, terminated, learns, weights = (
+            tensor(array, values.device) for array in vars(batch).values()
+        )
+        gamma, bounded = self.config.option_gamma, self.config.bounded_values
+        ahead = steps[:, None].float()
+        rewards = reached.float() * gamma ** (ahead - 1)  # Spec D1: 1 where the option's own classifier is positive
+        terminal = reached | terminated[:, None]
+        targets = double_q_targets(rewards, terminal, next_online, next_target, gamma**ahead, bounded=bounded)
+        taken = values.gather(2, actions[:, None, None].expand(-1, len(options), 1)).squeeze(2)
+        errors = (taken - targets) * learns
         losses = huber_loss(errors, torch.zeros_like(errors), reduction="none")
-        loss = (losses.sum(1) * batch.weights).mean()
+        loss = (losses.sum(1) * weights).mean()
         if not loss.isfinite():
-            wrong = (~losses.isfinite()).any(0).nonzero().flatten()
-            options = [options[column] for column in wrong.tolist()]
+            finite = losses.isfinite().all(0).tolist()
+            options = [option for option, fine in zip(options, finite, strict=True) if not fine]
         where = f"in the batch of update {self.updates}, step {step}"
         descend(loss, self.online, self.optimiser, f"options {list(options)}", where, self.largest)
         self.updates += 1
@@ -148,6 +154,6 @@ def descend(
     optimiser.step()
 
 
-def linear_epsilon(steps: NDArray[np.int64], over: int, final: float) -> NDArray[np.float64]:
-    """Exploration falling from 1 to ``final`` over ``over`` steps (Tables 2 and 4), float (n,)."""
+def linear_epsilon(steps: int | Ints, over: int, final: float) -> Doubles:
+    """Exploration falling from 1 to ``final`` over ``over`` steps (Tables 2 and 4), of each of ``steps``."""
     return np.maximum(final, 1.0 - (1.0 - final) * np.asarray(steps) / over)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 LAST = 100  # an agent is judged by its last so many episodes, an option by its last so many executions (Spec F3)
 
 
-class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
+class EpisodeRecorder(list[tuple[Any, ...]], Resumable):
     """Every finished episode of E environments, in the order in which they ended.
 
     A row is step, length, reward, terminated, succeeded: the columns of :class:`hypogoal.options.tables.Episodes`.
@@ -42,15 +42,10 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
         succeeded = step.succeeded
         if succeeded is None:
             succeeded = step.terminated & (self.rewards > 0)
-        for environment in np.flatnonzero(over):
-            row = (
-                self.steps,
-                int(self.lengths[environment]),
-                float(self.rewards[environment]),
-                int(step.terminated[environment]),
-                int(succeeded[environment]),
-            )
-            self.append(row)
+        columns = [self.lengths, self.rewards, step.terminated * 1, succeeded * 1]
+        ended = [column[over].tolist() for column in columns]
+        for facts in zip(*ended, strict=True):
+            self.append((self.steps, *facts))
         self.lengths[over] = 0
         self.rewards[over] = 0.0
 
@@ -73,11 +68,8 @@ class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
         return share > 0 and len(self) >= LAST and self.recent()["success"] >= share
 
     def snapshot(self) -> State:
-        return {**super().snapshot(), "rows": np.array(self, np.float64).reshape(-1, 5)}
+        return {**super().snapshot(), "rows": list(self)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        self.clear()
-        for step, length, reward, terminated, succeeded in snapshot["rows"].tolist():
-            row = (int(step), int(length), reward, int(terminated), int(succeeded))
-            self.append(row)
+        self[:] = map(tuple, snapshot["rows"])

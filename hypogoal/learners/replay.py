@@ -3,15 +3,13 @@
 A transition costs bytes, not images.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Columns
-from hypogoal.core.checkpoints import Resumable, State
+from hypogoal.core.arrays import Bools, Columns, Floats, Ints
+from hypogoal.core.checkpoints import Resumable
 
 Rows = TypeVar("Rows", bound=Columns)
 
@@ -20,10 +18,10 @@ Rows = TypeVar("Rows", bound=Columns)
 class Steps(Columns):
     """Steps of sequences, or transitions over several of these."""
 
-    state: NDArray[np.int32]  # ids
-    action: NDArray[np.int16]
-    next_state: NDArray[np.int32]  # ids
-    steps: NDArray[np.int16]  # from state to next_state
+    state: Ints  # ids
+    action: Ints
+    next_state: Ints  # ids
+    steps: Ints  # from state to next_state
 
 
 Joined = TypeVar("Joined", bound=Steps)
@@ -37,7 +35,7 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
     both: Schaul et al. 2015.
     """
 
-    CHANGING = ("size", "next", "largest")  # and the rows stored
+    CHANGING = ("data", "priorities", "size", "next", "largest")
 
     def __init__(
         self,
@@ -64,38 +62,29 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         self.next = (self.next + count) % self.capacity
         self.size = min(self.size + count, self.capacity)
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Ints, Floats]:
         """Stratified in proportion to priority: indices and importance weights (count,), the largest of these 1."""
         priorities = self.priorities[: self.size]
         sums = priorities.cumsum()
         total = sums[-1]
-        drawn = (np.arange(count) + rng.random(count)) * (total / count)
+        strata = np.arange(count) + rng.random(count)
+        drawn = strata * (total / count)
         drawn = np.minimum(drawn, np.nextafter(total, 0))
-        indices = np.searchsorted(sums, drawn, side="right")
+        indices = np.searchsorted(
+            sums,
+            drawn,
+            side="right",
+        )
         shares = priorities[indices] / total
         weights = (self.size * shares) ** -self.beta
-        return indices, (weights / weights.max()).astype(np.float32)
+        weights /= weights.max()
+        return indices, weights.astype(np.float32)
 
-    def set_priorities(self, indices: NDArray[np.int64], errors: NDArray[np.floating]) -> None:
+    def set_priorities(self, indices: Ints, errors: Floats) -> None:
         """New priorities of sampled transitions: their absolute TD errors (n,)."""
         priorities = errors.astype(np.float64) + 1e-3
         self.largest = max(self.largest, float(priorities.max()))
         self.priorities[indices] = priorities**self.alpha
-
-    def snapshot(self) -> State:
-        rows = slice(self.size)
-        return {
-            **super().snapshot(),
-            "data": self.data.at(rows).snapshot(),
-            "priorities": self.priorities[rows].copy(),
-        }
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue, on a fresh replay, from a ``snapshot`` of one of the same capacity and fields."""
-        super().restore(snapshot)
-        rows = slice(self.size)
-        self.data.put(rows, type(self.data)(**snapshot["data"]))
-        self.priorities[rows] = snapshot["priorities"]
 
 
 class StepsAhead(Resumable):
@@ -110,7 +99,7 @@ class StepsAhead(Resumable):
         self.n = n
         self.open: list[list[tuple[int, int]]] = [[] for _ in range(sequences)]  # states and actions
 
-    def add(self, rows: Joined, ended: NDArray[np.bool_]) -> Joined:
+    def add(self, rows: Joined, ended: Bools) -> Joined:
         """One step of every sequence, and which sequences end with it, bool (E,); returns the transitions now complete.
 
         A transition has ``state`` and ``action`` of its first step, and all else of its last.
@@ -119,14 +108,17 @@ class StepsAhead(Resumable):
             return rows
         complete: list[tuple[int, int, int, int]] = []  # sequence, steps, state, action
         for sequence, steps in enumerate(self.open):
-            state, action = int(rows.state[sequence]), int(rows.action[sequence])
-            steps.append((state, action))
+            now = rows.at(sequence)
+            steps.append((now.state.item(), now.action.item()))
             while steps and (ended[sequence] or len(steps) == self.n):
-                complete.append((sequence, len(steps), *steps.pop(0)))
-        sequences, counts, states, actions = np.array(complete, dtype=np.int64).reshape(-1, 4).T
+                count = len(steps)
+                first = steps.pop(0)
+                complete.append((sequence, count, *first))
+        columns = np.array(complete, dtype=np.int64).reshape(-1, 4).T
+        sequences, counts, states, actions = columns
         return replace(
             rows.at(sequences),
-            state=states.astype(np.int32),
-            action=actions.astype(np.int16),
-            steps=counts.astype(np.int16),
+            state=states,
+            action=actions,
+            steps=counts,
         )

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hypogoal.core.config import assigned
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
@@ -84,7 +82,7 @@ def write_layout(
     """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
     Both are null where the engine does not know them; then no episode of random play is played. ``layouts`` are those
-    of many; last comes the step at which each room was first reached, where there are rooms.
+    of many.
     """
     success = None
     if config.random_episodes:
@@ -97,9 +95,4 @@ def write_layout(
         "random_success": success,
         "random_episodes": 0 if success is None else config.random_episodes,
     }
-    if "room" in engine.position_names:
-        positions = engine.positions(np.arange(engine.n_states))
-        rooms, first = np.unique(positions[:, engine.position_names.index("room")], return_index=True)
-        steps = np.maximum(first - len(engine.starts) + 1, 0)
-        facts["rooms"] = dict(zip(map(str, rooms.tolist()), steps.tolist(), strict=True))
     (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.config import known, resolve
@@ -15,7 +15,9 @@ from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import assemble, continue_with
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import FILE
-from hypogoal.options.loop import OptionLoop, Transitions
+from hypogoal.options.learner import Transitions
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.parts import Ids
 
 REPLAY = 1_000  # nothing is learned: a small one
 SOLVED = "solved"  # why the last option of an episode ended
@@ -31,17 +33,6 @@ class Frame:
     predictions: tuple[bool, ...]  # of its sub-goal's K members on the state; option g*K + k goes by the k-th
     left: int  # steps until its timeout
     ended: str  # why it ended in this state; empty where it goes on
-
-
-@dataclass(frozen=True)
-class Episode:
-    """T steps."""
-
-    observations: Observations  # (T + 1, *obs), the last one that of the state it ended in
-    actions: NDArray[np.int64]  # (T,), primitive ones
-    options: NDArray[np.int64]  # (T,), which option ran
-    rewards: NDArray[np.float32]  # (T,)
-    terminated: bool  # the task was over; otherwise the episode was cut
 
 
 def agent_of(
@@ -81,63 +72,42 @@ def agent_of(
 def play_episode(loop: OptionLoop, members: int) -> list[Frame]:
     """One episode of :func:`agent_of`, K ``members``: a frame per step, and one for where each execution ended."""
     frames = []
-
-    def see(
-        ids: NDArray[np.int64],
-        step: int,
-        left: int,
-        moved: Transitions,
-        *,
-        ended: bool,
-    ) -> None:
-        [option] = moved.options.tolist()
-        first = option - option % members
-        predictions = loop.terminations.of(ids)[0, first : first + members].tolist()
-        why = _why(loop, moved, predictions[option - first]) if ended else ""
-        frames.append(
-            Frame(
-                loop.engine.images(ids)[0].copy(),
-                step,
-                option,
-                tuple(predictions),
-                left,
-                why,
-            )
-        )
-
     for step, moved in enumerate(_steps(loop)):
         left = loop.config.option_timeout - int(loop.age[0])
-        see(moved.ids, step, left + 1, moved, ended=False)
+        [option] = moved.options.tolist()
+        running = partial(_frame, loop, members, option)
+        frames.append(running(moved.ids, step, left + 1, ""))
         if moved.ended[0]:
-            see(moved.next_ids, step + 1, left, moved, ended=True)
+            frames.append(running(moved.next_ids, step + 1, left, _why(loop, moved)))
     return frames
 
 
-def _why(loop: OptionLoop, moved: Transitions, positive: bool) -> str:
+def _frame(loop: OptionLoop, members: int, option: int, ids: Ids, step: int, left: int, ended: str) -> Frame:
+    first = option - option % members
+    predictions = loop.terminations.of(ids)[0, first : first + members]
+    [picture] = loop.engine.images(ids)
+    return Frame(picture.copy(), step, option, tuple(predictions.tolist()), left, ended)
+
+
+def _why(loop: OptionLoop, moved: Transitions) -> str:
     """Why an option ended."""
     if moved.terminated[0]:
         *_, succeeded = loop.recorder.episodes[-1]
         return SOLVED if succeeded else "the episode, unsolved"
     if moved.timed_out[0]:
         return "its time is up"
-    return "its classifier is positive" if positive else "the episode is cut"
+    return "its classifier is positive" if moved.reached[0] else "the episode is cut"
 
 
-def play_episodes(loop: OptionLoop, count: int) -> Iterator[Episode]:
-    """So many episodes of :func:`agent_of`, one after the other."""
+def play_episodes(loop: OptionLoop, count: int) -> Iterator[tuple[Observations, Transitions]]:
+    """So many episodes of :func:`agent_of`: observations (T + 1, *obs), the last of where it ended, and T steps."""
     for _ in range(count):
-        observations, steps = [], []
+        pictures, steps = [], []
         for moved in _steps(loop):
-            observations.append(loop.engine.images(moved.ids)[0].copy())
+            pictures.append(loop.engine.images(moved.ids)[0].copy())
             steps.append(moved)
-        observations.append(loop.engine.images(moved.next_ids)[0])
-        yield Episode(
-            np.stack(observations),
-            np.array([moved.actions[0] for moved in steps], dtype=np.int64),
-            np.array([moved.options[0] for moved in steps], dtype=np.int64),
-            np.array([moved.rewards[0] for moved in steps], dtype=np.float32),
-            bool(moved.terminated[0]),
-        )
+        pictures.append(loop.engine.images(moved.next_ids)[0])
+        yield np.stack(pictures), Transitions.joined(steps)
 
 
 def _steps(loop: OptionLoop) -> Iterator[Transitions]:

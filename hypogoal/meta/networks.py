@@ -1,8 +1,5 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
-import math
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
@@ -26,10 +23,11 @@ class LightMetaNetwork(LightNetwork):
         if name == "light" and standard is None:
             embedding: Embedding = CellEmbedding(observation_shape)
         else:
+            name = AUTO if name == "light" else name
             embedding = embedding_for(
                 observation_shape,
                 standard,
-                AUTO if name == "light" else name,
+                name,
             )
         super().__init__(embedding)
         self.outputs = _outputs(WIDTH, options)
@@ -117,6 +115,15 @@ class CategoricalHead(nn.Module):
         """Of each option to be chosen, float32 (N, O); rows sum to 1, and options not offered have 0."""
         return scores.masked_fill(~offered, -torch.inf).log_softmax(1).exp()
 
+    def certainty(self, scores: Tensor, offered: Tensor) -> dict[str, float]:
+        """How sure it is: ``choice_entropy`` (nats), the probability of the ``top_choice``, means over N decisions.
+
+        Where ``top_choice`` is near 1, an option that stops working is not left again soon.
+        """
+        probabilities = self.probabilities(scores, offered)
+        entropy = torch.special.entr(probabilities).sum(1).mean()
+        return {"choice_entropy": float(entropy), "top_choice": float(probabilities.amax(1).mean())}
+
 
 class GaussianHead(CategoricalHead):
     """The paper's Gaussian policy head: scores (N, O) are drawn, and remembered; the best offered is played.
@@ -124,8 +131,6 @@ class GaussianHead(CategoricalHead):
     Its entropy is that of the drawn scores. It depends on their spread alone, so an entropy bonus cannot keep the
     choice from becoming certain.
     """
-
-    NODES = 16  # of the quadrature; a test holds it against draws
 
     def __init__(self, options: int):
         super().__init__(options)
@@ -151,18 +156,9 @@ class GaussianHead(CategoricalHead):
         normal = Normal(scores, self._spread(scores).expand_as(scores))
         return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
 
-    def probabilities(self, scores: Tensor, offered: Tensor) -> Tensor:
-        """That an option's draw is the highest of those offered, by Gauss-Hermite quadrature over that draw."""
-        spread = self._spread(scores)
-        chosen = torch.zeros_like(scores)
-        nodes, weights = np.polynomial.hermite_e.hermegauss(self.NODES)
-        for node, weight in zip(nodes, weights, strict=True):
-            lead = (scores + spread * node)[:, :, None] - scores[:, None, :]
-            below = torch.special.log_ndtr(lead / spread).masked_fill(~offered[:, None, :], 0.0)
-            others = below.sum(2) - below.diagonal(dim1=1, dim2=2)
-            chosen += weight / math.sqrt(2 * math.pi) * others.exp()
-        chosen = chosen.masked_fill(~offered, 0.0)
-        return chosen / chosen.sum(1, keepdim=True)
+    def certainty(self, scores: Tensor, offered: Tensor) -> dict[str, float]:
+        """Unknown: how likely an option's draw is the highest has no closed form."""
+        return {}
 
     def _spread(self, scores: Tensor) -> Tensor:
         return self.log_std.to(scores.device).exp()

@@ -6,11 +6,9 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.arrays import Columns, tensor
-from hypogoal.core.checkpoints import snapshot_of
+from hypogoal.core.arrays import Columns, Doubles, tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import drawing_from, rng_for, torch_generator
 from hypogoal.core.tensors import load_into
@@ -22,7 +20,7 @@ from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
 from hypogoal.options.networks import apply_to_states
-from hypogoal.options.parts import Ids
+from hypogoal.options.parts import Flags, Floats, Ids
 
 GRADIENT_NORM = 0.5
 CLIP = 0.2  # of the ratio of probabilities: Schulman et al. 2017
@@ -33,10 +31,10 @@ VALUE_WEIGHT = 0.5  # of the value loss: Schulman et al. 2017
 class Draws(Columns):
     """Choices of an option, arrays (n, ...)."""
 
-    state: NDArray[np.int64]  # in which it was chosen
-    offered: NDArray[np.bool_]  # (n, O)
-    drawn: NDArray[np.float32]  # what the head remembers of the draw, (n, R)
-    log_prob: NDArray[np.float32]
+    state: Ids  # in which it was chosen
+    offered: Flags  # (n, O)
+    drawn: Floats  # what the head remembers of the draw, (n, R)
+    log_prob: Floats
 
 
 class MetaPolicy(Chooser):
@@ -45,7 +43,7 @@ class MetaPolicy(Chooser):
     ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
     """
 
-    CHANGING = ("policy", "optimiser", "generator", "rng", "running", "updates")  # and the decisions
+    CHANGING = ("policy", "optimiser", "generator", "rng", "running", "draws", "outcomes", "updates")
 
     def __init__(
         self,
@@ -168,7 +166,7 @@ class MetaPolicy(Chooser):
         drawn = tensor(draws.drawn, self.device)
         old = tensor(draws.log_prob, self.device)
         with torch.no_grad():
-            certainty = certainty_of(self.head.probabilities(outputs[:, :-1], offered))
+            certainty = self.head.certainty(outputs[:, :-1], offered)
         for epoch in range(config.epochs):
             order = self.rng.permutation(len(draws))
             for begin in range(0, len(order), config.meta_batch):
@@ -202,27 +200,13 @@ class MetaPolicy(Chooser):
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
         load_into(self.policy, state, FILE)
 
-    def snapshot(self) -> dict[str, Any]:
-        if self.draws:  # one array for each column
-            self.draws, self.outcomes = [Draws.joined(self.draws)], [Outcome.joined(self.outcomes)]
-        return {**super().snapshot(), "draws": snapshot_of(self.draws), "outcomes": snapshot_of(self.outcomes)}
-
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
         self.draws = [Draws(**part) for part in snapshot["draws"]]
         self.outcomes = [Outcome(**part) for part in snapshot["outcomes"]]
 
 
-def certainty_of(probabilities: Tensor) -> dict[str, float]:
-    """How sure a policy is: ``choice_entropy`` (nats) and the probability of the ``top_choice``, means over decisions.
-
-    ``probabilities`` are (n, O). Where ``top_choice`` is near 1, an option that stops working is not left again soon.
-    """
-    entropy = torch.special.entr(probabilities).sum(1).mean()
-    return {"choice_entropy": float(entropy), "top_choice": float(probabilities.amax(1).mean())}
-
-
-def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
+def scaled_advantages(advantages: Doubles, floor: float) -> Doubles:
     """Advantages (n,) less their mean, in units of their standard deviation, or of ``floor`` where that is larger.
 
     Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts

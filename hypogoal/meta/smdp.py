@@ -1,18 +1,19 @@
 """Returns and advantages of decisions that last several steps (Spec E1)."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hypogoal.core.arrays import Bools, Doubles
 
 
 def smdp_advantages(
-    returns: NDArray[np.float64],
-    discounts: NDArray[np.float64],
-    values: NDArray[np.float64],
-    next_values: NDArray[np.float64],
-    terminated: NDArray[np.bool_],
-    ended: NDArray[np.bool_],
+    returns: Doubles,
+    discounts: Doubles,
+    values: Doubles,
+    next_values: Doubles,
+    terminated: Bools,
+    ended: Bools,
     trace: float,
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Spec E1: generalised advantages of consecutive decisions of one environment.
 
     delta_t = R_t + gamma^tau_t (1 - terminated_t) V(s'_t) - V(s_t);

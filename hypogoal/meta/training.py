@@ -62,7 +62,7 @@ def assemble(
     chooser = load_chooser(config.chooser).create(engine, terminations.options, config, seed, device)
     recorder = Recorder(terminations.options, engine)
     gamma = GAMMA if isinstance(config, TrainMetaConfig) else 1.0
-    visited = Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None
+    visited = Visited(engine, config.save_visited, seed) if config.save_visited else None
     return OptionLoop(engine, terminations, learner, chooser, recorder, config, gamma, visited)
 
 

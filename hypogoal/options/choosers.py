@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Columns
+from hypogoal.core.arrays import Columns, Doubles
 from hypogoal.core.seeding import rng_for
 from hypogoal.options.parts import Flags, Ids, Part, load_part
 
@@ -38,9 +37,9 @@ class Outcome(Columns):
     began: Ids  # the states in which these were chosen
     reached: Flags  # the options' own classifiers ended them
     inside: Flags  # these were positive already where they began
-    returns: NDArray[np.float64]  # the environment's rewards inside the option, discounted from its start
+    returns: Doubles  # the environment's rewards inside the option, discounted from its start
     durations: Ids  # tau, the options' steps
-    discounts: NDArray[np.float64]  # gamma ** tau, for the state reached
+    discounts: Doubles  # gamma ** tau, for the state reached
     next_ids: Ids  # the states reached
     terminated: Flags  # the task is over, nothing follows
     truncated: Flags  # the episode was cut, at its limit or because the next option begins at a start

@@ -8,7 +8,7 @@ from its first state on, with nothing remembered; so it does in acting, in learn
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Self
 
@@ -26,15 +26,10 @@ from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import Batch, DoubleDQN
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.observations import PICTURE, Observations
+from hypogoal.options import saved
 from hypogoal.options.config import STACK, PaperConfig
-from hypogoal.options.learner import (
-    FILE,
-    Learner,
-    Policies,
-    SavedOptions,
-    Transitions,
-)
-from hypogoal.options.parts import Ids
+from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.parts import Flags, Ids
 
 
 class PaperQNetwork(nn.Module):
@@ -99,19 +94,14 @@ class Lived(Columns):
     """Steps of executions, arrays (n, ...)."""
 
     path: NDArray[np.int32]  # (n, recurrence + 1), ids: a window, its last states real, and the state that came next
-    length: NDArray[np.int32]  # of the window
-    action: NDArray[np.int16]
-    terminated: NDArray[np.bool_]  # the task is over
+    length: Ids  # of the window
+    action: Ids
+    terminated: Flags  # the task is over
 
     @classmethod
     def empty(cls, rows: int, recurrence: int) -> Self:
         """Rows of zeros."""
-        return cls(
-            path=np.zeros((rows, recurrence + 1), np.int32),
-            length=np.zeros(rows, np.int32),
-            action=np.zeros(rows, np.int16),
-            terminated=np.zeros(rows, np.bool_),
-        )
+        return replace(cls.zeros(rows), path=np.zeros((rows, recurrence + 1), np.int32))
 
 
 class Member(DoubleDQN):
@@ -137,19 +127,23 @@ class PaperLearner(Learner):
         """It sees pictures only, and learns single steps of its members' own executions."""
         if config.experience != "own":
             fault = "network=paper needs experience=own"
-            raise UserError(fault, f"experience={config.experience}", "Give --set experience=own.")
+            raise UserError(
+                fault,
+                f"experience={config.experience}",
+                "Give --set experience=own.",
+            )
         if engine.observation_dtype != PICTURE:
             fault = "the paper's networks see pictures only"
             raise UserError(fault, "network=paper", "Give --set network=light.")
 
     @classmethod
-    def policies(cls, saved: SavedOptions) -> Policies:
-        return PaperPolicies(saved)
+    def policies(cls, options: saved.SavedOptions) -> saved.Policies:
+        return PaperPolicies(options)
 
     def build(self, config: PaperConfig, seed: int) -> None:
         self.members = []
+        shape, actions = self.engine.observation_shape, self.engine.n_actions
         for option in range(self.options):
-            shape, actions = self.engine.observation_shape, self.engine.n_actions
             with drawing_from(torch_generator(seed, "option-weights", option)):
                 network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), config))
@@ -180,22 +174,23 @@ class PaperLearner(Learner):
             rows = options == option
             network = self.members[option].online.eval()
             lengths = self.lengths[rows]
-            windows = left_aligned(self.windows[rows], lengths)
-            states, places = np.unique(windows, return_inverse=True)
-            features = network.see(self.tensor(self.engine.images(states)))
-            seen = self.tensor(places.reshape(windows.shape))
-            values = network(features, seen, torch.from_numpy(lengths))
+            images, places = self._seen(left_aligned(self.windows[rows], lengths))
+            values = network(
+                network.see(images),
+                places,
+                torch.from_numpy(lengths),
+            )
             chosen[rows] = values.argmax(1).cpu().numpy()
         return chosen
 
+    def _seen(self, windows: Ids) -> tuple[Tensor, Tensor]:
+        """The distinct images in windows, and which one each place has."""
+        states, places = np.unique(windows, return_inverse=True)
+        return self.tensor(self.engine.images(states)), self.tensor(places.reshape(windows.shape))
+
     def observe(self, moved: Transitions) -> None:
         path = np.column_stack([self.windows, moved.next_ids])
-        steps = Lived.cast(
-            path,
-            self.lengths,
-            moved.actions,
-            moved.terminated,
-        )
+        steps = Lived.cast(path, self.lengths, moved.actions, moved.terminated)
         for option in np.unique(moved.options):
             rows = moved.options == option
             member = self.members[option]
@@ -217,46 +212,39 @@ class PaperLearner(Learner):
 
     def _update(self, option: int, member: Member) -> float:
         """One update of a member's policy; returns the loss, 0 where all steps drawn are forgotten."""
-        config = self.config
-        most = config.recurrence
-        indices, weights = member.replay.sample(config.option_batch, self.rng)
+        most = self.config.recurrence
+        indices, weights = member.replay.sample(self.config.option_batch, self.rng)
         steps = member.replay.data.at(indices)
         padding = np.arange(most + 1) < most - steps.length[:, None]
         known = (self.engine.remembers(steps.path) | padding).all(axis=1)
         if not known.any():
             return 0.0
-        indices = indices[known]
-        weights = weights[known]
-        steps = steps.at(known)
+        indices, weights, steps = indices[known], weights[known], steps.at(known)
 
         path = steps.path.astype(np.int64)
-        length = steps.length.astype(np.int64)
+        length = steps.length
         later = np.minimum(length + 1, most)
-        now = left_aligned(path[:, :-1], length)
-        next_ones = left_aligned(path[:, 1:], later)
-        windows = np.stack([now, next_ones])
-        states, places = np.unique(windows, return_inverse=True)
-        images = self.tensor(self.engine.images(states))  # each once; BatchNorm counts it once (DEV-51)
-        before, after = self.tensor(places.reshape(windows.shape))
-        online = member.online.train()
-        target = member.target
+        lengths, later_lengths = torch.from_numpy(length), torch.from_numpy(later)
+        windows = np.stack([left_aligned(path[:, :-1], length), left_aligned(path[:, 1:], later)])
+        images, places = self._seen(windows)  # each image once; BatchNorm counts it once (DEV-51)
+        before, after = places
+        online, target = member.online.train(), member.target
         features = online.see(images)
-        values = online(features, before, torch.from_numpy(length))
+        values = online(features, before, lengths)
         with torch.no_grad():
-            next_online = online(features, after, torch.from_numpy(later))
-            next_target = target(target.see(images), after, torch.from_numpy(later))
+            next_online = online(features, after, later_lengths)
+            next_target = target(target.see(images), after, later_lengths)
 
         next_states = path[:, -1]
-        reached = self.terminations.of_running(next_states, np.full_like(next_states, option))
-        rewards = self.tensor(reached).float()  # Spec D1: 1 where the option's own classifier is positive, else 0
-        terminal = self.tensor(reached | steps.terminated)
+        reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]
+        ones = np.ones_like(length)
         batch = Batch(
-            actions=self.tensor(steps.action.astype(np.int64)),
-            rewards=rewards[:, None],
-            terminal=terminal[:, None],
-            discounts=config.option_gamma,
-            weights=self.tensor(weights),
-            learns=torch.ones_like(terminal)[:, None],
+            steps.action,
+            ones,
+            reached,
+            steps.terminated,
+            np.ones_like(reached),
+            weights,
         )
         loss, errors = member.update(
             values[:, None],
@@ -278,7 +266,7 @@ class PaperLearner(Learner):
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):
-            member.load(below(f"{option}.", weights), f"option {option} of {FILE}")
+            member.load(below(f"{option}.", weights), f"option {option} of {saved.FILE}")
 
 
 def left_aligned(windows: Ids, lengths: Ids) -> Ids:
@@ -291,33 +279,36 @@ def left_aligned(windows: Ids, lengths: Ids) -> Ids:
 class PaperPolicies:
     """Greedy policies of saved options that have a network each (Spec D2, D8)."""
 
-    def __init__(self, saved: SavedOptions):
-        self.recurrence = saved.config["recurrence"]
+    def __init__(self, options: saved.SavedOptions):
+        self.recurrence = options.config["recurrence"]
         if not isinstance(self.recurrence, int):
             fault = "these options remember their executions in another way than this version's"
-            raise UserError(fault, f"recurrence={self.recurrence}", "Train them again with --set recurrence=N.")
-        make = partial(PaperQNetwork, saved.shape, saved.actions("0.values.2.bias", 1))
+            raise UserError(
+                fault,
+                f"recurrence={self.recurrence}",
+                "Train them again with --set recurrence=N.",
+            )
+        make = partial(
+            PaperQNetwork,
+            options.shape,
+            options.actions("0.values.2.bias", 1),
+        )
         self.networks = []
-        for option in range(saved.count):
-            network = load_fitting(make, below(f"{option}.", saved.weights), FILE)
+        for option in range(options.count):
+            network = load_fitting(make, below(f"{option}.", options.weights), saved.FILE)
             self.networks.append(network.eval())
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
-        return _Execution(self.networks[option], self.recurrence)
+        window: deque[Observations] = deque(maxlen=self.recurrence)
+        return partial(_act, self.networks[option], window)
 
 
-class _Execution:
-    """One execution of an option, whose last states its network sees."""
-
-    def __init__(self, network: PaperQNetwork, recurrence: int):
-        self.network = network
-        self.window: deque[Observations] = deque(maxlen=recurrence)
-
-    @torch.no_grad()
-    def __call__(self, observation: Observations) -> int:
-        self.window.append(observation)
-        features = self.network.see(torch.from_numpy(np.stack(self.window)))
-        count = len(features)
-        values = self.network(features, torch.arange(count)[None], torch.tensor([count]))
-        return int(values.argmax())
+@torch.no_grad()
+def _act(network: PaperQNetwork, window: deque[Observations], observation: Observations) -> int:
+    """The action in the last state of an execution, of which ``window`` has those before."""
+    window.append(observation)
+    features = network.see(torch.from_numpy(np.stack(window)))
+    count = len(window)
+    values = network(features, torch.arange(count)[None], torch.tensor([count]))
+    return int(values.argmax())

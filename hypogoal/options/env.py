@@ -14,10 +14,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.observations import Observations
-from hypogoal.options.learner import Policies
 from hypogoal.options.loop import offered_options
 from hypogoal.options.parts import Flags, Floats
 from hypogoal.options.reward import require_observations
+from hypogoal.options.saved import Policies
 from hypogoal.options.termination import Terminations
 
 MASKED = "a masked option runs: choose by action_masks(), or have warnings of this ignored"
@@ -152,7 +152,11 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             UserError: there is no such option, or the environment was not reset.
         """
         if not self.action_space.contains(action):
-            raise UserError("no such option", repr(action), f"They are 0 to {self.options.count - 1}.")
+            raise UserError(
+                "no such option",
+                repr(action),
+                f"They are 0 to {self.options.count - 1}.",
+            )
         option = int(action)
         masked = not self.action_masks()[option]
         if masked:

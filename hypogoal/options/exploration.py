@@ -1,8 +1,8 @@
 """How the intra-option policies explore: when a random action is played in place of their own."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Doubles
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.options.config import LearnerConfig
 from hypogoal.options.parts import Ids
@@ -36,7 +36,7 @@ class Exploration(Resumable):
     def mix(
         self,
         policy: Ids,
-        epsilon: NDArray[np.float64],
+        epsilon: Doubles,
         age: Ids,
     ) -> Ids:
         """Actions int64 (E,): the policy's (E,), or random ones, by ``epsilon`` (E,), ``age`` (E,) steps after

@@ -1,7 +1,7 @@
 """What all learners of intra-option policies do: act, explore, count, and keep it in artefacts (Spec D2, D8)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,55 +10,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.arrays import tensor
-from hypogoal.core.artefacts import AGAIN
+from hypogoal.core.arrays import Columns, Doubles, tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
-from hypogoal.observations import Observations
 from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
-from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part
+from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part, saved_row
+from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.termination import ORACLE, Terminations
 
-FILE = "options.safetensors"  # of an artefact
 LEARNERS = {
     "light": "hypogoal.options.light:LightLearner",
     "paper": "hypogoal.options.conv_gru:PaperLearner",
     "planned": "hypogoal.options.planned:PlannedLearner",
 }
 
-# Starts an execution of an option: gives a function from an observation (*obs) to the action.
-Policies = Callable[[int], Callable[[Observations], int]]
-
 
 @dataclass(frozen=True)
-class SavedOptions:
-    """An artefact's options, on observations of this ``shape``."""
-
-    config: Mapping[str, Any]
-    weights: Mapping[str, Tensor]
-    shape: tuple[int, ...]
-
-    @property
-    def count(self) -> int:
-        """How many options there are."""
-        return len(self.config["sub_goals"]) * self.config["members"]
-
-    def actions(self, layer: str, heads: int) -> int:
-        """How many actions there are, A, if the weights' last ``layer`` has so many heads of A outputs.
-
-        A ``UserError`` where the weights are not those of so many options.
-        """
-        actions = len(self.weights.get(layer, ())) // heads
-        if not actions:
-            raise UserError("the weights do not fit the manifest", f"{self.count} options", AGAIN)
-        return actions
-
-
-@dataclass(frozen=True)
-class Transitions:
+class Transitions(Columns):
     """One step of every environment, arrays (E,): what intra-option policies learn from."""
 
     ids: Ids
@@ -147,7 +118,7 @@ class Learner(Part, ABC):
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         """Those of :meth:`weights` among tensors of an artefact."""
 
-    def epsilon(self) -> NDArray[np.float64]:
+    def epsilon(self) -> Doubles:
         """Every option's exploration, float (O,)."""
         steps = self.steps_since_positive if self.config.epsilon_from == "first-positive" else self.option_steps
         return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
@@ -180,10 +151,7 @@ class Learner(Part, ABC):
         """
         self.load_weights(state)
         for name in self.KEPT:
-            saved = state.get(name)
-            if saved is None or saved.shape != (self.options,) or saved.dtype != torch.int64 or (saved < 0).any():
-                raise UserError(f"the weights do not fit the manifest (at {name})", f"{self.options} options", AGAIN)
-            setattr(self, name, saved.numpy().copy())
+            setattr(self, name, saved_row(state, name, self.options, torch.int64))
 
 
 def load_learner(name: str) -> type[Learner]:

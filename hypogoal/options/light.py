@@ -5,37 +5,23 @@ with its own reward, unless the transition starts inside its sub-goal. With ``ex
 member whose option was running learns, and a transition may reach several steps ahead within its execution.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import drawing_from, torch_generator
-from hypogoal.core.tensors import below, load_fitting
+from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import Batch, DoubleDQN
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
-from hypogoal.observations import Observations, standard_of
+from hypogoal.options import networks, saved
 from hypogoal.options.config import STACK, LightConfig
-from hypogoal.options.learner import (
-    FILE,
-    Learner,
-    Policies,
-    SavedOptions,
-    Transitions,
-)
-from hypogoal.options.networks import (
-    LightQNetwork,
-    PictureEmbedding,
-    apply_all_to_states,
-    apply_to_states,
-)
-from hypogoal.options.parts import Flags, Ids
+from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.parts import Flags, Floats, Ids
 
 POSITIVES_KEPT = 512  # per member
 POSITIVE_SHARE = 0.25  # of a batch: steps that reached a sub-goal
@@ -46,8 +32,8 @@ GRADIENT_NORM = 10.0
 class Lessons(Steps):
     """Transitions to learn from, arrays (n,)."""
 
-    option: NDArray[np.int16]  # that was running
-    terminated: NDArray[np.bool_]  # the task is over
+    option: Ids  # that was running
+    terminated: Flags  # the task is over
 
 
 class LightLearner(Learner):
@@ -61,11 +47,15 @@ class LightLearner(Learner):
         if config.n_step > 1 and config.experience != "own":
             fault = "several steps at once are for an option's own member: others' sub-goals may lie among them"
             setting = f"n_step={config.n_step}, experience={config.experience}"
-            raise UserError(fault, setting, "Give --set experience=own or --set n_step=1.")
+            raise UserError(
+                fault,
+                setting,
+                "Give --set experience=own or --set n_step=1.",
+            )
 
     @classmethod
-    def policies(cls, saved: SavedOptions) -> Policies:
-        return LightPolicies(saved)
+    def policies(cls, options: saved.SavedOptions) -> saved.Policies:
+        return saved.LightPolicies(options)
 
     def build(self, config: LightConfig, seed: int) -> None:
         self.running_only = config.experience == "own"
@@ -75,17 +65,16 @@ class LightLearner(Learner):
         self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
         self.steps = self.due = 0
 
-    def network(self, config: LightConfig, seed: int) -> LightQNetwork:
+    def network(self, config: LightConfig, seed: int) -> networks.LightQNetwork:
         """One with fresh weights."""
         engine = self.engine
         with drawing_from(torch_generator(seed, "option-weights")):
-            shape, embedding = engine.observation_shape, config.embedding
-            network = LightQNetwork(
-                shape,
+            network = networks.LightQNetwork(
+                engine.observation_shape,
                 self.options,
                 engine.n_actions,
                 engine.standard,
-                embedding,
+                config.embedding,
             )
         return network.to(self.device)
 
@@ -101,7 +90,7 @@ class LightLearner(Learner):
         options: Ids,
         age: Ids,
     ) -> Ids:
-        values = apply_to_states(self.networks.online, self.engine, ids).cpu().numpy()
+        values = networks.apply_to_states(self.networks.online, self.engine, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
@@ -129,14 +118,11 @@ class LightLearner(Learner):
 
         With own experience, False for all options but the one that was running.
         """
-        states = rows.state.astype(np.int64)
-        next_states = rows.next_state.astype(np.int64)
         if not self.running_only:
-            return self.terminations.of(states), self.terminations.of(next_states)
-        option = rows.option.astype(np.int64)
-        owner = option[:, None] == np.arange(self.options)
-        inside = self.terminations.of_running(states, option)
-        reached = self.terminations.of_running(next_states, option)
+            return self.terminations.of(rows.state), self.terminations.of(rows.next_state)
+        owner = rows.option[:, None] == np.arange(self.options)
+        inside = self.terminations.of_running(rows.state, rows.option)
+        reached = self.terminations.of_running(rows.next_state, rows.option)
         return owner & inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
@@ -155,25 +141,31 @@ class LightLearner(Learner):
         learns = ~inside
         if self.running_only:
             learns &= lessons.option[:, None] == np.arange(self.options)
-        ahead = self.tensor(lessons.steps).float()[:, None]
-        gamma = self.config.option_gamma
-        rewards = self.tensor(reached).float()  # Spec D1: 1 where the option's own classifier is positive, else 0
         batch = Batch(
-            actions=self.tensor(lessons.action.astype(np.int64)),
-            rewards=rewards * gamma ** (ahead - 1),
-            terminal=self.tensor(reached | lessons.terminated[:, None]),
-            discounts=gamma**ahead,
-            weights=self.tensor(weights),
-            learns=self.tensor(learns),
+            lessons.action,
+            lessons.steps,
+            reached,
+            lessons.terminated,
+            learns,
+            weights,
         )
-        states = lessons.state.astype(np.int64)
-        next_states = lessons.next_state.astype(np.int64)
-        values = self._values(states, next_states)
-        loss, errors = self.networks.update(*values, batch, range(self.options), self.steps)
+        values = networks.values_of(
+            self.networks.online,
+            self.networks.target,
+            self.engine,
+            lessons.state,
+            lessons.next_state,
+        )
+        loss, errors = self.networks.update(
+            *values,
+            batch,
+            range(self.options),
+            self.steps,
+        )
         self.replay.set_priorities(indices, errors[: len(indices)])
         return loss
 
-    def _batch(self) -> tuple[Lessons, Ids, NDArray[np.float32]]:
+    def _batch(self) -> tuple[Lessons, Ids, Floats]:
         """Transitions, the first of them drawn from the replay at indices int64 (m,), and weights float32 (n,)."""
         kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
         if self.engine.memory is not None:
@@ -193,56 +185,8 @@ class LightLearner(Learner):
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
         return batch, indices, weights
 
-    def _values(self, states: Ids, next_states: Ids) -> tuple[Tensor, Tensor, Tensor]:
-        """The online network in states (with gradients) and in next states, the target in these; (n, O, A) each."""
-        online = self.networks.online
-        target = self.networks.target
-        if isinstance(online.cells, PictureEmbedding):  # whose states hardly ever occur twice
-            images = self.tensor(self.engine.images(np.concatenate([states, next_states])))
-            now, later = images.float().split(len(states))
-            with torch.no_grad():
-                following = online(later), target(later)
-            return online(now), *following
-        # A batch has few distinct states, late in training 40 of 256: the networks see each once.
-        distinct, places = np.unique(np.concatenate([states, next_states]), return_inverse=True)
-        here, after = self.tensor(places).split(len(states))
-        values, others = apply_all_to_states((online, target), self.engine, distinct)
-        # index_select, not indexing, whose gradient takes several times as long.
-        now = values.index_select(0, here)
-        next_online = values.detach().index_select(0, after)
-        next_target = others.index_select(0, after)
-        return now, next_online, next_target
-
     def weights(self) -> dict[str, Tensor]:
         return {f"online.{name}": value for name, value in self.networks.online.state_dict().items()}
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        self.networks.load(below("online.", weights), FILE)
-
-
-class LightPolicies:
-    """Greedy policies of saved options that share one network (Spec D8)."""
-
-    def __init__(self, saved: SavedOptions):
-        weights = below("online.", saved.weights)
-        embedding = saved.config["embedding"]
-        actions = saved.actions("online.heads.weight", saved.count)
-        standard = standard_of(saved.shape) if "cells.mean" in weights else None  # the weights' own replaces it
-        make = partial(
-            LightQNetwork,
-            saved.shape,
-            saved.count,
-            actions,
-            standard,
-            embedding,
-        )
-        self.network = load_fitting(make, weights, FILE)
-
-    def __call__(self, option: int) -> Callable[[Observations], int]:
-        """Start an execution."""
-        return partial(self._act, option)
-
-    @torch.no_grad()
-    def _act(self, option: int, observation: Observations) -> int:
-        values = self.network(torch.from_numpy(np.ascontiguousarray(observation[None])))[0, option]
-        return int(values.argmax())
+        self.networks.load(below("online.", weights), saved.FILE)

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bools
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Step, check_step
@@ -25,7 +25,7 @@ from hypogoal.options.visited import Visited
 NONE = -1
 
 
-def offered_options(predictions: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def offered_options(predictions: Bools) -> Bools:
     """Spec D6: options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
     offered = ~predictions
     offered[~offered.any(1)] = True
@@ -66,9 +66,8 @@ class OptionLoop(Resumable):
                 "Give --set restart_options=false.",
             )
         count = engine.count
-        self.option = np.full(count, NONE, dtype=np.int64)
-        self.began = np.zeros(count, dtype=np.int64)  # the states in which the running options were chosen
-        self.age = np.zeros(count, dtype=np.int64)
+        self.option = np.full(count, NONE)
+        self.began, self.age = np.zeros((2, count), dtype=np.int64)  # states in which options were chosen; steps since
         self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
         engine.reset()
@@ -87,7 +86,6 @@ class OptionLoop(Resumable):
         self._choose()
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=learning)
-        layouts = [*self.engine.layouts.now] if self.engine.layouts else None
         step = self.engine.step(actions)
         if first:
             check_step(self.engine, step)
@@ -99,7 +97,15 @@ class OptionLoop(Resumable):
         timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
         ended = reached | timed_out | over
         moved = Transitions(
-            ids, actions, step.next_ids, step.rewards, option, step.terminated, reached, timed_out, ended
+            ids,
+            actions,
+            step.next_ids,
+            step.rewards,
+            option,
+            step.terminated,
+            reached,
+            timed_out,
+            ended,
         )
         if learning:
             self.learner.observe(moved)
@@ -107,9 +113,9 @@ class OptionLoop(Resumable):
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
             self.engine.restart(ended & ~over)
         if self.visited:
-            self.visited.see(step.next_ids, actions, step.terminated | step.truncated, layouts)
+            self.visited.see(step.next_ids)
         self.recorder.see(step)
-        self._finish_options(step, reached, ended, learning=learning)
+        self._finish_options(step, moved, learning=learning)
         return moved
 
     def _choose(self) -> None:
@@ -127,17 +133,15 @@ class OptionLoop(Resumable):
         self.returns[free] = 0.0
         self.recorder.chose(chosen, offered)
 
-    def _finish_options(
-        self, step: Step, reached: NDArray[np.bool_], ended: NDArray[np.bool_], *, learning: bool
-    ) -> None:
-        done = np.flatnonzero(ended)
+    def _finish_options(self, step: Step, moved: Transitions, *, learning: bool) -> None:
+        done = np.flatnonzero(moved.ended)
         if not len(done):
             return
         outcome = Outcome(
             environments=done,
             options=self.option[done],
             began=self.began[done],
-            reached=reached[done],
+            reached=moved.reached[done],
             inside=self.inside[done],
             returns=self.returns[done],
             durations=self.age[done],

@@ -1,14 +1,12 @@
 """Q-networks of the intra-option policies (Spec D2): a small one on cells, or on pictures."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.arrays import tensor
+from hypogoal.core.arrays import Bytes, Ints, tensor
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
@@ -40,7 +38,7 @@ class CellEmbedding(nn.Module):
         )
         self._more = (0, 0, 0, -width % CELL, 0, -height % CELL)  # no channels; columns and rows behind the last
         self.features = self.CHANNELS * -(-height // CELL) * -(-width // CELL)
-        self._tiles: NDArray[np.uint8] | None = None
+        self._tiles: Bytes | None = None
         self._pixels = torch.empty(0)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -50,7 +48,7 @@ class CellEmbedding(nn.Module):
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
         return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 
-    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
+    def from_codes(self, codes: Tensor, tiles: Bytes) -> Tensor:
         """The same from tile codes, integers (N, cells), and the tiles uint8 (T, 8, 8, C) that they stand for."""
         if self._tiles is not tiles:
             self._tiles = tiles
@@ -137,7 +135,15 @@ class OwnEmbedding(FullView):
 
     def forward(self, observations: Tensor) -> Any:
         """uint8 (N, H, W, C), or float32 (N, *shape) where there is a standard -> float32 (N, features)."""
-        seen = observations if self.dtype == PICTURE else standardised(observations, self.mean, self.deviation)
+        seen = (
+            observations
+            if self.dtype == PICTURE
+            else standardised(
+                observations,
+                self.mean,
+                self.deviation,
+            )
+        )
         return self.encoder(as_input(seen))
 
 
@@ -179,7 +185,7 @@ class LightNetwork(nn.Module):
         """What :meth:`head` gives for observations (N, *obs); see also :class:`Pixels`."""
         return self.head(self.trunk(self.cells(images)))
 
-    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
+    def from_codes(self, codes: Tensor, tiles: Bytes) -> Tensor:
         """The same from tile codes; see :meth:`CellEmbedding.from_codes`."""
         assert isinstance(self.cells, CellEmbedding)
         return self.head(self.trunk(self.cells.from_codes(codes, tiles)))
@@ -209,17 +215,36 @@ class LightQNetwork(LightNetwork):
         return self.heads(features).view(-1, self.members, self.actions)
 
 
-def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
+def apply_to_states(network: nn.Module, engine: Engine, ids: Ints) -> Tensor:
     """A network's output on states of an engine: by tile codes where both know them, else by images."""
-    return apply_all_to_states((network,), engine, ids)[0]
-
-
-def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDArray[np.int64]) -> list[Tensor]:
-    """As :func:`apply_to_states`, several networks' outputs on the same states."""
-    device = next(networks[0].parameters()).device
+    device = next(network.parameters()).device
     tiles = engine.tiles
-    if tiles is not None and isinstance(getattr(networks[0], "cells", None), CellEmbedding):
+    if tiles is not None and isinstance(getattr(network, "cells", None), CellEmbedding):
         codes = tensor(engine.codes(ids).astype(np.int64), device)
-        return [network.from_codes(codes, tiles) for network in networks]  # type: ignore[operator]
-    images = tensor(engine.images(ids), device)
-    return [network(images) for network in networks]
+        return network.from_codes(codes, tiles)  # type: ignore[operator]
+    return network(tensor(engine.images(ids), device))
+
+
+def values_of(
+    online: nn.Module,
+    target: nn.Module,
+    engine: Engine,
+    states: Ints,
+    next_states: Ints,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The online network in states (with gradients) and in next states, the target in these; (n, O, A) each."""
+    both = np.concatenate([states, next_states])
+    device = next(online.parameters()).device
+    if isinstance(online.cells, PictureEmbedding):  # whose states hardly ever occur twice
+        now, later = tensor(engine.images(both), device).float().split(len(states))
+        with torch.no_grad():
+            following = online(later), target(later)
+        return online(now), *following
+    # A batch has few distinct states, late in training 40 of 256: the networks see each once.
+    distinct, places = np.unique(both, return_inverse=True)
+    before, after = tensor(places, device).split(len(states))
+    values = apply_to_states(online, engine, distinct)
+    others = apply_to_states(target, engine, distinct)
+    # index_select, not indexing, whose gradient takes several times as long.
+    now = values.index_select(0, before)
+    return now, values.detach().index_select(0, after), others.index_select(0, after)

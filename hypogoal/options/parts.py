@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from hypogoal.domains.base import Engine
 
 Ids: TypeAlias = NDArray[np.int64]  # (n,), of environments, states or options
@@ -29,6 +32,15 @@ class Part(Resumable):
         """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
 
 
+def saved_row(weights: Mapping[str, Tensor], name: str, options: int, dtype: Any) -> NDArray[Any]:
+    """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing or damaged."""
+    row = weights.get(name)
+    if row is None or row.shape != (options,) or row.dtype != dtype:
+        fault = f"the weights do not fit the manifest (at {name})"
+        raise UserError(fault, f"{options} options", AGAIN)
+    return row.numpy().copy()
+
+
 Kind = TypeVar("Kind", bound=Part)
 
 
@@ -40,5 +52,6 @@ def load_part(name: str, kind: str, base: type[Kind], built_in: Mapping[str, str
     """
     part = load(name, kind, f"hypogoal.{kind.replace(' ', '_')}s", built_in)
     if not (inspect.isclass(part) and issubclass(part, base)):
-        raise UserError(f"this is no {kind}", name, f"Give a subclass of {base.__module__}.{base.__name__}.")
+        do = f"Give a subclass of {base.__module__}.{base.__name__}."
+        raise UserError(f"this is no {kind}", name, do)
     return part

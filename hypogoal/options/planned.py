@@ -15,7 +15,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.parts import Ids
+from hypogoal.options.parts import Flags, Ids
 from hypogoal.options.termination import Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
@@ -55,7 +55,7 @@ class PlannedLearner(Learner):
     ) -> Ids:
         """Which of the plan's actions each option prefers."""
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
-        nearest: NDArray[np.int64] = ahead.argmin(axis=1)
+        nearest: Ids = ahead.argmin(axis=1)
         return nearest
 
     def act(
@@ -102,14 +102,14 @@ def plan_of(
     return plan
 
 
-def places_of(plan: Plan, engine: Engine) -> NDArray[np.int64]:
+def places_of(plan: Plan, engine: Engine) -> Ids:
     """Where in a plan each of the engine's states is, int64 (n_states,); -1 of those that are not in it."""
     places = np.full(engine.n_states, -1, np.int64)
     places[plan.ids] = np.arange(len(plan.ids))
     return places
 
 
-def distances(reached: NDArray[np.bool_], after: NDArray[np.int64], final: NDArray[np.bool_]) -> NDArray[np.int32]:
+def distances(reached: Flags, after: Ids, final: Flags) -> NDArray[np.int32]:
     """Breadth-first search from all sub-goals at once, against the direction of time: steps to them, int32 (N, O).
 
     0 where an option's sub-goal is ``reached`` (N, O), ``FAR`` where no way leads there; states ``after`` each action

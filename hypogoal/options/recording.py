@@ -1,14 +1,13 @@
 """What happened while options were played: episodes, choices, where options stopped (Spec E5, F3, F4, F5, F6)."""
 
-import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.data import create_hdf5
@@ -17,12 +16,7 @@ from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Outcome
 from hypogoal.options.parts import Flags, Floats, Ids
-from hypogoal.options.tables import (
-    Choices,
-    Episodes,
-    Executions,
-    Exploits,
-)
+from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 
 STOPS_KEPT = 128  # per option
 
@@ -56,10 +50,10 @@ class Recorder(Resumable):
     ):
         self.options, self.engine, self.window = options, engine, window
         self.episodes = EpisodeRecorder(engine.count)
-        self.choices: list[tuple[int, int, int, int, float, int, int]] = []
-        self.stops: list[deque[int]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
-        self.executions: list[deque[Execution]] = [deque(maxlen=LAST) for _ in range(options)]
-        self.pictures: list[deque[Observations]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
+        self.choices: list[tuple[float, ...]] = []
+        self.stops: list[deque[int]] = latest(options, STOPS_KEPT)
+        self.executions: list[deque[Execution]] = latest(options, LAST)
+        self.pictures: list[deque[Observations]] = latest(options, STOPS_KEPT)
         self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # states that running executions came to
         self.counts = np.zeros((options, 5))  # in the window: offered, chosen, expected, reached, duration
         self.counted_from = 0  # the step at which the window began
@@ -84,68 +78,83 @@ class Recorder(Resumable):
         if self.steps - self.counted_from >= self.window:
             self.flush()
         self.counts[:, 0] += offered.sum(0)
-        np.add.at(self.counts[:, 1], options, 1)
+        np.add.at(
+            self.counts[:, 1],
+            options,
+            1,
+        )
         self.counts[:, 2] += (offered / offered.sum(1, keepdims=True)).sum(0)
 
     def finished(self, outcome: Outcome) -> None:
         """Executions that ended."""
-        np.add.at(self.counts[:, 3], outcome.options, outcome.reached)
-        np.add.at(self.counts[:, 4], outcome.options, outcome.durations)
-        forgets = self.engine.memory is not None
-        for row, environment in enumerate(outcome.environments.tolist()):
-            option = int(outcome.options[row])
+        np.add.at(
+            self.counts[:, 3],
+            outcome.options,
+            outcome.reached,
+        )
+        np.add.at(
+            self.counts[:, 4],
+            outcome.options,
+            outcome.durations,
+        )
+        columns = (
+            outcome.environments,
+            outcome.options,
+            outcome.durations,
+            outcome.reached,
+            outcome.inside,
+            outcome.terminated,
+            outcome.began,
+        )
+        plain = [column.tolist() for column in columns]
+        for environment, option, duration, reached, inside, terminated, began in zip(*plain, strict=True):
             run = Execution(
-                step=self.steps,
-                option=option,
-                duration=int(outcome.durations[row]),
-                reached=bool(outcome.reached[row]),
-                inside_at_start=bool(outcome.inside[row]),
-                terminated=bool(outcome.terminated[row]),
-                states=self.paths[environment],
-                began=int(outcome.began[row]),
+                self.steps,
+                option,
+                duration,
+                reached,
+                inside,
+                terminated,
+                self.paths[environment],
+                began,
             )
-            self.executions[option].append(run)
+            self.executions[run.option].append(run)
             self.paths[environment] = []
-            if run.reached:
-                stop = outcome.next_ids[row]
-                self.stops[option].append(int(stop))
-                if forgets:
-                    self.pictures[option].append(self.engine.images(stop[None])[0])
+            if not run.reached:
+                continue
+            self.stops[run.option].append(run.states[-1])
+            if self.engine.memory is not None:
+                [picture] = self.engine.images(np.array(run.states[-1:]))
+                self.pictures[run.option].append(picture)
 
     def recent(self, *, restarted: bool) -> dict[str, float]:
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
-        if not restarted:
-            return self.episodes.recent() if self.episodes else {}
+        if not restarted and self.episodes:
+            return self.episodes.recent()
+        numbers: dict[str, float] = {}
         runs = self._executions()
-        if not runs:
-            return {}
-        return {
-            "reached": fmean(run.reached for run in runs),
-            "terminated": fmean(run.terminated for run in runs),
-            "duration": fmean(run.duration for run in runs),
-        }
+        if not restarted or not runs:
+            return numbers
+        for name in ("reached", "terminated", "duration"):
+            numbers[name] = fmean(getattr(run, name) for run in runs)
+        return numbers
 
     def _executions(self) -> list[Execution]:
         """The last of all options, option by option."""
-        runs: list[Execution] = []
-        for of_option in self.executions:
-            runs.extend(of_option)
-        return runs
+        return [*chain(*self.executions)]
 
     def flush(self) -> None:
         """Close the current window of choices."""
-        for option, (offered, chosen, expected, reached, duration) in enumerate(self.counts.tolist()):
-            row = (int(offered), int(chosen), round(expected, 6), int(reached), int(duration))
-            self.choices.append((self.steps, option, *row))
+        for option, counts in enumerate(self.counts.round(6).tolist()):
+            self.choices.append((self.steps, option, *counts))
         self.counted_from = self.steps
         self.counts[:] = 0
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
         for runs in self.executions:
-            restored = [Execution(*run) for run in runs]
-            runs.clear()
-            runs.extend(restored)
+            for index, run in enumerate(runs):
+                runs[index] = Execution(*run)
 
     def write(self, folder: Path) -> None:
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
@@ -156,7 +165,7 @@ class Recorder(Resumable):
             for option, stops in enumerate(self.stops):
                 if stops:
                     kept = self.pictures[option]
-                    states = np.stack(kept) if kept else self.engine.images(np.array(stops, dtype=np.int64))
+                    states = np.stack(kept) if kept else self.engine.images(np.array(stops))
                     file.create_dataset(
                         str(option),
                         data=states,
@@ -173,15 +182,10 @@ class Recorder(Resumable):
         stops = np.array([run.states[-1] for run in runs], dtype=np.int64)
         options = np.array([run.option for run in runs], dtype=np.int64)
         places = self.engine.positions(stops)
-        away = distances(places, options)
+        aways = distances(places, options)
         rows = []
-        for run, place, distance in zip(
-            runs,
-            places.tolist(),
-            away.tolist(),
-            strict=True,
-        ):
-            rows.append((*run[:6], *place, distance))
+        for run, place, away in zip(runs, places, aways, strict=True):
+            rows.append((*run[:6], *place, away))
         Executions.of_rows(rows).write(folder)
 
     def write_exploits(
@@ -200,11 +204,12 @@ class Recorder(Resumable):
             states = np.array(run.states, dtype=np.int64)
             options = np.full_like(states, run.option)
             is_near, sure = near(states, options), log_odds(states, options)
-            best_near, best_far = highest(sure[is_near]), highest(sure[~is_near])
+            best_near = np.fmax.reduce(sure[is_near], initial=np.nan)  # NaN of none
+            best_far = np.fmax.reduce(sure[~is_near], initial=np.nan)
             rows.append((run.step, run.option, run.reached, is_near[-1], best_near, best_far))
         Exploits.of_rows(rows).write(folder)
 
 
-def highest(values: NDArray[np.floating]) -> float:
-    """The highest of some numbers, NaN of none."""
-    return values.max().item() if len(values) else math.nan
+def latest(options: int, most: int) -> list[deque[Any]]:
+    """For each option an empty list that keeps the last so many."""
+    return [deque(maxlen=most) for _ in range(options)]

@@ -75,7 +75,13 @@ class SubgoalReward:
             raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
         rule, length = rule_of(termination)
         thresholds = self.ensemble.thresholds_as_log_odds()
-        self.ends = rule(None, count, thresholds=thresholds, environments=count, length=length)
+        self.ends = rule(
+            None,
+            count,
+            thresholds=thresholds,
+            environments=count,
+            length=length,
+        )
 
     def __call__(self, observations: Any) -> Floats:
         """The rewards (N,) of observations."""
@@ -111,7 +117,14 @@ class SubgoalReward:
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """See :meth:`SubgoalReward.wrap`: an episode is to each member an execution of its option."""
 
-    def __init__(self, env: Env, reward: SubgoalReward, scale: float, add: bool, ends: bool):
+    def __init__(
+        self,
+        env: Env,
+        reward: SubgoalReward,
+        scale: float,
+        add: bool,
+        ends: bool,
+    ):
         kept = {"reward": reward, "scale": scale, "add": add, "ends": ends}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
         gymnasium.Wrapper.__init__(self, env)

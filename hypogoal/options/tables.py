@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import csv
 import io
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Columns
+from hypogoal.core.arrays import Columns, Doubles
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_text, write_table
+from hypogoal.core.files import read_text, replacing
 from hypogoal.learners.episodes import LAST
 from hypogoal.options.parts import Flags, Ids
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 MAX_INTEGER = 2**53  # integers that a float holds exactly
 MAX_OPTIONS = 2**16
@@ -41,25 +41,25 @@ class Table(Columns):
     @classmethod
     def read(cls, path: Path) -> Self:
         """The table in a file; a ``UserError`` where it is missing or damaged, see :func:`read_table`."""
-        columns, types = read_table(path, cls.names()), cls.types()
-        return cls(**{name: values.astype(types[name]) for name, values in columns.items()})
+        return cls.cast(*read_table(path, cls.names()).values())
 
     def write(self, folder: Path) -> None:
         """The file of this table into ``folder``; a NaN is an empty cell."""
-        rows = []
-        for row in self.rows():
-            rows.append(["" if value != value else value for value in row])
-        write_table(folder / self.FILE, self.names(), rows)
+        with replacing(folder / self.FILE) as fresh:
+            self.frame().to_csv(fresh, index=False, lineterminator="\n")
 
     def rows(self) -> list[tuple[Any, ...]]:
         """Plain numbers, row by row; truth values are 0 and 1."""
-        columns = []
+        return [*self.frame().itertuples(index=False, name=None)]
+
+    def frame(self) -> DataFrame:
+        """Numbers, truth values as 0 and 1."""
+        from pandas import DataFrame
+
+        columns = {}
         for name in self.names():
-            values = getattr(self, name)
-            if values.dtype == np.bool_:
-                values = values.astype(np.int64)
-            columns.append(values.tolist())
-        return list(zip(*columns, strict=True))
+            columns[name] = getattr(self, name) * 1
+        return DataFrame(columns)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Episodes(Table):
 
     step: Ids  # environment steps when it ended, summed over parallel environments and stages
     length: Ids  # steps
-    reward: NDArray[np.float64]  # undiscounted
+    reward: Doubles  # undiscounted
     terminated: Flags  # it reached a terminal state; else it was cut at the cap
     # Spec F5: as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
     succeeded: Flags
@@ -90,11 +90,11 @@ class Choices(Table):
     option: Ids  # g*K + k
     offered: Ids  # decisions in which it was offered
     chosen: Ids  # decisions for it
-    expected: NDArray[np.float64]  # decisions for it under uniform-random choice
+    expected: Doubles  # decisions for it under uniform-random choice
     reached: Ids  # executions that reached its sub-goal
     duration: Ids  # steps of its executions
 
-    def total(self, name: str, options: int) -> NDArray[np.float64]:
+    def total(self, name: str, options: int) -> Doubles:
         """The sum of column ``name`` over all windows, (O,)."""
         return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
 
@@ -135,39 +135,30 @@ class Exploits(Table):
     option: Ids  # g*K + k
     reached: Flags  # its own termination classifier ended it
     near: Flags  # that was near its true sub-goal
-    best_near: NDArray[np.float64]  # highest log-odds near the true sub-goal; NaN where it did not come near
-    best_far: NDArray[np.float64]  # highest log-odds far from it; NaN where it always was near
+    best_near: Doubles  # highest log-odds near the true sub-goal; NaN where it did not come near
+    best_far: Doubles  # highest log-odds far from it; NaN where it always was near
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, NDArray[np.float64]]:
+def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, Doubles]:
     """Columns of a table of numbers, a CSV file with a header; float (n,) each.
 
     ``columns`` are required, None for all that the file has. A file that is missing, too large, no table, or has other
     cells than finite numbers of at most 2^53 (or, in a ``BLANK`` column, nothing) is a ``UserError``.
     """
-    text = read_text(path, "the table is", AGAIN)
+    from pandas import read_csv
+
+    text = io.StringIO(read_text(path, "the table is", AGAIN))
     try:
-        reader = csv.DictReader(io.StringIO(text, newline=""))
-        header = list(reader.fieldnames or ())
-        columns = header if columns is None else columns
-        rows = []
-        for row in reader:
-            rows.append([_number(row[name], name) for name in columns])
-        if not set(columns) <= set(header):
-            raise KeyError(path)
-    except (ValueError, KeyError, TypeError, csv.Error):
+        frame = read_csv(text, dtype=str)
+        frame = frame[[*(columns or frame)]].astype(np.float64)
+    except (ValueError, KeyError):
         raise UserError("the table is damaged", path, AGAIN) from None
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
-    blank = np.isnan(values) & np.isin(columns, BLANK)
-    exact = np.abs(values) < MAX_INTEGER  # no NaN, and an integer that has not lost digits
-    if not (exact | blank).all():
-        raise UserError("a number in the table is missing or too large", path, AGAIN)
-    table = dict(zip(columns, values.T, strict=True))
-    options = table.get("option", np.zeros(0))
-    if not ((options >= 0) & (options < MAX_OPTIONS)).all():
+    for name, values in frame.items():
+        exact = values.abs() < MAX_INTEGER  # no NaN, and an integer that has not lost digits
+        if name in BLANK:
+            exact |= values.isna()
+        if not exact.all():
+            raise UserError("a number in the table is missing or too large", path, AGAIN)
+    if "option" in frame and not frame["option"].between(0, MAX_OPTIONS, inclusive="left").all():
         raise UserError("an option in the table has an impossible number", path, AGAIN)
-    return table
-
-
-def _number(cell: str, column: str) -> float:
-    return math.nan if cell == "" and column in BLANK else float(cell)
+    return {str(name): values.to_numpy() for name, values in frame.items()}

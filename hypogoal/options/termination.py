@@ -12,19 +12,12 @@ import numpy as np
 import torch
 
 from hypogoal.core.arrays import tensor
-from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.options.parts import (
-    Flags,
-    Floats,
-    Ids,
-    Part,
-    load_part,
-)
+from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part, saved_row
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
 ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
@@ -126,24 +119,29 @@ class Terminations(Part):
             assert self.classify is not None
             fresh = np.unique(ids[unknown])
             before = self.judged[fresh]
-            self.judged[fresh] = np.where(np.isnan(before), self.classify(fresh), before)
+            self.judged[fresh] = np.where(
+                np.isnan(before),
+                self.classify(fresh),
+                before,
+            )
         return self.judged[ids]
 
     def _grow(self, ids: Ids) -> None:
         """Room for these states, twice as much as before at least."""
         size = len(self.judged)
-        missing = int(ids.max(initial=-1)) + 1 - size
+        missing = ids.max(initial=-1) + 1 - size
         if missing > 0:
-            more = np.full((max(missing, size, 1024), self.options), np.nan, dtype=np.float32)
-            self.judged = np.concatenate([self.judged, more])
+            more = max(missing, size, 1024)
+            self.judged = np.pad(
+                self.judged,
+                ((0, more), (0, 0)),
+                constant_values=np.nan,
+            )
 
 
 def thresholds_in(state: Mapping[str, torch.Tensor], options: int) -> Floats:
     """The log-odds float32 (O,) that an artefact keeps; a ``UserError`` where they are missing or damaged."""
-    saved = state.get(THRESHOLDS)
-    if saved is None or saved.shape != (options,) or saved.dtype != torch.float32 or not saved.isfinite().all():
-        raise UserError(f"the weights do not fit the manifest (at {THRESHOLDS})", f"{options} options", AGAIN)
-    return saved.numpy().copy()
+    return saved_row(state, THRESHOLDS, options, torch.float32)
 
 
 RULES = {"learned": f"{__name__}:Terminations"}
@@ -157,7 +155,11 @@ def rule_of(termination: str) -> tuple[type[Terminations], int]:
     name, _, number = termination.rpartition(":")
     if not number.isdecimal():
         name, number = termination, ""
-    wrong = UserError("unknown termination", f"termination={termination}", "Give learned, oracle or module:Class.")
+    wrong = UserError(
+        "unknown termination",
+        f"termination={termination}",
+        "Give learned, oracle or module:Class.",
+    )
     if name not in RULES and (":" not in name or name.partition(":")[0] in RULES):
         raise wrong
     rule = load_part(name, "termination rule", Terminations, RULES)

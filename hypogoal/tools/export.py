@@ -164,14 +164,14 @@ def _buffers(episodes: Iterable[Any], progress: Progress) -> Iterator[Any]:
     """Episodes as minari takes them."""
     from minari.data_collector import EpisodeBuffer
 
-    for episode in episodes:
-        last = np.arange(len(episode.actions)) == len(episode.actions) - 1
+    for observations, steps in episodes:
+        last = np.arange(len(steps)) == len(steps) - 1
         yield EpisodeBuffer(
-            observations=episode.observations,
-            actions=episode.actions,
-            rewards=episode.rewards,
-            terminations=last & episode.terminated,
-            truncations=last & (not episode.terminated),
-            infos={"option": np.concatenate([[-1], episode.options])},
+            observations=observations,
+            actions=steps.actions,
+            rewards=steps.rewards,
+            terminations=steps.terminated,
+            truncations=last & ~steps.terminated,
+            infos={"option": np.concatenate([[-1], steps.options])},
         )
         progress.advance()

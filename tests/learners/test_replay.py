@@ -75,13 +75,14 @@ def test_the_target_follows_with_everything(interval: int) -> None:
     config = LearnerConfig(target_interval=interval, option_learning_rate=0.1)
     network = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2), torch.nn.Unflatten(1, (1, 2)))
     learning, states = DoubleDQN(network, config), torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
+    ones = np.ones(4, np.int64)
     batch = Batch(
-        actions=torch.tensor([0, 1, 1, 0]),
-        rewards=torch.ones(4, 1),
-        terminal=torch.ones(4, 1, dtype=torch.bool),
-        discounts=0.9,
-        weights=torch.ones(4),
-        learns=torch.ones(4, 1, dtype=torch.bool),
+        actions=np.array([0, 1, 1, 0]),
+        steps=ones,
+        reached=ones[:, None] > 0,
+        terminated=ones > 0,
+        learns=ones[:, None] > 0,
+        weights=ones.astype(np.float32),
     )
     first = copy.deepcopy(learning.target.state_dict())
     for updates in (1, 2):

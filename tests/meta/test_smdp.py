@@ -9,7 +9,7 @@ from corridor import Corridor
 
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, best
-from hypogoal.meta.ppo import Draws, MetaPolicy, certainty_of, clipped_surrogate, scaled_advantages
+from hypogoal.meta.ppo import Draws, MetaPolicy, clipped_surrogate, scaled_advantages
 from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.options.choosers import Outcome
 
@@ -104,34 +104,13 @@ def test_networks_give_a_score_per_option_and_a_value(network: type) -> None:
     assert float(out.detach()[:, :15].softmax(1).max()) < 0.08
 
 
-def test_probabilities_of_a_choice_are_those_of_many_draws() -> None:
-    """Spec E2: of both heads, with options left out, near and far scores, and unequal spreads of the Gaussian's."""
-    scores = torch.tensor([[0.0, 0.5, -1.0, 9.0], [0.0, 6.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
-    offered = torch.tensor([[True, True, True, False], [True] * 4, [True, False, False, True]])
-    gaussian, draws = GaussianHead(4), 40_000
-    with torch.no_grad():
-        gaussian.log_std.copy_(torch.tensor([0.0, 0.3, -0.3, 0.2]))
-        for head in (CategoricalHead(4), gaussian):
-            probabilities = head.probabilities(scores, offered)
-            assert (probabilities[~offered] == 0).all()
-            torch.testing.assert_close(probabilities.sum(1), torch.ones(3))
-            for row in range(3):
-                many = (scores[row].expand(draws, 4), offered[row].expand(draws, 4))
-                options, _ = head.draw(*many, torch.Generator().manual_seed(row))
-                shares = np.bincount(options.numpy(), minlength=4) / draws
-                np.testing.assert_allclose(probabilities[row].numpy(), shares, atol=0.012)
-
-
 def test_certainty_of_a_choice_where_it_is_forced() -> None:
-    """A uniform choice of n has entropy ln n, a certain one 0; a Gaussian's certainty follows its scores."""
-    even = certainty_of(torch.full((2, 5), 0.2))
-    assert even["choice_entropy"] == pytest.approx(np.log(5)) and even["top_choice"] == pytest.approx(0.2)
-    sure = certainty_of(torch.eye(4))
-    assert sure == {"choice_entropy": 0.0, "top_choice": 1.0}
-    head, offered = GaussianHead(15), torch.ones((1, 15), dtype=torch.bool)
-    leads = [certainty_of(head.probabilities(lead * torch.eye(15)[:1], offered).detach()) for lead in (0.0, 4.0, 8.0)]
-    assert [round(lead["top_choice"], 2) for lead in leads] == [0.07, 0.98, 1.0]
-    assert leads[0]["choice_entropy"] > 2.7 > leads[1]["choice_entropy"] > leads[2]["choice_entropy"]
+    """A uniform choice of n has entropy ln n, a certain one 0."""
+    head, offered = CategoricalHead(4), torch.ones((4, 4), dtype=torch.bool)
+    even = head.certainty(torch.zeros(4, 4), offered)
+    assert even["choice_entropy"] == pytest.approx(np.log(4)) and even["top_choice"] == pytest.approx(0.25)
+    for scores, left in ((1e3 * torch.eye(4), offered), (torch.zeros(4, 4), torch.eye(4) > 0)):
+        assert head.certainty(scores, left) == {"choice_entropy": 0.0, "top_choice": 1.0}
 
 
 def test_the_papers_network_has_the_size_that_its_deviation_gives() -> None:

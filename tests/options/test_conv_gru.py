@@ -15,9 +15,9 @@ from hypogoal.learners import double_dqn
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.conv_gru import Lived, PaperLearner, PaperPolicies, PaperQNetwork, left_aligned
-from hypogoal.options.learner import SavedOptions
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
+from hypogoal.options.saved import SavedOptions
 from hypogoal.options.termination import oracle_terminations
 
 STAY = 0

@@ -26,7 +26,6 @@ from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations, oracle_terminations
-from hypogoal.options.visited import Visited
 
 SEEDS = (5, 100, 101, 7)
 
@@ -127,26 +126,6 @@ def test_a_wrong_member_is_told_from_an_option_that_gets_nowhere() -> None:
     found = [alone(loop, option, option, ways[:, option]) for option in (2, 3, 4)]
     assert [told["success"].mean() for told in found] == [1, 0, 0]
     assert [told["false_positives"].mean() for told in found] == [0, 1, 0]
-
-
-def test_states_visited_are_of_their_layouts() -> None:
-    """Spec B7: the stripe of each picture is its layout's."""
-    seeds = tuple(range(8))
-    engine = corridors(drawn(seeds), 3)
-    ends = oracle_terminations(engine, (0, 1))
-    config = OptionConfig.of(environments=3, warm_up=10**6)
-    from hypogoal.options.light import LightLearner
-
-    visited = Visited(engine, 200, 0, 0)
-    learner, recorder = LightLearner(engine, ends, config, 0), Recorder(2, engine)
-    loop = OptionLoop(engine, ends, learner, RandomChooser(rng_for(0, "c")), recorder, config, 1.0, visited=visited)
-    for _ in range(150):
-        loop.step()
-    kept = visited.states()
-    stripes = {seed: corridors(seed, 1).images(np.zeros(1, np.int64))[0, 47, 0].tolist() for seed in seeds}
-    assert len(set(kept.origins["layout_seed"].tolist())) > 3
-    for picture, seed in zip(kept.observations, kept.origins["layout_seed"].tolist(), strict=True):
-        assert picture[47, 0].tolist() == stripes[seed]
 
 
 def test_the_setting_says_how_many_or_which() -> None:

@@ -11,8 +11,9 @@ import torch
 
 from hypogoal.core.errors import UserError
 from hypogoal.options.conv_gru import PaperQNetwork
-from hypogoal.options.learner import Policies, make_policies
+from hypogoal.options.learner import make_policies
 from hypogoal.options.networks import LightQNetwork
+from hypogoal.options.saved import Policies
 
 SHAPE, OPTIONS, ACTIONS = (24, 24, 3), 2, 5
 

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
+from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Step
 from hypogoal.domains.doorkey.domain import DOMAIN
@@ -32,7 +33,7 @@ EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned")
 class Corridor:
     """Five cells in a row: action 2 steps right, action 0 left, the others do nothing; the goal is the last cell."""
 
-    n_actions, n_states = 7, 5
+    n_actions, n_states, resumes = 7, 5, False
     observation_shape: tuple[int, ...] = (64, 64, 3)
 
     def __init__(self, count: int, max_steps: int = 20):
@@ -72,12 +73,18 @@ class Corridor:
         return (np.asarray(ids) == 4)[:, None]
 
 
+def learn(env, chosen, steps, folder, kept=None):
+    """A trained agent."""
+    log, progress = MetricsLog(folder / "metrics.jsonl"), Progress("", steps, quiet=True)
+    return train(env, chosen, steps, 1, log, progress, kept or Checkpoints(None))
+
+
 @pytest.mark.parametrize(("agent", "setting"), list(HYPERPARAMETERS))
-def test_solves_an_easy_task(agent, setting):
+def test_solves_an_easy_task(agent, setting, tmp_path):
     """Spec E7: every baseline, in either setting, learns a corridor that random play rarely finishes in time."""
     chosen = HYPERPARAMETERS[agent, setting]
     env = EngineEnv(Corridor(chosen.environments))
-    trained = train(env, chosen, steps=EASY_STEPS[agent, setting], seed=1)
+    trained = learn(env, chosen, EASY_STEPS[agent, setting], tmp_path)
     assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.8
     trial = EngineEnv(Corridor(1))
     observation: Any = trial.reset()
@@ -181,12 +188,12 @@ def test_the_artefact_says_what_happened(tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_global_randomness_is_given_back():
+def test_global_randomness_is_given_back(tmp_path):
     """Spec E7: the library draws from global generators; ours are where they were afterwards."""
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    train(EngineEnv(Corridor(4)), HYPERPARAMETERS["ppo", "paper"], steps=100, seed=0)
+    learn(EngineEnv(Corridor(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
     assert torch.rand(1) == expected
 
 
@@ -197,7 +204,7 @@ def test_a_break_leaves_no_trace(agent, last, tmp_path):
 
     def trained(checkpoints):
         env = EngineEnv(DoorKeyEngine(100, chosen.environments, max_steps=40))
-        found = train(env, chosen, steps=2_560, seed=3, checkpoints=checkpoints)
+        found = learn(env, chosen, 2_560, tmp_path, checkpoints)
         return env.episodes, found.policy.state_dict()
 
     episodes, unbroken = trained(Checkpoints(None))

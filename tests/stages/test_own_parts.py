@@ -25,11 +25,12 @@ from hypogoal.meta.episodes import agent_of, play_episode
 from hypogoal.options.choosers import Chooser, Offered, load_chooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.env import OptionEnv, Options
-from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions, load_learner, make_policies
+from hypogoal.options.learner import Learner, Transitions, load_learner, make_policies
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.recording import Recorder
 from hypogoal.options.reward import SubgoalReward
+from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.tables import Choices
 from hypogoal.options.termination import Terminations, learned_terminations, saved_terminations
 

@@ -21,6 +21,7 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import CELL, FEATURES, NETWORKS
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
+from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.observations import PICTURE
 
 LOG_INTERVAL = 5_000  # environment steps
@@ -72,14 +73,14 @@ class Watch(BaseCallback):
         self,
         env: EngineEnv,
         checkpoints: Checkpoints,
-        log: MetricsLog | None,
+        log: MetricsLog,
         progress: Progress,
     ):
         super().__init__()
         self.env, self.checkpoints, self.log, self.progress = env, checkpoints, log, progress
         self.first_goal: int | None = None
 
-    def see(self, rows: Sequence[tuple[int, int, float, int, int]]) -> None:
+    def see(self, rows: Sequence[tuple[Any, ...]]) -> None:
         """Look for the first goal among episodes, of which those that ended before did not succeed."""
         if self.first_goal is None:
             self.first_goal = next((step for step, *_, succeeded in rows if succeeded), None)
@@ -89,7 +90,7 @@ class Watch(BaseCallback):
 
     def snapshot(self) -> State:
         """Where the agent is, and how much is logged."""
-        return {"agent": agent_snapshot(self.model, self.env), "log": self.log.snapshot() if self.log else 0}
+        return {"agent": agent_snapshot(self.model, self.env), "log": self.log.snapshot()}
 
     def _on_step(self) -> bool:
         episodes, count = self.env.episodes, self.env.num_envs
@@ -101,13 +102,12 @@ class Watch(BaseCallback):
             numbers = {name.removeprefix(UPDATED): value for name, value in _updated(self.model).items()}
             if isinstance(self.model, DQN):
                 numbers["epsilon"] = float(self.model.exploration_rate)
-            if self.log:
-                self.log.write(
-                    step=episodes.steps,
-                    episodes=len(episodes),
-                    **shown,
-                    **numbers,
-                )
+            self.log.write(
+                step=episodes.steps,
+                episodes=len(episodes),
+                **shown,
+                **numbers,
+            )
         self.progress.update(min(episodes.steps, self.progress.total), **shown)
         return True
 
@@ -180,9 +180,9 @@ def train(
     chosen: PPOSettings | DQNSettings,
     steps: int,
     seed: int,
-    log: MetricsLog | None = None,
-    progress: Progress | None = None,
-    checkpoints: Checkpoints | None = None,
+    log: MetricsLog,
+    progress: Progress,
+    checkpoints: Checkpoints,
     device: str = "cpu",
 ) -> BaseAlgorithm:
     """Spec E7: train a fresh agent for ``steps`` environment steps of all environments, rounded up to whole rollouts.
@@ -190,14 +190,9 @@ def train(
     ``env.episodes`` is filled; ``log`` and ``progress`` are told of every ``LOG_INTERVAL`` steps. Checkpoints (spec G1)
     are of no use where the engine cannot be resumed. NaN or Inf in a weight is a ``NumericalError``.
     """
-    if checkpoints is None or not env.engine.resumes:
+    if not env.engine.resumes:
         checkpoints = Checkpoints(None)
-    watch = Watch(
-        env,
-        checkpoints,
-        log,
-        progress or Progress("", steps, quiet=True),
-    )
+    watch = Watch(env, checkpoints, log, progress)
     with own_randomness():
         agent = make_agent(env, chosen, seed, device)
         if isinstance(agent, ExploringDQN) and isinstance(chosen, DQNSettings):
@@ -208,12 +203,11 @@ def train(
             )
             agent.exploration_rate = 1.0
         saved = checkpoints.load()
-        if log:
-            log.restore(saved["log"] if saved else 0)
+        log.restore(saved["log"] if saved else 0)
         if saved:
             restore_agent(agent, env, saved["agent"])
             watch.see(env.episodes)
-            watch.progress.resume(min(env.episodes.steps, steps))
+            progress.resume(min(env.episodes.steps, steps))
         agent.learn(
             steps - agent.num_timesteps,
             callback=watch,
@@ -275,26 +269,25 @@ def _updated(agent: BaseAlgorithm) -> dict[str, float]:
 
 
 def _generators() -> dict[str, Any]:
-    """The states of all global generators."""
+    """The states of the global generators that the library draws from."""
     numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002
-    return {"torch": torch.get_rng_state(), "numpy": numpy_state, "python": random.getstate()}
+    return {"torch": torch.get_rng_state(), "numpy": numpy_state}
 
 
 def _set_generators(states: Mapping[str, Any]) -> None:
     torch.set_rng_state(states["torch"])
     np.random.set_state(states["numpy"])  # noqa: NPY002
-    version, numbers, gauss = states["python"]
-    random.setstate((version, tuple(numbers), gauss))
 
 
 @contextlib.contextmanager
 def own_randomness() -> Iterator[None]:
-    """Lend stable-baselines3 the global generators it insists on, and put them back afterwards."""
-    before = _generators()
+    """Lend stable-baselines3 the global generators, which it seeds, and put them back afterwards."""
+    before, python = _generators(), random.getstate()
     try:
         yield
     finally:
         _set_generators(before)
+        random.setstate(python)
 
 
 def weights(agent: BaseAlgorithm) -> dict[str, Tensor]:
@@ -306,8 +299,5 @@ def weights(agent: BaseAlgorithm) -> dict[str, Tensor]:
 def epsilon(chosen: DQNSettings, step: int, first_goal: int | None) -> float:
     """Table 4: exploration at ``step``: from 1 to the final value, linearly, from the start or the first goal on."""
     if chosen.epsilon_from == "first-goal":
-        if first_goal is None:
-            return 1.0
-        step -= first_goal
-    share = min(1.0, step / chosen.epsilon_steps)
-    return 1.0 + share * (chosen.epsilon_final - 1.0)
+        step -= step if first_goal is None else first_goal
+    return float(linear_epsilon(step, chosen.epsilon_steps, chosen.epsilon_final))

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.domains.base import Engine, check_step
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
@@ -39,12 +40,16 @@ class EngineEnv(VecEnv):
             first.dtype.type,
         )
         actions = spaces.Discrete(engine.n_actions)
-        super().__init__(engine.count, space, actions)
+        super().__init__(
+            engine.count,
+            space,
+            actions,
+        )
         self.episodes = EpisodeRecorder(engine.count)
         self._actions = np.zeros(engine.count, dtype=np.int64)
         self._checked = False  # the engine's first step
 
-    def _observe(self, ids: NDArray[np.int64]) -> Observations:
+    def _observe(self, ids: Ints) -> Observations:
         if self.tiles is not None:
             return self.engine.codes(ids)
         images = self.engine.images(ids)
@@ -62,7 +67,7 @@ class EngineEnv(VecEnv):
         """Take note of the actions (count,) of the next step."""
         self._actions = np.asarray(actions, dtype=np.int64)
 
-    def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Observations, Floats, Bools, list[dict[str, Any]]]:
         """Step every environment; where an episode ended, the observation is that of the next one's start."""
         step = self.engine.step(self._actions)
         if not self._checked:

@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
+
+from hypogoal.core.arrays import Bytes
 
 FEATURES = 128
 CELL = 8  # pixels; the first convolution's kernel and stride
@@ -58,7 +59,7 @@ class CellNetwork(BaseFeaturesExtractor):
         space: spaces.Box,
         channels: Sequence[int],
         dense: int,
-        tiles: NDArray[np.uint8] | None = None,
+        tiles: Bytes | None = None,
         rows: int = 0,
     ):
         super().__init__(space, FEATURES)
@@ -87,7 +88,12 @@ class CellNetwork(BaseFeaturesExtractor):
             return torch.relu(self.first(observations.permute(0, 2, 3, 1)))
         table = torch.relu(self.first(self.tiles)).flatten(start_dim=1)
         seen = table.index_select(0, observations.flatten().long())
-        return seen.view(len(observations), self.rows, -1, table.shape[1])
+        return seen.view(
+            len(observations),
+            self.rows,
+            -1,
+            table.shape[1],
+        )
 
     def forward(self, observations: Tensor) -> Tensor:
         return self.dense(self.further(self._cells(observations)))

@@ -1,0 +1,64 @@
+"""Greedy policies of options in an artefact, without an engine (Spec D2, D8)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hypogoal.core.tensors import below, load_fitting
+from hypogoal.observations import Observations, standard_of
+from hypogoal.options.networks import LightQNetwork
+
+FILE = "options.safetensors"  # of an artefact
+# Starts an execution of an option: gives a function from an observation (*obs) to the action.
+Policies: TypeAlias = Callable[[int], Callable[[Observations], int]]
+
+
+@dataclass(frozen=True)
+class SavedOptions:
+    """An artefact's options, on observations of this ``shape``."""
+
+    config: Mapping[str, Any]
+    weights: Mapping[str, Tensor]
+    shape: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """How many options there are."""
+        return len(self.config["sub_goals"]) * self.config["members"]
+
+    def actions(self, layer: str, heads: int) -> int:
+        """How many actions there are, A, if the weights' last ``layer`` has so many heads of A outputs; else any."""
+        return len(self.weights.get(layer, ())) // heads or 1
+
+
+class LightPolicies:
+    """Those of options that share a light network."""
+
+    def __init__(self, saved: SavedOptions):
+        weights = below("online.", saved.weights)
+        embedding = saved.config["embedding"]
+        actions = saved.actions("online.heads.weight", saved.count)
+        standard = standard_of(saved.shape) if "cells.mean" in weights else None  # the weights' own replaces it
+        make = partial(
+            LightQNetwork,
+            saved.shape,
+            saved.count,
+            actions,
+            standard,
+            embedding,
+        )
+        self.network = load_fitting(make, weights, FILE)
+
+    def __call__(self, option: int) -> Callable[[Observations], int]:
+        """Start an execution."""
+        return partial(self._act, option)
+
+    @torch.no_grad()
+    def _act(self, option: int, observation: Observations) -> int:
+        values = self.network(torch.from_numpy(np.ascontiguousarray(observation[None])))
+        return int(values[0, option].argmax())
