@@ -30,7 +30,7 @@ from hypogoal.observations import PICTURE, Observations, Standard, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Execution
 from hypogoal.options.tables import Exploits
-from hypogoal.options.termination import Terminations, rule_of
+from hypogoal.options.termination import Terminations, load_rule
 
 POLICIES = ("before", "mended")
 CHUNK = 256  # observations that own code is given at once
@@ -97,10 +97,10 @@ def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Set
 
         if engine.observation_dtype != PICTURE:
             engine.standard = target.standard or standard_of(engine.observation_shape)
-        rule, length = rule_of(setup.config.termination)
+        rule = load_rule(setup.config.termination)
         rule.refuse(setup.config, engine)
         thresholds = log_odds_of(edges).astype(np.float32)
-        return rule(log_odds, len(edges), None, thresholds, engine.count, length)
+        return rule(log_odds, len(edges), None, thresholds, engine.count)
 
     return ends
 

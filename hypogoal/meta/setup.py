@@ -91,8 +91,7 @@ def of_ensemble(setup: Setup, engine: Engine) -> ends.Terminations:
     if oracle:
         columns = world.columns_of(setup.domain, sub_goals)
     else:
-        rule, _ = ends.rule_of(config.termination)
-        rule.refuse(config, engine)
+        ends.load_rule(config.termination).refuse(config, engine)
     ensembles = []
     for sub_goal in sub_goals if numbers or not oracle else ():
         ensemble = read_ensemble(setup.folder, setup.source, sub_goal)

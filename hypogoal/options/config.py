@@ -19,8 +19,10 @@ class OptionConfig(Config):
     termination: str = setting(
         "learned",
         "where options end: learned, at the first positive prediction; oracle, at true sub-goals (upper bound); or a "
-        "rule of your own, module:Class or module:Class:NUMBER",
+        "rule of your own",
         source="paper: learned",
+        choices=("learned", "oracle"),
+        own=True,
     )
     experience: str = setting(
         "shared",

@@ -16,7 +16,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.options.parts import Flags, Floats
-from hypogoal.options.termination import rule_of
+from hypogoal.options.termination import load_rule
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
 
@@ -73,14 +73,12 @@ class SubgoalReward:
         if by not in self.least and by not in range(count):
             do = f"Choose one of {', '.join(self.least)}, or a member, 0 to {count - 1}."
             raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
-        rule, length = rule_of(termination)
         thresholds = self.ensemble.thresholds_as_log_odds()
-        self.ends = rule(
+        self.ends = load_rule(termination)(
             None,
             count,
             thresholds=thresholds,
             environments=count,
-            length=length,
         )
 
     def __call__(self, observations: Any) -> Floats:

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from hypogoal.core.arrays import tensor
-from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
@@ -36,14 +35,9 @@ class Terminations(Part):
         classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
         thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
         environments: E.
-        length: the number behind the rule's name.
-
-    Attributes:
-        NUMBERED: whether a number, ``length``, stands behind the rule's name.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("judged", THRESHOLDS)
-    NUMBERED: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -52,11 +46,10 @@ class Terminations(Part):
         classify_one: Callable[[Ids, int], Floats] | None = None,
         thresholds: Floats | None = None,
         environments: int = 1,
-        length: int = 0,
     ):
         self.classify, self.options, self.classify_one = classify, options, classify_one
         self.thresholds = np.zeros(options, dtype=np.float32) if thresholds is None else thresholds
-        self.environments, self.length = environments, length
+        self.environments = environments
         self.judged = np.zeros((0, options), dtype=np.float32)  # log-odds of states by id; NaN: not judged yet
 
     def reached(
@@ -147,31 +140,14 @@ def thresholds_in(state: Mapping[str, torch.Tensor], options: int) -> Floats:
 RULES = {"learned": f"{__name__}:Terminations"}
 
 
-def rule_of(termination: str) -> tuple[type[Terminations], int]:
-    """The rule and its number, of ``learned``, ``module:Class``, ``module:Class:3``.
-
-    Anything else is a ``UserError``.
-    """
-    name, _, number = termination.rpartition(":")
-    if not number.isdecimal():
-        name, number = termination, ""
-    wrong = UserError(
-        "unknown termination",
-        f"termination={termination}",
-        "Give learned, oracle or module:Class.",
-    )
-    if name not in RULES and (":" not in name or name.partition(":")[0] in RULES):
-        raise wrong
-    rule = load_part(name, "termination rule", Terminations, RULES)
-    if bool(number) != rule.NUMBERED or number == "0":
-        raise wrong
-    return rule, int(number or 0)
+def load_rule(name: str) -> type[Terminations]:
+    """The class that the setting ``termination`` names; a ``UserError`` where it names none."""
+    return load_part(name, "termination rule", Terminations, RULES)
 
 
 def saved_terminations(termination: str, weights: Mapping[str, torch.Tensor], options: int) -> Terminations:
     """Those of an artefact with such weights, for one environment that is no engine's."""
-    rule, length = rule_of(termination)
-    ends = rule(None, options, length=length)
+    ends = load_rule(termination)(None, options)
     ends.load(weights)
     return ends
 
@@ -187,7 +163,7 @@ def learned_terminations(
     """Spec D1: option g*K + k ends at a positive prediction of member k of sub-goal g's ensemble, of G with K members.
 
     ``running_only``: states are classified for the running options only, which costs a K-th.
-    ``rule``: see :func:`rule_of`.
+    ``rule``: see :func:`load_rule`.
     """
     stacked = StackedMembers(ensembles)
     networks: list[torch.nn.Module] = []
@@ -209,12 +185,10 @@ def learned_terminations(
             log_odds: Floats = (logits[:, 1] - logits[:, 0]).cpu().numpy()
         return log_odds
 
-    termination, length = rule_of(rule)
-    return termination(
+    return load_rule(rule)(
         classify,
         len(networks),
         classify_one if running_only else None,
         np.concatenate([ensemble.thresholds_as_log_odds() for ensemble in ensembles]),
         engine.count,
-        length,
     )

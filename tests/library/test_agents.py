@@ -141,9 +141,8 @@ def test_what_a_session_shows_is_one_useful_line(options: Options) -> None:
 
 
 class Falling(Terminations):
-    """After so many executions in all the thresholds of all options fall."""
+    """After twenty executions in all the thresholds of all options fall."""
 
-    NUMBERED = True
     CHANGING = (*Terminations.CHANGING, "ended")
 
     def __init__(self, *arguments: Any, **more: Any):
@@ -152,7 +151,7 @@ class Falling(Terminations):
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
         self.ended += len(options)
-        if self.ended >= self.length:
+        if self.ended >= 20:
             self.ended = 0
             self.thresholds = self.thresholds - np.float32(0.01)
 
@@ -160,7 +159,7 @@ class Falling(Terminations):
 def test_options_end_by_the_rule_they_were_trained_with(made: Path) -> None:
     """Spec H4: lowered thresholds go with the artefact, into train-meta, to agents and to other people's code."""
     play = settings("environments=4", "warm_up=100", "layout_seed=0", "max_episode_steps=30", "random_episodes=0")
-    ends = settings(f"termination={__name__}:Falling:20", "option_timeout=2", "option_batch=32")
+    ends = settings(f"termination={__name__}:Falling", "option_timeout=2", "option_batch=32")
     out, meta = made / "patient", made / "patient-meta"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TESTS))

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from torch import nn
 from uneven import Uneven
 
-from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import NETWORKS
-from hypogoal.options.termination import Terminations, learned_terminations, rule_of
+from hypogoal.options.termination import Terminations, learned_terminations
 
 
 def ensembles_of(engine: Engine, network: str) -> list[Ensemble]:
@@ -134,20 +133,3 @@ def test_what_was_said_stands(asked: str, monkeypatch: pytest.MonkeyPatch) -> No
         for (ids, options), expected in zip(together, said, strict=True):
             rows = later[ids] if expected.ndim == 2 else later[ids, options]
             np.testing.assert_array_equal(rows, expected)
-
-
-class AtLeast(Terminations):
-    """A rule with a number."""
-
-    NUMBERED = True
-
-
-def test_rules_are_read_from_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec H4: one's own have a number behind the name, or none."""
-    own = f"{__name__}:AtLeast"
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    assert [rule_of(text) for text in ("learned", f"{own}:3")] == [(Terminations, 0), (AtLeast, 3)]
-    assert rule_of(f"{__name__}:Terminations") == (Terminations, 0)
-    for text in ("patience", "learned:3", "single", "", own, f"{own}:0", f"{__name__}:Terminations:3"):
-        with pytest.raises(UserError, match=r"unknown termination.* Give learned, oracle or module:Class"):
-            rule_of(text)
