@@ -107,16 +107,14 @@ class Terminations(Part):
     def _all(self, ids: Ids) -> Floats:
         """Log-odds (n, O)."""
         self._grow(ids)
-        unknown = np.isnan(self.judged[ids]).any(1)
-        if unknown.any():
-            assert self.classify is not None
-            fresh = np.unique(ids[unknown])
-            before = self.judged[fresh]
-            self.judged[fresh] = np.where(
-                np.isnan(before),
-                self.classify(fresh),
-                before,
-            )
+        known = self.judged[ids]
+        unknown = np.isnan(known).any(axis=1)
+        if not unknown.any():
+            return known
+        assert self.classify is not None
+        fresh = np.unique(ids[unknown])
+        before = self.judged[fresh]
+        self.judged[fresh] = np.where(np.isnan(before), self.classify(fresh), before)
         return self.judged[ids]
 
     def _grow(self, ids: Ids) -> None:

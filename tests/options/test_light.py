@@ -8,7 +8,7 @@ import torch
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
-from hypogoal.options.networks import apply_to_states
+from hypogoal.options.networks import apply_to_states, values_of
 from hypogoal.options.termination import oracle_terminations
 
 
@@ -30,7 +30,7 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
         gradients = torch.autograd.grad(loss, [*learner.networks.online.parameters()])
         return torch.cat([gradient.flatten() for gradient in gradients])
 
-    here, next_online, next_target = learner._values(s, following)
+    here, next_online, next_target = values_of(learner.networks.online, learner.networks.target, engine, s, following)
     fast = slopes(here)
     plain = apply_to_states(learner.networks.online, engine, s)
     torch.testing.assert_close(here, plain)
