@@ -33,7 +33,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
 from hypogoal.meta.config import TrainOptionsConfig  # noqa: E402
 from hypogoal.options.choosers import RandomChooser  # noqa: E402
-from hypogoal.options.conv_gru import Lived, PaperLearner, left_aligned  # noqa: E402
+from hypogoal.options.conv_gru import Lived, PaperLearner  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.loop import OptionLoop  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
@@ -83,7 +83,7 @@ class PlainLearner:
         indices, weights = self.replay.sample(32, self.rng)
         steps = self.replay.data.at(indices)
         last = torch.from_numpy(steps.length.astype(np.int64) - 1)
-        paths = left_aligned(steps.path.astype(np.int64), steps.length + 1)  # padded with the last state
+        paths = steps.path.astype(np.int64)
         here, after = paths[:, :-1], paths[:, 1:]
         row = torch.arange(32)
         self.online.train()
@@ -92,7 +92,7 @@ class PlainLearner:
         with torch.no_grad():
             best = self.online(following)[row, last].argmax(1)
             ahead = self.target(following)[row, last].gather(1, best[:, None])[:, 0]
-        reached = torch.from_numpy(self.reached.of(steps.path[:, -1].astype(np.int64))[:, 0])
+        reached = torch.from_numpy(self.reached.of(paths[np.arange(32), steps.length])[:, 0])
         end = reached | torch.from_numpy(steps.terminated)
         goal = reached.float() + 0.95 * ahead * ~end
         taken = values.gather(1, torch.from_numpy(steps.action.astype(np.int64))[:, None])[:, 0]

@@ -42,7 +42,12 @@ class EpisodeRecorder(list[tuple[Any, ...]], Resumable):
         succeeded = step.succeeded
         if succeeded is None:
             succeeded = step.terminated & (self.rewards > 0)
-        columns = [self.lengths, self.rewards, step.terminated * 1, succeeded * 1]
+        columns = [
+            self.lengths,
+            self.rewards,
+            step.terminated * 1,
+            succeeded * 1,
+        ]
         ended = [column[over].tolist() for column in columns]
         for facts in zip(*ended, strict=True):
             self.append((self.steps, *facts))

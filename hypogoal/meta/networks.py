@@ -70,9 +70,9 @@ def _outputs(width: int, options: int) -> Linear:
     return layer
 
 
-def best(scores: Tensor, offered: Tensor) -> Tensor:
-    """The option offered with the highest score, int64 (N,)."""
-    return scores.masked_fill(~offered, -torch.inf).argmax(1)
+def among(scores: Tensor, offered: Tensor) -> Tensor:
+    """Scores (N, O), minus infinity of options that are not offered."""
+    return scores.masked_fill(~offered, -torch.inf)
 
 
 class CategoricalHead(nn.Module):
@@ -93,11 +93,8 @@ class CategoricalHead(nn.Module):
         generator: torch.Generator,
     ) -> tuple[Tensor, Tensor]:
         """Options int64 (N,), and what is remembered of the draw, float32 (N, R): the options' numbers."""
-        option = torch.multinomial(
-            self.probabilities(scores, offered),
-            1,
-            generator=generator,
-        )
+        probabilities = among(scores, offered).log_softmax(1).exp()
+        option = torch.multinomial(probabilities, 1, generator=generator)
         return option[:, 0], option.float()
 
     def log_prob(
@@ -107,22 +104,9 @@ class CategoricalHead(nn.Module):
         drawn: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Log probability of the draws and the entropy of what is drawn, float32 (N,) each."""
-        log = scores.masked_fill(~offered, -torch.inf).log_softmax(1)
+        log = among(scores, offered).log_softmax(1)
         entropy = -(log.exp() * log.masked_fill(~offered, 0.0)).sum(1)
         return log.gather(1, drawn.long()).squeeze(1), entropy
-
-    def probabilities(self, scores: Tensor, offered: Tensor) -> Tensor:
-        """Of each option to be chosen, float32 (N, O); rows sum to 1, and options not offered have 0."""
-        return scores.masked_fill(~offered, -torch.inf).log_softmax(1).exp()
-
-    def certainty(self, scores: Tensor, offered: Tensor) -> dict[str, float]:
-        """How sure it is: ``choice_entropy`` (nats), the probability of the ``top_choice``, means over N decisions.
-
-        Where ``top_choice`` is near 1, an option that stops working is not left again soon.
-        """
-        probabilities = self.probabilities(scores, offered)
-        entropy = torch.special.entr(probabilities).sum(1).mean()
-        return {"choice_entropy": float(entropy), "top_choice": float(probabilities.amax(1).mean())}
 
 
 class GaussianHead(CategoricalHead):
@@ -145,7 +129,7 @@ class GaussianHead(CategoricalHead):
     ) -> tuple[Tensor, Tensor]:
         noise = torch.randn(scores.shape, generator=generator).to(scores.device)
         drawn = scores + self._spread(scores) * noise
-        return best(drawn, offered), drawn
+        return among(drawn, offered).argmax(1), drawn
 
     def log_prob(
         self,
@@ -155,10 +139,6 @@ class GaussianHead(CategoricalHead):
     ) -> tuple[Tensor, Tensor]:
         normal = Normal(scores, self._spread(scores).expand_as(scores))
         return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
-
-    def certainty(self, scores: Tensor, offered: Tensor) -> dict[str, float]:
-        """Unknown: how likely an option's draw is the highest has no closed form."""
-        return {}
 
     def _spread(self, scores: Tensor) -> Tensor:
         return self.log_std.to(scores.device).exp()

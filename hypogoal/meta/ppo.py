@@ -8,17 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hypogoal.core.arrays import Columns, Doubles, tensor
+from hypogoal.core.arrays import Columns, tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import drawing_from, rng_for, torch_generator
 from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
-from hypogoal.meta import networks
+from hypogoal.meta import networks, smdp
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.observations import PICTURE
-from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
+from hypogoal.options.choosers import FILE, Chooser, Outcome
 from hypogoal.options.networks import apply_to_states
 from hypogoal.options.parts import Flags, Floats, Ids
 
@@ -108,7 +107,7 @@ class MetaPolicy(Chooser):
     ) -> Self:
         return cls(engine, options, config, seed, device)
 
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ids, ids: Ids, offered: Flags) -> Ids:
         mask = torch.from_numpy(offered)
         with torch.no_grad():
             scores = self._outputs(ids)[:, :-1].cpu()
@@ -151,7 +150,7 @@ class MetaPolicy(Chooser):
             following = self._outputs(outcomes.next_ids)
         values = outputs[:, -1].double().cpu().numpy()
         last = np.diff(outcomes.environments, append=-1) != 0  # what comes next is another environment's
-        advantages = smdp_advantages(
+        advantages = smdp.smdp_advantages(
             outcomes.returns,
             outcomes.discounts,
             values,
@@ -161,12 +160,10 @@ class MetaPolicy(Chooser):
             config.gae_lambda,
         )
         goals = tensor(advantages + values, self.device).float()
-        scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
+        scaled = tensor(smdp.scaled_advantages(advantages, config.advantage_floor), self.device).float()
         offered = tensor(draws.offered, self.device)
         drawn = tensor(draws.drawn, self.device)
         old = tensor(draws.log_prob, self.device)
-        with torch.no_grad():
-            certainty = self.head.certainty(outputs[:, :-1], offered)
         for epoch in range(config.epochs):
             order = self.rng.permutation(len(draws))
             for begin in range(0, len(order), config.meta_batch):
@@ -191,7 +188,7 @@ class MetaPolicy(Chooser):
                     GRADIENT_NORM,
                 )
         self.updates += 1
-        return {**certainty, "value": float(values.mean())}
+        return {"value": float(values.mean())}
 
     def state(self) -> dict[str, Tensor]:
         return dict(self.policy.state_dict())
@@ -204,19 +201,6 @@ class MetaPolicy(Chooser):
         super().restore(snapshot)
         self.draws = [Draws(**part) for part in snapshot["draws"]]
         self.outcomes = [Outcome(**part) for part in snapshot["outcomes"]]
-
-
-def scaled_advantages(advantages: Doubles, floor: float) -> Doubles:
-    """Advantages (n,) less their mean, in units of their standard deviation, or of ``floor`` where that is larger.
-
-    Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts
-    until it is sure of something arbitrary.
-    """
-    return (advantages - advantages.mean()) / max(
-        float(advantages.std()),
-        floor,
-        1e-8,
-    )
 
 
 def clipped_surrogate(

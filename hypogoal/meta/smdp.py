@@ -40,3 +40,16 @@ def smdp_advantages(
         following = delta + discounts[t] * trace * (not ended[t]) * following
         advantages[t] = following
     return advantages
+
+
+def scaled_advantages(advantages: Doubles, floor: float) -> Doubles:
+    """Advantages (n,) less their mean, in units of their standard deviation, or of ``floor`` where that is larger.
+
+    Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts
+    until it is sure of something arbitrary.
+    """
+    return (advantages - advantages.mean()) / max(
+        float(advantages.std()),
+        floor,
+        1e-8,
+    )

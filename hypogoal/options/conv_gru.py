@@ -93,7 +93,7 @@ class PaperQNetwork(nn.Module):
 class Lived(Columns):
     """Steps of executions, arrays (n, ...)."""
 
-    path: NDArray[np.int32]  # (n, recurrence + 1), ids: a window, its last states real, and the state that came next
+    path: NDArray[np.int32]  # (n, recurrence + 1), ids: a window, then the state that came next, then any of these
     length: Ids  # of the window
     action: Ids
     terminated: Flags  # the task is over
@@ -148,7 +148,7 @@ class PaperLearner(Learner):
                 network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), config))
         self.windows = np.zeros((self.engine.count, config.recurrence), np.int64)  # of running executions
-        self.lengths = np.zeros(self.engine.count, np.int64)  # of these, how many of the last states are real
+        self.lengths = np.zeros(self.engine.count, np.int64)  # theirs; the places behind have states of the window
 
     @staticmethod
     def reach(config: PaperConfig, options: int) -> int:
@@ -167,19 +167,18 @@ class PaperLearner(Learner):
         age: Ids,
     ) -> Ids:
         """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
-        self.windows = np.column_stack([self.windows[:, 1:], ids])
+        begun, full = age == 0, age >= self.config.recurrence
+        self.windows[begun] = ids[begun, None]
+        self.windows[full, :-1] = self.windows[full, 1:]
         self.lengths = np.minimum(age + 1, self.config.recurrence)
+        self.windows[np.arange(len(ids)), self.lengths - 1] = ids
         chosen = np.empty_like(ids)
         for option in np.unique(options):
             rows = options == option
             network = self.members[option].online.eval()
-            lengths = self.lengths[rows]
-            images, places = self._seen(left_aligned(self.windows[rows], lengths))
-            values = network(
-                network.see(images),
-                places,
-                torch.from_numpy(lengths),
-            )
+            images, places = self._seen(self.windows[rows])
+            lengths = torch.from_numpy(self.lengths[rows])
+            values = network(network.see(images), places, lengths)
             chosen[rows] = values.argmax(1).cpu().numpy()
         return chosen
 
@@ -190,6 +189,7 @@ class PaperLearner(Learner):
 
     def observe(self, moved: Transitions) -> None:
         path = np.column_stack([self.windows, moved.next_ids])
+        path[np.arange(len(path)), self.lengths] = moved.next_ids
         steps = Lived.cast(path, self.lengths, moved.actions, moved.terminated)
         for option in np.unique(moved.options):
             rows = moved.options == option
@@ -212,21 +212,20 @@ class PaperLearner(Learner):
 
     def _update(self, option: int, member: Member) -> float:
         """One update of a member's policy; returns the loss, 0 where all steps drawn are forgotten."""
-        most = self.config.recurrence
         indices, weights = member.replay.sample(self.config.option_batch, self.rng)
         steps = member.replay.data.at(indices)
-        padding = np.arange(most + 1) < most - steps.length[:, None]
-        known = (self.engine.remembers(steps.path) | padding).all(axis=1)
+        known = self.engine.remembers(steps.path).all(axis=1)
         if not known.any():
             return 0.0
         indices, weights, steps = indices[known], weights[known], steps.at(known)
 
-        path = steps.path.astype(np.int64)
-        length = steps.length
-        later = np.minimum(length + 1, most)
-        lengths, later_lengths = torch.from_numpy(length), torch.from_numpy(later)
-        windows = np.stack([left_aligned(path[:, :-1], length), left_aligned(path[:, 1:], later)])
-        images, places = self._seen(windows)  # each image once; BatchNorm counts it once (DEV-51)
+        path, length = steps.path.astype(np.int64), steps.length
+        most = self.config.recurrence
+        now, shifted = path[:, :-1], path[:, 1:]
+        following = np.where(length[:, None] < most, now, shifted)
+        lengths = torch.from_numpy(length)
+        later_lengths = torch.from_numpy(np.minimum(length + 1, most))
+        images, places = self._seen(np.stack([now, following]))  # each image once; BatchNorm counts it once (DEV-51)
         before, after = places
         online, target = member.online.train(), member.target
         features = online.see(images)
@@ -235,7 +234,7 @@ class PaperLearner(Learner):
             next_online = online(features, after, later_lengths)
             next_target = target(target.see(images), after, later_lengths)
 
-        next_states = path[:, -1]
+        next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]
         ones = np.ones_like(length)
         batch = Batch(
@@ -267,13 +266,6 @@ class PaperLearner(Learner):
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):
             member.load(below(f"{option}.", weights), f"option {option} of {saved.FILE}")
-
-
-def left_aligned(windows: Ids, lengths: Ids) -> Ids:
-    """Windows (n, T) whose last ``lengths`` (n,) places are real -> with these first, then the last state again."""
-    last = windows.shape[1] - 1
-    columns = np.arange(last + 1) + last + 1 - lengths[:, None]
-    return np.take_along_axis(windows, np.minimum(columns, last), axis=1)
 
 
 class PaperPolicies:

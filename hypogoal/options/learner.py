@@ -106,15 +106,14 @@ class Learner(Part, ABC):
     def observe(self, moved: Transitions) -> None:
         """Store one step of every environment."""
 
-    @abstractmethod
     def learn(self) -> dict[str, float]:
-        """As many updates as are due; returns the last one's numbers, empty when none was due."""
+        """As many updates as are due; returns the last one's numbers, empty when none was due, as by default."""
+        return {}
 
-    @abstractmethod
     def weights(self) -> dict[str, Tensor]:
-        """Of all policies, by name."""
+        """Of all policies, by name; by default there are none."""
+        return {}
 
-    @abstractmethod
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         """Those of :meth:`weights` among tensors of an artefact."""
 

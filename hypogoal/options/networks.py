@@ -135,16 +135,9 @@ class OwnEmbedding(FullView):
 
     def forward(self, observations: Tensor) -> Any:
         """uint8 (N, H, W, C), or float32 (N, *shape) where there is a standard -> float32 (N, features)."""
-        seen = (
-            observations
-            if self.dtype == PICTURE
-            else standardised(
-                observations,
-                self.mean,
-                self.deviation,
-            )
-        )
-        return self.encoder(as_input(seen))
+        if self.dtype != PICTURE:
+            observations = standardised(observations, self.mean, self.deviation)
+        return self.encoder(as_input(observations))
 
 
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
@@ -182,7 +175,7 @@ class LightNetwork(nn.Module):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        """What :meth:`head` gives for observations (N, *obs); see also :class:`Pixels`."""
+        """What :meth:`head` gives for observations (N, *obs)."""
         return self.head(self.trunk(self.cells(images)))
 
     def from_codes(self, codes: Tensor, tiles: Bytes) -> Tensor:
@@ -238,8 +231,9 @@ def values_of(
     if isinstance(online.cells, PictureEmbedding):  # whose states hardly ever occur twice
         now, later = tensor(engine.images(both), device).float().split(len(states))
         with torch.no_grad():
-            following = online(later), target(later)
-        return online(now), *following
+            next_online = online(later)
+            next_target = target(later)
+        return online(now), next_online, next_target
     # A batch has few distinct states, late in training 40 of 256: the networks see each once.
     distinct, places = np.unique(both, return_inverse=True)
     before, after = tensor(places, device).split(len(states))
@@ -247,4 +241,6 @@ def values_of(
     others = apply_to_states(target, engine, distinct)
     # index_select, not indexing, whose gradient takes several times as long.
     now = values.index_select(0, before)
-    return now, values.detach().index_select(0, after), others.index_select(0, after)
+    next_online = values.detach().index_select(0, after)
+    next_target = others.index_select(0, after)
+    return now, next_online, next_target

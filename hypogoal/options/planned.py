@@ -4,12 +4,10 @@ Where an engine knows what follows on each action, what an option does is a matt
 whose options are planned shows what its hypotheses are worth, whatever option learning makes of them.
 """
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
@@ -55,8 +53,7 @@ class PlannedLearner(Learner):
     ) -> Ids:
         """Which of the plan's actions each option prefers."""
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
-        nearest: Ids = ahead.argmin(axis=1)
-        return nearest
+        return np.argmin(ahead, axis=1)
 
     def act(
         self,
@@ -74,15 +71,6 @@ class PlannedLearner(Learner):
         reached = self.terminations.of_running(moved.next_ids, moved.options)
         np.add.at(self.positives, moved.options[reached], 1)
         self.count(moved.options)
-
-    def learn(self) -> dict[str, float]:
-        return {}
-
-    def weights(self) -> dict[str, Tensor]:
-        return {}
-
-    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """There are none."""
 
 
 def plan_of(

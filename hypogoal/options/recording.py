@@ -30,8 +30,8 @@ class Execution(NamedTuple):
     reached: bool  # its own classifier ended it
     inside_at_start: bool  # its own classifier was positive where it began
     terminated: bool  # it ended in a terminal state of the episode
+    began: int  # the id of the state in which it was chosen
     states: list[int]  # the ids of those that it came to, the last one that it ended in
-    began: int  # the id of the one before them
 
 
 class Recorder(Resumable):
@@ -107,17 +107,8 @@ class Recorder(Resumable):
             outcome.began,
         )
         plain = [column.tolist() for column in columns]
-        for environment, option, duration, reached, inside, terminated, began in zip(*plain, strict=True):
-            run = Execution(
-                self.steps,
-                option,
-                duration,
-                reached,
-                inside,
-                terminated,
-                self.paths[environment],
-                began,
-            )
+        for environment, *facts in zip(*plain, strict=True):
+            run = Execution._make([self.steps, *facts, self.paths[environment]])
             self.executions[run.option].append(run)
             self.paths[environment] = []
             if not run.reached:

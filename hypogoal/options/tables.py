@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MAX_INTEGER = 2**53  # integers that a float holds exactly
-MAX_OPTIONS = 2**16
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
 
 
@@ -159,6 +158,4 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, Do
             exact |= values.isna()
         if not exact.all():
             raise UserError("a number in the table is missing or too large", path, AGAIN)
-    if "option" in frame and not frame["option"].between(0, MAX_OPTIONS, inclusive="left").all():
-        raise UserError("an option in the table has an impossible number", path, AGAIN)
     return {str(name): values.to_numpy() for name, values in frame.items()}

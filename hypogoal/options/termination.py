@@ -47,7 +47,9 @@ class Terminations(Part):
         thresholds: Floats | None = None,
         environments: int = 1,
     ):
-        self.classify, self.options, self.classify_one = classify, options, classify_one
+        self.classify = classify
+        self.classify_one = classify_one
+        self.options = options
         self.thresholds = np.zeros(options, dtype=np.float32) if thresholds is None else thresholds
         self.environments = environments
         self.judged = np.zeros((0, options), dtype=np.float32)  # log-odds of states by id; NaN: not judged yet
@@ -114,7 +116,12 @@ class Terminations(Part):
         assert self.classify is not None
         fresh = np.unique(ids[unknown])
         before = self.judged[fresh]
-        self.judged[fresh] = np.where(np.isnan(before), self.classify(fresh), before)
+        new = np.isnan(before)
+        self.judged[fresh] = np.where(
+            new,
+            self.classify(fresh),
+            before,
+        )
         return self.judged[ids]
 
     def _grow(self, ids: Ids) -> None:
@@ -183,10 +190,11 @@ def learned_terminations(
             log_odds: Floats = (logits[:, 1] - logits[:, 0]).cpu().numpy()
         return log_odds
 
+    thresholds = [ensemble.thresholds_as_log_odds() for ensemble in ensembles]
     return load_rule(rule)(
         classify,
         len(networks),
         classify_one if running_only else None,
-        np.concatenate([ensemble.thresholds_as_log_odds() for ensemble in ensembles]),
+        np.concatenate(thresholds),
         engine.count,
     )

@@ -8,9 +8,9 @@ import torch
 from corridor import Corridor
 
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, best
-from hypogoal.meta.ppo import Draws, MetaPolicy, clipped_surrogate, scaled_advantages
-from hypogoal.meta.smdp import smdp_advantages
+from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, among
+from hypogoal.meta.ppo import Draws, MetaPolicy, clipped_surrogate
+from hypogoal.meta.smdp import scaled_advantages, smdp_advantages
 from hypogoal.options.choosers import Outcome
 
 
@@ -89,7 +89,7 @@ def test_masked_options_are_never_drawn() -> None:
         log_prob, entropy = head.log_prob(scores, offered, drawn)
         assert torch.isfinite(log_prob).all() and torch.isfinite(entropy).all()
         assert log_prob.shape == entropy.shape == (500,)
-        assert int(best(scores, offered)[0]) == 3
+        assert int(among(scores, offered).argmax(1)[0]) == 3
     log_prob, entropy = CategoricalHead(4).log_prob(scores[:1], offered[:1], torch.tensor([[3.0]]))
     assert float(log_prob.detach()) == pytest.approx(1 - np.log(np.exp(1) + 1))
     p = np.exp(1) / (1 + np.exp(1))
@@ -102,15 +102,6 @@ def test_networks_give_a_score_per_option_and_a_value(network: type) -> None:
     out = network((64, 64, 3), 15)(torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8))
     assert out.shape == (2, 16)
     assert float(out.detach()[:, :15].softmax(1).max()) < 0.08
-
-
-def test_certainty_of_a_choice_where_it_is_forced() -> None:
-    """A uniform choice of n has entropy ln n, a certain one 0."""
-    head, offered = CategoricalHead(4), torch.ones((4, 4), dtype=torch.bool)
-    even = head.certainty(torch.zeros(4, 4), offered)
-    assert even["choice_entropy"] == pytest.approx(np.log(4)) and even["top_choice"] == pytest.approx(0.25)
-    for scores, left in ((1e3 * torch.eye(4), offered), (torch.zeros(4, 4), torch.eye(4) > 0)):
-        assert head.certainty(scores, left) == {"choice_entropy": 0.0, "top_choice": 1.0}
 
 
 def test_the_papers_network_has_the_size_that_its_deviation_gives() -> None:

@@ -14,7 +14,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners import double_dqn
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.conv_gru import Lived, PaperLearner, PaperPolicies, PaperQNetwork, left_aligned
+from hypogoal.options.conv_gru import Lived, PaperLearner, PaperPolicies, PaperQNetwork
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
 from hypogoal.options.saved import SavedOptions
@@ -33,7 +33,8 @@ def loop_of(engine: Any, **changes: Any) -> OptionLoop:
 
 def lived(paths: list[list[int]], recurrence: int) -> Lived:
     """Steps of executions through these states, the last of which came next."""
-    rows = [([0] * recurrence + path)[-recurrence - 1 :] for path in paths]
+    kept = [path[-recurrence - 1 :] for path in paths]
+    rows = [path + path[-1:] * (recurrence + 1 - len(path)) for path in kept]
     lengths = [min(len(path) - 1, recurrence) for path in paths]
     return Lived.cast(np.array(rows), lengths, [0] * len(paths), [False] * len(paths))
 
@@ -69,11 +70,6 @@ def test_the_papers_sizes() -> None:
     assert network(seen, torch.arange(3)[:, None], torch.ones(3, dtype=torch.int64)).shape == (3, 18)
 
 
-def test_real_places_come_first() -> None:
-    windows = np.array([[0, 0, 7, 8], [1, 2, 3, 4], [0, 0, 0, 9]])
-    assert left_aligned(windows, np.array([2, 4, 1])).tolist() == [[7, 8, 8, 8], [1, 2, 3, 4], [9, 9, 9, 9]]
-
-
 @pytest.mark.usefixtures("small_gru")
 @pytest.mark.parametrize(("recurrence", "states"), [(1, {4, 5}), (3, {2, 3, 4, 5}), (9, {1, 2, 3, 4, 5})])
 def test_only_states_of_the_window_are_seen(recurrence: int, states: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +100,7 @@ def test_what_is_stored_are_the_steps_of_the_execution() -> None:
                 steps[place] = []
     for option, member in enumerate(loop.learner.members):
         data = member.replay.data
-        found = [data.path[row, 3 - data.length[row] :].tolist() for row in range(member.replay.size)]
+        found = [data.path[row, : data.length[row] + 1].tolist() for row in range(member.replay.size)]
         assert found == [path for chosen, path in wanted if chosen == option]
 
 
