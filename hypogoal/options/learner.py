@@ -125,7 +125,7 @@ class Learner(Part, ABC):
     def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
         chosen = self.greedy(ids, options, age)
-        if explore:
+        if explore and isinstance(self.config, LearnerConfig):
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen
 

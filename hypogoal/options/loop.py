@@ -94,8 +94,8 @@ class OptionLoop(Resumable):
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
-        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
-        ended = reached | timed_out | over
+        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated  # see meta.training
+        ended = reached | timed_out | over  # all that ends an option
         moved = Transitions(
             ids,
             actions,

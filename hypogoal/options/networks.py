@@ -41,15 +41,19 @@ class CellEmbedding(nn.Module):
         self._tiles: Bytes | None = None
         self._pixels = torch.empty(0)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> float32 (N, features), cells row by row."""
+    def forward(self, images: Tensor, tiles: Bytes | None = None) -> Tensor:
+        """uint8 (N, H, W, C) -> float32 (N, features), cells row by row.
+
+        With ``tiles``, uint8 (T, 8, 8, C), the images are cells' codes instead, integers (N, cells).
+        """
+        if tiles is not None:
+            return self._looked_up(images, tiles)
         if any(self._more):
             images = nn.functional.pad(images, self._more)
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
         return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 
-    def from_codes(self, codes: Tensor, tiles: Bytes) -> Tensor:
-        """The same from tile codes, integers (N, cells), and the tiles uint8 (T, 8, 8, C) that they stand for."""
+    def _looked_up(self, codes: Tensor, tiles: Bytes) -> Tensor:
         if self._tiles is not tiles:
             self._tiles = tiles
             pixels = tensor(tiles.copy(), self.conv.weight.device)
@@ -162,7 +166,7 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
 
 
 class LightNetwork(nn.Module):
-    """An embedding and two dense layers; with cells it takes tile codes as well."""
+    """An embedding and two dense layers."""
 
     def __init__(self, cells: Embedding):
         super().__init__()
@@ -174,14 +178,9 @@ class LightNetwork(nn.Module):
             nn.ReLU(),
         )
 
-    def forward(self, images: Tensor) -> Tensor:
-        """What :meth:`head` gives for observations (N, *obs)."""
-        return self.head(self.trunk(self.cells(images)))
-
-    def from_codes(self, codes: Tensor, tiles: Bytes) -> Tensor:
-        """The same from tile codes; see :meth:`CellEmbedding.from_codes`."""
-        assert isinstance(self.cells, CellEmbedding)
-        return self.head(self.trunk(self.cells.from_codes(codes, tiles)))
+    def forward(self, *seen: Any) -> Tensor:
+        """What :meth:`head` gives for observations (N, *obs), or for tile codes and the tiles."""
+        return self.head(self.trunk(self.cells(*seen)))
 
     def head(self, features: Tensor) -> Tensor:
         """The network's outputs, from float32 (N, width)."""
@@ -214,7 +213,7 @@ def apply_to_states(network: nn.Module, engine: Engine, ids: Ints) -> Tensor:
     tiles = engine.tiles
     if tiles is not None and isinstance(getattr(network, "cells", None), CellEmbedding):
         codes = tensor(engine.codes(ids).astype(np.int64), device)
-        return network.from_codes(codes, tiles)  # type: ignore[operator]
+        return network(codes, tiles)
     return network(tensor(engine.images(ids), device))
 
 

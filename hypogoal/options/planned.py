@@ -51,20 +51,9 @@ class PlannedLearner(Learner):
         options: Ids,
         age: Ids,
     ) -> Ids:
-        """Which of the plan's actions each option prefers."""
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
-        return np.argmin(ahead, axis=1)
-
-    def act(
-        self,
-        ids: Ids,
-        options: Ids,
-        age: Ids,
-        *,
-        explore: bool = True,
-    ) -> Ids:
-        """There is nothing to explore."""
-        return self.actions[self.greedy(ids, options, age)]
+        nearest = ahead.argmin(axis=1)
+        return self.actions[nearest]
 
     def observe(self, moved: Transitions) -> None:
         """Only counted."""
@@ -106,7 +95,8 @@ def distances(reached: Flags, after: Ids, final: Flags) -> NDArray[np.int32]:
     steps = np.where(reached, 0, FAR).astype(np.int32)
     going = np.flatnonzero(~final)
     while True:
-        nearer = np.minimum(steps[going], steps[after[going]].min(axis=1) + 1)
+        ahead = steps[after[going]].min(axis=1) + 1
+        nearer = np.minimum(steps[going], ahead)
         if (nearer >= steps[going]).all():
             return np.minimum(steps, FAR)
         steps[going] = nearer

@@ -1,4 +1,10 @@
-"""What ends an option: one object, which every loop that plays options asks (Spec D1, D2, H4).
+"""What decides that an option ends: one object, which every loop that plays options asks (Spec D1, D2, H4).
+
+An execution ends at the first of three things (the last lines of ``OptionLoop.advance`` and ``OptionEnv.step`` say so):
+its sub-goal is reached, as :meth:`Terminations.reached` says; it has taken ``option_timeout`` steps; its episode ends.
+By default the sub-goal is reached where the prediction of the option's own member is positive: where the member's
+log-odds lie above its threshold. Another rule is another subclass, named by the setting ``termination``; with
+``termination=oracle`` the sub-goals' true labels stand in for predictions.
 
 Inside an engine each state is judged once. Libraries round differently in batches of another size. So a member whose
 probability is at its threshold, to the last bits of a float32, may give a state another prediction in another batch.
