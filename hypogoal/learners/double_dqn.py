@@ -52,7 +52,7 @@ def double_q_targets(
 
 
 @dataclass(frozen=True)
-class Batch:
+class ReplayBatch:
     """Transitions that the policies of O options learn from."""
 
     actions: Ints  # (n,)
@@ -84,7 +84,7 @@ class DoubleDQN(Resumable):
         values: Tensor,
         next_online: Tensor,
         next_target: Tensor,
-        batch: Batch,
+        batch: ReplayBatch,
         options: Sequence[int],
         step: int,
     ) -> tuple[float, Floats]:

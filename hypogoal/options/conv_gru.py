@@ -23,7 +23,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import drawing_from, torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import Batch, DoubleDQN
+from hypogoal.learners.double_dqn import DoubleDQN, ReplayBatch
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import saved
@@ -237,7 +237,7 @@ class PaperLearner(Learner):
         next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]
         ones = np.ones_like(length)
-        batch = Batch(
+        batch = ReplayBatch(
             steps.action,
             ones,
             reached,

@@ -16,7 +16,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import drawing_from, torch_generator
 from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import Batch, DoubleDQN
+from hypogoal.learners.double_dqn import DoubleDQN, ReplayBatch
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options import networks, saved
 from hypogoal.options.config import STACK, LightConfig
@@ -141,7 +141,7 @@ class LightLearner(Learner):
         learns = ~inside
         if self.running_only:
             learns &= lessons.option[:, None] == np.arange(self.options)
-        batch = Batch(
+        batch = ReplayBatch(
             lessons.action,
             lessons.steps,
             reached,

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Columns
-from hypogoal.learners.double_dqn import SOFT, Batch, DoubleDQN, double_q_targets, linear_epsilon
+from hypogoal.learners.double_dqn import SOFT, DoubleDQN, ReplayBatch, double_q_targets, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import LearnerConfig
 
@@ -76,7 +76,7 @@ def test_the_target_follows_with_everything(interval: int) -> None:
     network = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2), torch.nn.Unflatten(1, (1, 2)))
     learning, states = DoubleDQN(network, config), torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
     ones = np.ones(4, np.int64)
-    batch = Batch(
+    batch = ReplayBatch(
         actions=np.array([0, 1, 1, 0]),
         steps=ones,
         reached=ones[:, None] > 0,
