@@ -180,7 +180,7 @@ def terminal(title: str, frame: pd.DataFrame) -> Table:
     frame = frame.map(lambda text: text.partition(" ±")[0].partition(" [")[0])
     labels = min(40, max(len(" | ".join(map(str, np.atleast_1d(key)))) for key in frame.index))
     wide = [3 + max(len(str(name)), *map(len, frame[name])) for name in frame]
-    frame = frame.loc[:, labels + np.cumsum(wide) < WIDTH]
+    frame = frame.loc[:, labels + 4 + np.cumsum(wide) <= WIDTH]  # with the borders of the labels
     printed = Table(title=title, title_justify="left", width=WIDTH)
     for name in frame.index.names:
         printed.add_column(str(name), overflow="fold")
