@@ -13,7 +13,7 @@ from PIL import Image
 
 from hypogoal.data import open_dataset
 from hypogoal.importing.pictures import picture_of, read_pictures
-from tests.importing.states import SIDE, arrays, pictures, save_minari, save_pictures
+from tests.importing.states import SIDE, pictures, save_pictures
 
 
 def saved(values: np.ndarray, kind: str = "PNG", **more: Any) -> bytes:
@@ -96,23 +96,17 @@ def test_what_is_not_read_is_counted_and_folders_are_groups(tmp_path: Path) -> N
     assert not others & held
 
 
-def test_pictures_of_any_source_are_made_smaller(tmp_path: Path) -> None:
+def test_large_pictures_are_made_smaller(tmp_path: Path) -> None:
     """Spec B6: their longer side has so many pixels, areas are averaged; what is small enough stays as it is."""
-    images, _ = pictures(24)
+    images, labels = pictures(24)
     small = images.reshape(24, 24, 2, 24, 2, 3).mean((2, 4))
-    np.savez(tmp_path / "own.npz", **arrays())
-    sources = [save_pictures(tmp_path / "at-right"), tmp_path / "own.npz", save_minari(tmp_path / "own-v0")]
-    for number, source in enumerate(sources):
-        given = ["--label", f"right={source / 'right.csv'}"] if number == 2 else []
-        out = tmp_path / f"{number}.h5"
-        run("import", source, "--out", out, "--resize", "24", *given, "-q")
-        data = open_dataset(out)
-        assert data.observation_shape == (24, 24, 3) and data.config["resize"] == 24
-        if number == 0:
-            positives = small[np.arange(24) % 2 == 1]
-            assert np.abs(data.labelled("at-right").observations[:12] - positives).max() <= 1
-    large = sources[0] / "positive" / "01.png"
+    folder, out = save_pictures(tmp_path / "at-right"), tmp_path / "data.h5"
+    run("import", folder, "--out", out, "--resize", "24", "-q")
+    data = open_dataset(out)
+    assert data.observation_shape == (24, 24, 3) and data.config["resize"] == 24
+    assert np.abs(data.labelled("at-right").observations[:12] - small[labels]).max() <= 1
+    large = folder / "positive" / "01.png"
     Image.open(large).resize((96, 96)).save(large)
-    refuses("states differ in size", "import", sources[0], "--out", tmp_path / "x.h5")
-    run("import", sources[0], "--out", tmp_path / "x.h5", "--resize", "30", "-q")
-    assert open_dataset(tmp_path / "x.h5").observation_shape == (30, 30, 3)
+    refuses("states differ in size", "import", folder, "--out", tmp_path / "x.h5")
+    run("import", folder, "--out", out, "--resize", "30", "-q", "--force")
+    assert open_dataset(out).observation_shape == (30, 30, 3)
