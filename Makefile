@@ -73,7 +73,7 @@ check: $(STAMP) ## linter, formatter, types, import contracts, vague names
 	$(BIN)/python -m tests.vague_names
 
 bench: $(STAMP) ## what is faster than what, in ratios (BENCH=--short for a quick look, ONLY="doorkey loop")
-	for name in $(ONLY); do $(BIN)/python -m benchmarks $$name $(BENCH) || exit 1; done
+	for name in $(ONLY); do $(BIN)/python -m benchmarks.$$name $(BENCH) || exit 1; done
 
 docs: $(STAMP) ## the documentation as a site, in site/
 	$(BIN)/python -m mkdocs build --strict

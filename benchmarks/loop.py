@@ -1,19 +1,17 @@
 """End to end: agents that learn, environment steps per second of CPU time of one thread, in one run.
 
-    python -m benchmarks loop [--short] [--json PATH]
+    python -m benchmarks.loop [--short] [--json PATH]
 
 On DoorKey ``train-meta`` in the light setting, 15 learned members, over a run of its default length, against
 stable-baselines3's PPO and DQN with its own defaults for pictures, on MiniGrid's class with
-``RGBImgObsWrapper(tile_size=8)``: what one would use instead. Beside it the share of the loop that goes into
-terminations and masks: members' verdicts on states, of which a run meets fewer new ones as it learns. On Montezuma's
-Revenge ``train-options`` against the emulator's ceiling, random actions with a stack at each step.
+``RGBImgObsWrapper(tile_size=8)``: what one would use instead. On Montezuma's Revenge ``train-options`` against the
+emulator's ceiling, random actions with a stack at each step.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-import statistics
 import tempfile
 import time
 from pathlib import Path
@@ -31,7 +29,6 @@ from hypogoal.cli import main as hypogoal  # noqa: E402
 LAYOUT = 100
 WANTED = {"train-meta": 15.0}
 HALF = "update_interval=16"  # half as often as the default
-WANTED_SHARE = 0.1  # of verdicts, at most
 RESTORE_EVERY = 40  # steps of the emulator alone
 CLIMBING = "train-options at a ladder"
 WANTED_OF_CEILING = {CLIMBING: 0.8}
@@ -42,13 +39,6 @@ def quietly(*command: object) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         if hypogoal([*map(str, command), "-q"]):
             raise SystemExit(f"failed: {command}")
-
-
-def per_step(steps: int, work: Any) -> float:
-    """CPU seconds of an environment step."""
-    begin = time.process_time()
-    work()
-    return (time.process_time() - begin) / steps
 
 
 def baseline(algorithm: str, steps: int) -> float:
@@ -63,52 +53,40 @@ def baseline(algorithm: str, steps: int) -> float:
         agent: Any = PPO("CnnPolicy", env, seed=0, device="cpu", n_steps=rollout, batch_size=min(64, rollout))
     else:
         agent = DQN("CnnPolicy", env, seed=0, device="cpu", learning_starts=100, buffer_size=10_000)
-    return per_step(steps, lambda: agent.learn(steps))
+    return timing.cpu_seconds(lambda: agent.learn(steps)) / steps
 
 
-def meta(ensemble: Path, steps: int, folder: Path, shares: list[float], *more: str) -> float:
+def meta(ensemble: Path, steps: int, folder: Path, *more: str) -> float:
     """An environment step of ``train-meta`` on DoorKey with ``more`` settings, CPU seconds.
 
-    The share of verdicts goes to ``shares``. The loop alone: start-up and the measures at the end are not counted.
+    The loop alone: start-up and the measures at the end are not counted.
     """
-    from hypogoal.options.termination import Terminations
     from hypogoal.stages import agents
 
-    judge, loop, played = Terminations.of, agents.train, 0.0
-    judging = [0.0]
-
-    def of(self: Terminations, ids: Any) -> Any:
-        begin = time.process_time()
-        found = judge(self, ids)
-        judging[0] += time.process_time() - begin
-        return found
+    loop, played = agents.train, 0.0
 
     def train(*given: Any) -> bool:
         nonlocal played
-        judging[0] = 0.0
         begin = time.process_time()
         solved = loop(*given)
         played = time.process_time() - begin
         return solved
 
     changes = (word for pair in ("random_episodes=1", f"steps={steps}", *more) for word in ("--set", pair))
-    with patch.object(Terminations, "of", of), patch.object(agents, "train", train):
+    with patch.object(agents, "train", train):
         out = folder / f"out-{time.monotonic_ns()}"
         quietly("train-meta", ensemble, "--layout-seed", LAYOUT, "--out", out, *changes)
-    shares.append(judging[0] / played)
     return played / steps
 
 
 def stage(steps: int, folder: Path, *command: object) -> float:
     """Ours, CPU seconds of a step; start-up and the measures at the end are not counted: the difference of two runs."""
     few = steps // 5
-
-    def seconds(count: int) -> float:
-        begin = time.process_time()
-        quietly(*command, "--out", folder / f"out-{time.monotonic_ns()}", "--set", f"steps={count}")
-        return time.process_time() - begin
-
-    return (seconds(steps) - seconds(few)) / (steps - few)
+    seconds = []
+    for count in (steps, few):
+        words = (*command, "--out", folder / f"out-{time.monotonic_ns()}", "--set", f"steps={count}")
+        seconds.append(timing.cpu_seconds(lambda words=words: quietly(*words)))  # type: ignore[misc]
+    return (seconds[0] - seconds[1]) / (steps - few)
 
 
 def climbing(ensemble: Path, steps: int, folder: Path) -> float:
@@ -136,7 +114,7 @@ def ceiling(steps: int) -> float:
             emulator.step(action)
             _observation = emulator.stack
 
-    return per_step(steps, play)
+    return timing.cpu_seconds(play) / steps
 
 
 def main() -> None:
@@ -144,19 +122,17 @@ def main() -> None:
     given = timing.arguments(__doc__, "loop")
     repeats, ours, theirs = (1, 2_500, 256) if given.short else (3, 300_000, 4_096)
     about = timing.machine("torch", "stable-baselines3", "minigrid", "ale-py")
-    print(", ".join(f"{name} {value}" for name, value in about.items()))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         quietly("collect", "doorkey", "--out", folder / "data.h5", "--set", "heldout_layouts=1")
         learned = 3 if given.short else 150
         quietly("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "--set", f"steps={learned}")
-        shares: list[float] = []
         found = timing.alternated(
             {
                 "PPO, stable-baselines3 on MiniGrid": lambda: baseline("ppo", theirs),
                 "DQN, stable-baselines3 on MiniGrid": lambda: baseline("dqn", theirs),
-                "train-meta": lambda: meta(folder / "ensemble", ours, folder, shares),
-                "train-meta, half the updates": lambda: meta(folder / "ensemble", ours, folder, [], HALF),
+                "train-meta": lambda: meta(folder / "ensemble", ours, folder),
+                "train-meta, half the updates": lambda: meta(folder / "ensemble", ours, folder, HALF),
             },
             repeats,
         )
@@ -175,10 +151,8 @@ def main() -> None:
         )
         climb = timing.rows_of(climbed, "the emulator's ceiling", WANTED_OF_CEILING)
     timing.show(f"\nDoorKey: an environment step, learning included ({ours:,} of ours)", rows)
-    share = statistics.median(shares)
-    print(f"terminations and masks: {share:.1%} of train-meta's time (wanted: under {WANTED_SHARE:.0%})")
     timing.show("\nMontezuma's Revenge: an agent step, learning included", climb)
-    results = {"doorkey": rows, "steps": ours, "verdicts": share, "montezuma": climb, "repeats": repeats}
+    results = {"doorkey": rows, "steps": ours, "montezuma": climb, "repeats": repeats}
     timing.write(given.json, about, results)
 
 

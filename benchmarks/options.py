@@ -1,6 +1,6 @@
-"""Option learning: updates against a plain one, all members at once, replay; in one run, one thread.
+"""Option learning: updates against a plain one, all members at once; in one run, one thread.
 
-    python -m benchmarks options [--short] [--json PATH]
+    python -m benchmarks.options [--short] [--json PATH]
 
 The plain update is the paper's network and Double-DQN as one would write them down, anew: the images of every step of
 32 executions up to the sampled step, float32 NCHW, three passes (the online network before and after the step, the
@@ -12,7 +12,6 @@ All are fed executions of random play.
 from __future__ import annotations
 
 import copy
-import resource
 import statistics
 from typing import Any
 
@@ -33,7 +32,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
 from hypogoal.meta.config import TrainOptionsConfig  # noqa: E402
 from hypogoal.options.choosers import RandomChooser  # noqa: E402
-from hypogoal.options.conv_gru import Lived, PaperLearner  # noqa: E402
+from hypogoal.options.conv_gru import PaperLearner  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.loop import OptionLoop  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
@@ -173,43 +172,16 @@ def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[s
     return rows, timing.rows_of(by_members, f"light, {MEMBERS[-1]} members", {})
 
 
-def replay_figures(repeats: int) -> dict[str, float]:
-    """Memory of 15 full replays of 1e5 transitions, and a sample of 32 with its new priorities."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    replays = [PrioritisedReplay(Lived.empty(100_000, 10)) for _ in range(15)]
-    rng = np.random.default_rng(0)
-    for replay in replays:
-        for _ in range(100):
-            steps = rng.integers(0, 2, (1_000, 11))
-            replay.add(Lived.cast(steps, *steps[:, :3].T))
-    held = sum(part.nbytes for replay in replays for part in (replay.priorities, *vars(replay.data).values()))
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
-
-    def sampled() -> None:
-        for _ in range(200):
-            indices, _ = replays[0].sample(32, rng)
-            replays[0].set_priorities(indices, rng.random(32, np.float32))
-
-    times = [timing.cpu_seconds(sampled) / 200 for _ in range(repeats)]
-    sampling = 1e3 * statistics.median(times)
-    return {"MB held": held / 1e6, "MB grown": grown / 1e6, "ms to sample 32 and update": sampling}
-
-
 def main() -> None:
     """Measure, print, write."""
     given = timing.arguments(__doc__, "options")
     repeats, count = (1, 2) if given.short else (5, 10)
     prepare()
     about = timing.machine("torch", "numpy")
-    print(", ".join(f"{name} {value}" for name, value in about.items()))
-    replay = replay_figures(3 if given.short else 20)
     rows, members = updates(repeats, count)
     timing.show("\na Double-DQN update", rows)
     timing.show("\nthe light update by number of members, all learning from every transition", members)
-    print(f"\n15 replays of 1e5 DoorKey transitions: {replay['MB held']:.0f} MB (wanted: under 300);")
-    print(f"a sample of 32 and its priorities: {replay['ms to sample 32 and update']:.3f} ms (wanted: under 0.3)")
-    results = {"updates": rows, "members": members, "replay": replay, "repeats": repeats}
-    timing.write(given.json, about, results)
+    timing.write(given.json, about, {"updates": rows, "members": members, "repeats": repeats})
 
 
 if __name__ == "__main__":

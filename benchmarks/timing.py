@@ -21,7 +21,7 @@ def alone() -> None:
 
 
 def machine(*packages: str) -> dict[str, str]:
-    """Where it was measured, of which commit (with a + where files differ from it), and with which versions."""
+    """Where it is measured, of which commit (with a + where files differ from it), with which versions; printed."""
     model = platform.processor() or "unknown"
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -30,12 +30,14 @@ def machine(*packages: str) -> dict[str, str]:
     versions = {name: metadata.version(name) for name in packages}
     told = subprocess.run(["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=False)
     commit = {"commit": told.stdout.strip()} if told.returncode == 0 else {}
-    return {"processor": model, **commit, "python": platform.python_version(), **versions}
+    about = {"processor": model, **commit, "python": platform.python_version(), **versions}
+    print(", ".join(f"{name} {value}" for name, value in about.items()))
+    return about
 
 
 def arguments(doc: str | None, name: str) -> argparse.Namespace:
     """``--short`` and ``--json PATH``, which every benchmark has."""
-    parser = argparse.ArgumentParser(prog=f"python -m benchmarks {name}", description=(doc or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=(doc or "").split("\n")[0])
     parser.add_argument("--short", action="store_true", help="a few seconds, for continuous integration")
     parser.add_argument("--json", type=Path, help="also write the figures here")
     return parser.parse_args()
@@ -62,16 +64,8 @@ def rows_of(found: Mapping[str, Sequence[float]], reference: str, wanted: Mappin
     rows = []
     for name, seconds in found.items():
         ratios = [slow / fast for slow, fast in zip(found[reference], seconds, strict=True)]
-        rows.append(
-            {
-                "name": name,
-                "seconds": statistics.median(seconds),
-                "lowest": min(seconds),
-                "highest": max(seconds),
-                "ratio": statistics.median(ratios),
-                "wanted": wanted.get(name),
-            }
-        )
+        row = {"name": name, "seconds": statistics.median(seconds), "lowest": min(seconds), "highest": max(seconds)}
+        rows.append({**row, "ratio": statistics.median(ratios), "wanted": wanted.get(name)})
     return rows
 
 
@@ -80,7 +74,7 @@ def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     print(f"{title}\n{'':44}{'median':>11}{'ratio':>9}{'wanted':>9}")
     for row in rows:
         wanted = f"{row['wanted']:.1f}x" if row["wanted"] else ""
-        print(f"{row['name'][:43]:44}{1e3 * row['seconds']:8.2f} ms{row['ratio']:8.2f}x{wanted:>9}")
+        print(f"{row['name'][:43]:44}{1e3 * row['seconds']:8.3g} ms{row['ratio']:8.2f}x{wanted:>9}")
 
 
 def write(path: Path | None, about: Mapping[str, str], results: Mapping[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """One step of ensemble training against a plain loop over the members, in one run, one thread.
 
-    python -m benchmarks training [--short] [--json PATH]
+    python -m benchmarks.training [--short] [--json PATH]
 
 The plain loop is the formulation of the authors' public code, written anew: each member by itself, float32 NCHW,
 labelled and unlabelled states in two passes, the disagreement of each ordered pair, Adam for each member. Both train
@@ -113,7 +113,6 @@ def main() -> None:
     repeats, steps = (1, 4) if given.short else (5, 12)
     prepare()
     about = timing.machine("torch", "numpy")
-    print(", ".join(f"{name} {value}" for name, value in about.items()))
     results: dict[str, Any] = {"repeats": repeats, "steps": steps}
     with tempfile.TemporaryDirectory() as folder:
         for domain in WANTED if not given.short else ("doorkey",):

@@ -16,7 +16,7 @@ NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's 
 HERE = "{run}"  # in a cell's words the run's folder
 DONE, RUNNING, FAILED, WAITING = "done", "running", "failed", "waiting"
 STOPPED = ("", "130", "143", "-2", "-15")  # exit codes that are no failure: none yet, Ctrl-C, SIGTERM
-COLUMNS = ["artefact", "sub_goal", "member", "scope", "quantity", "value"]
+COLUMNS = ["cell", "sub_goal", "member", "scope", "quantity", "value"]
 
 Value = str | int | float
 
@@ -46,14 +46,19 @@ class Cell(BaseModel):
         return f"{self.name}.h5" if self.stage == "collect" else self.name
 
     @property
+    def out(self) -> Path:
+        """Its output."""
+        return self.run / self.place
+
+    @property
     def draft(self) -> Draft:
         """The draft of its output."""
-        return Draft(self.run / self.place)
+        return Draft(self.out)
 
     @property
     def is_done(self) -> bool:
         """Whether its output is there."""
-        return (self.run / self.place).exists()
+        return self.out.exists()
 
     @property
     def is_makeable(self) -> bool:
@@ -63,8 +68,8 @@ class Cell(BaseModel):
     @property
     def command(self) -> list[str]:
         """Its words as one types them after ``hypogoal``."""
-        words = [word.replace(HERE, str(self.run)) for word in self.words]
-        return [*words, "--out", str(self.run / self.place)]
+        words = [*self.words, "--out", str(self.out)]
+        return [word.replace(HERE, str(self.run)) for word in words]
 
     def log(self, suffix: str = "log") -> Path:
         """What its attempts printed; with the suffix ``code`` how the last one ended, a signal as a negative number."""
@@ -124,12 +129,12 @@ def write_results(run: Path, evaluation: Path) -> None:
     cells = read_plan(run)
     if not cells:
         return
-    rows = [{"cell": cell.name, "stage": cell.stage, **cell.columns, "artefact": cell.place} for cell in cells]
-    numbers = pandas.read_csv(evaluation / "numbers.csv", dtype=str, keep_default_na=False)
-    of_ends = numbers[numbers["step"] == ""]
+    rows = [{"cell": cell.name, "stage": cell.stage, **cell.columns} for cell in cells]
     made = pandas.DataFrame(rows, dtype=object)
-    results = made.merge(of_ends[COLUMNS], on="artefact", suffixes=("_of_cell", ""))
-    results.drop(columns="artefact").to_csv(evaluation / "results.csv", index=False, lineterminator="\n")
+    numbers = pandas.read_csv(evaluation / "numbers.csv", dtype=str, keep_default_na=False)
+    of_ends = numbers.query("step == ''").rename(columns={"artefact": "cell"})[COLUMNS]
+    results = made.merge(of_ends, on="cell", suffixes=("_of_cell", ""))
+    results.to_csv(evaluation / "results.csv", index=False, lineterminator="\n")
 
 
 def status_lines(run: Path) -> list[str]:

@@ -12,7 +12,6 @@ import shlex
 import shutil
 import signal
 import sys
-import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -50,7 +49,7 @@ app = typer.Typer(
     cls=Commands,
     help="Transferable sub-goals by hypothesising which features generalise.\n\nStart here: "
     "[bold]hypogoal run rooms --preset demo[/bold], two minutes from nothing to a report.",
-    epilog="Each command's --help ends with an example. Settings: hypogoal config.",
+    epilog="Each command's --help ends with an example. Settings: hypogoal config STAGE.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -62,16 +61,6 @@ Json = Annotated[bool, Option("--json", metavar="", help="Machine-readable outpu
 def command(panel: str, example: str, name: str | None = None) -> Any:
     """Make a function a command of a group; its ``--help`` ends with an example."""
     return app.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
-
-
-def list_stages(names: Iterable[str], panel: str) -> None:
-    """List stages among the commands."""
-    for name in names:
-        app.command(name, help=stages.LISTED[name], rich_help_panel=panel)(lambda: None)
-
-
-*_MADE, _AUDIT = stages.LISTED
-list_stages(_MADE, MAKE)
 
 
 def _version(wanted: bool) -> None:
@@ -109,9 +98,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its exit
         return 1
     except KeyboardInterrupt as stop:
-        if arguments is None:
-            for number in processes.SIGNALS:  # all is cleaned up: a further signal may end the process at once
-                signal.signal(number, signal.SIG_DFL)
         number = stop.args[0] if stop.args else signal.SIGINT
         return _fail("stopped", 128 + number, stop)
     except (Exception, SystemExit) as error:
@@ -129,10 +115,8 @@ def _commands() -> Any:
 
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
-    every = dict(_commands().commands)
-    for name in stages.LISTED:
-        every[name] = stages.load_stage(name).command
-    return every
+    of_stages = {name: stages.load_stage(name).command for name in stages.LISTED}
+    return {**_commands().commands, **of_stages}
 
 
 def _called(words: list[str]) -> int:
@@ -152,15 +136,16 @@ def _called(words: list[str]) -> int:
 
 def _advice(error: Any) -> str:
     """What to do about words that a command does not take; settings are often mistaken for options."""
-    stage = getattr(getattr(error, "ctx", None), "info_name", "") or ""
+    stage = error.ctx.info_name
     if hasattr(error, "possibilities") and stage in stages.LISTED:
         return f"Settings are given as --set KEY=VALUE; 'hypogoal config {stage}' lists them."
-    return f"See 'hypogoal {stage} --help'." if stage not in ("", "hypogoal") else "See 'hypogoal --help'."
+    words = "hypogoal" if stage == "hypogoal" else f"hypogoal {stage}"
+    return f"See '{words} --help'."
 
 
 def _fail(message: str, code: int, error: BaseException | None = None) -> int:
-    """Say what is wrong, and the notes that were added to the error, each once."""
-    notes = dict.fromkeys(getattr(error, "__notes__", []))
+    """Say what is wrong, and the notes that were added to the error."""
+    notes = getattr(error, "__notes__", [])
     line = "; ".join([message.rstrip("."), *notes]) if notes else message
     say(f"hypogoal: {printable(line)}", err=True)
     return code
@@ -169,10 +154,8 @@ def _fail(message: str, code: int, error: BaseException | None = None) -> int:
 def echo(value: Any, as_json: bool, text: Iterable[str]) -> None:
     """Print a value for programs, or its text for people."""
     if as_json:
-        say(json.dumps(value, indent=1))
-        return
-    for line in text:
-        say(line)
+        text = [json.dumps(value, indent=1)]
+    say(*text)
 
 
 @command(MAKE, "run doorkey --preset demo --out runs/demo")
@@ -184,9 +167,7 @@ def run(
     seed: Annotated[str | None, Option(help="The run seeds, instead of the experiment's: 3, or 0-9.")] = None,
     device: stages.Device = "auto",
     force: stages.Force = False,
-    resume: Annotated[
-        bool, Option("--resume", metavar="", help="Keep what is complete, continue with the rest.")
-    ] = False,
+    resume: stages.Resume = False,
     from_: Annotated[
         str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it.")
     ] = None,
@@ -225,12 +206,10 @@ def run(
         only=only,
         say=lambda text: None if quiet else say(text, err=True),
     )
-    if engine == "slurm" or only or not (out / "report").is_dir():
+    if only or not (out / "report").is_dir():
         say(out)
         return
-    for line in look.outcome(look.describe(out / "evaluation")):
-        say(line)
-    say(out / "report" / "index.html")
+    say(*look.outcome(look.describe(out / "evaluation")), out / "report" / "index.html")
 
 
 @command(LOOK, "show runs/mine")
@@ -247,8 +226,7 @@ def show(
     if pictures is not None:
         from hypogoal.evaluation.sheets import write_sheets
 
-        for sheet in write_sheets(path, pictures):
-            say(sheet, err=as_json)
+        say(*write_sheets(path, pictures), err=as_json)
 
 
 @command(LOOK, "verify runs/mine")
@@ -279,10 +257,10 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
 
 @command(LOOK, "config train-ensemble --domain montezuma")
 def config(
-    stage: Annotated[str | None, Argument(help="For example train-meta; without it, the list of stages.")] = None,
+    stage: Annotated[str, Argument(help="For example train-meta, or run.")],
     domain: Annotated[str, Option(help=f"Settings for: {stages.DOMAINS}")] = "doorkey",
     preset: stages.Preset = None,
-    write: Annotated[Path | None, Option(help="Write them as a preset to edit: a new .toml file for --preset.")] = None,
+    toml: Annotated[bool, Option("--toml", metavar="", help="As a preset to edit: a .toml file for --preset.")] = False,
     as_json: Json = False,
 ) -> None:
     """List every setting of a stage: default, unit, meaning, source."""
@@ -290,21 +268,8 @@ def config(
     from hypogoal.domains import base as domains
     from hypogoal.experiments.named import config_class_of
 
-    if stage is None:
-        helps = stages.LISTED | {"run": "Run all cells of an experiment."}
-        names = settings.TABLES
-        echo(names, as_json, [f"{name:15}{helps[name]}" for name in names])
-        return
     rows = settings.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
-    if not domains.load_domain(domain).starts:
-        rows = [row for row in rows if row["name"] != "start"]  # it would be refused
-    if write is None:
-        echo(rows, as_json, _setting_lines(rows))
-        return
-    if write.exists() or write.suffix != ".toml":
-        raise UserError("a preset needs a new .toml file", write, "Choose another name.")
-    write.write_text(settings.as_toml(stage, rows), encoding="utf-8")
-    say(write)
+    echo(rows, as_json, [settings.as_toml(stage, rows)] if toml else _setting_lines(rows))
 
 
 def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
@@ -326,20 +291,26 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
 @command(LOOK, "compare runs/mine runs/other --out runs/both")
 def compare(
     runs: Annotated[list[Path], Argument(metavar="RUN...", help="Evaluated; each is compared with the first.")],
-    out: Annotated[Path | None, Option(help="Where to write a page; else who wins is printed.")] = None,
+    out: stages.Out,
     force: stages.Force = False,
 ) -> None:
     """Put evaluated runs side by side: what differs, who wins."""
     from hypogoal import look
     from hypogoal.tools.compare import compare as compared
 
-    with tempfile.TemporaryDirectory() as folder:
-        place = out or Path(folder, "comparison")
-        page = compared(runs, place, force=force)
-        for line in look.outcome(look.describe(place)):
-            say(line)
-    if out is not None:
-        say(page)
+    page = compared(runs, out, force=force)
+    say(*look.outcome(look.describe(out)), page)
+
+
+LABEL = "Episodes: a column, last:N frames, FILE.csv; data file: FILE.csv."
+
+
+def _label(text: str) -> tuple[str, str]:
+    """``NAME=RULE`` as a pair."""
+    name, _, rule = text.partition("=")
+    if not (name and rule):
+        raise UserError("--label needs NAME=RULE", text, "For example --label won=next.success.")
+    return name, rule
 
 
 @command(OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
@@ -349,13 +320,7 @@ def import_(
     sub_goal: Annotated[
         list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
     ] = None,
-    label: Annotated[
-        list[str] | None,
-        Option(
-            metavar="NAME=RULE",
-            help="Episodes: a column, last:N frames, FILE.csv; data file: FILE.csv.",
-        ),
-    ] = None,
+    label: Annotated[list[Any] | None, Option(parser=_label, metavar="NAME=RULE", help=LABEL)] = None,
     key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
     every: Annotated[int, Option(min=1, help="Episodes: take every N-th frame.")] = 1,
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
@@ -375,7 +340,7 @@ def import_(
         source,
         out,
         sub_goals=tuple(sub_goal or ()),
-        rules=_labels(label or ()),
+        rules=dict(label or ()),
         share=heldout,
         group=group,
         domain=domain,
@@ -386,34 +351,21 @@ def import_(
         resize=resize,
         stack=stack,
     )
-    for line in remarks:
-        say(f"hypogoal: {line}", err=True)
+    say(*(f"hypogoal: {line}" for line in remarks), err=True)
     if not quiet:
         details = look.describe(out)
-        for line in (f"states: {details['observations']}", *look.outcome(details)):
-            say(line)
+        say(f"states: {details['observations']}", *look.outcome(details))
         run_folder = out.parent if out.name == "data.h5" else Path("runs", out.stem)
         say(f"next: {own_code.command('train-ensemble', out, '--out', run_folder / 'ensemble')}")
     say(out)
 
 
-def _labels(texts: Iterable[str]) -> dict[str, str]:
-    """The rules of ``--label NAME=RULE`` by name."""
-    labels = {}
-    for text in texts:
-        name, _, rule = text.partition("=")
-        if not (name and rule):
-            raise UserError("--label needs NAME=RULE", text, "For example --label won=next.success.")
-        labels[name] = rule
-    return labels
-
-
 @command(OWN, "export runs/mine/ensemble --out mine")
 def export(
     source: Annotated[Path, Argument(help="The folder of a meta or an ensemble artefact.")],
-    out: Annotated[Path, Option(help="The folder; a Minari dataset's is NAME-v0.")],
+    out: stages.Out,
     episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
-    seed: Annotated[int, Option(min=0, help="Seed of the agent's choices.")] = 0,
+    seed: stages.Seed = 0,
     force: stages.Force = False,
     quiet: stages.Quiet = False,
 ) -> None:
@@ -435,7 +387,6 @@ def check(
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
     set_: stages.Set = None,
     seed: stages.Seed = 0,
-    layout_seed: Annotated[int, Option(min=0, help="The layout to play.")] = 0,
 ) -> None:
     """Check that your domain, objective or network keeps its contract.
 
@@ -446,27 +397,27 @@ def check(
     from hypogoal.core import config as settings
     from hypogoal.domains import base as domains
 
-    if domain is None and diversity is None and network is None:
-        raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
     checks: list[Any] = []
     observations: tuple[Any, ...] = ()
     if domain is not None:
         loaded = domains.load_domain(domain)
         chosen = domains.settings_of("collect", domain, typed=settings.assigned(set_ or ()))
-        checks.append(contracts.check_domain(loaded, chosen, layout_seed=layout_seed, seed=seed))
-        observations = tuple(loaded.observation_shape), loaded.observation_dtype
+        checks.append(contracts.check_domain(loaded, chosen, seed=seed))
+        observations = loaded.observation_shape, loaded.observation_dtype
     if diversity is not None:
         checks.append(contracts.check_objective(diversity))
     if network is not None:
         checks.append(contracts.check_network(network, *observations))
+    if not checks:
+        raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
     for verdict in itertools.chain(*checks):
-        for line in verdict.lines:
-            say(line)
+        say(*verdict.lines)
         if not verdict.ok:
             raise typer.Exit(2)
 
 
-list_stages([_AUDIT], OWN)
+for _stage, _help in stages.LISTED.items():  # their commands come from them
+    app.command(_stage, help=_help, rich_help_panel=OWN if _stage == "audit" else MAKE)(lambda: None)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -17,8 +17,6 @@ Commits e4a7b5a (planned), a08a8b0 (learned), a133675 (baselines). Preference: l
 
 from __future__ import annotations
 
-import argparse
-import csv
 from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
@@ -30,7 +28,7 @@ from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, play_agent
 from hypogoal.evaluation.names import LEARNED, UNIFORM
 from hypogoal.evaluation.run import find_artefacts
-from studies.cells import difference, interval, table
+from studies.cells import difference, interval, parser_of, read_rows, table, write_rows
 
 ENSEMBLES = {
     "joint": "joint, K = 2",
@@ -55,10 +53,8 @@ METHODS = IN_ROOMS | {  # by what the names of artefacts have in them, the longe
 BASELINES = ("ppo", "dqn")
 PLANNED = "planned"
 POLICIES = {"learned": "learned options", PLANNED: "planned options"}  # baselines have none
-PRACTICE, PRACTISED = (
-    "practice",
-    "practised",
-)  # steps in the plain world, and whether uniform-random choice solved it by then
+# Steps in the plain world, and whether uniform-random choice solved it by then.
+PRACTICE, PRACTISED = "practice", "practised"
 MOST_LAYOUTS = 10  # side by side in a table; more are in the rows alone
 ROOMS = {  # columns, by what their files' names end in
     "seeds 400 to 409": "-joint",
@@ -79,7 +75,8 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
     """
     rows = [row for artefact in find_artefacts(run, "meta") for row in _played(artefact)]
     if baselines:
-        rows += [row for row in _numbers(baselines) if row["seed"] and not row["step"] and row["quantity"] in OF_PLAY]
+        numbers = read_rows(baselines / "evaluation" / "numbers.csv")
+        rows += [row for row in numbers if row["seed"] and not row["step"] and row["quantity"] in OF_PLAY]
     kept: list[tuple[str, ...]] = []
     for row in rows:
         method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
@@ -92,10 +89,7 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
     names = (*METHODS, *POLICIES, "agent", "uniform", *OF_PLAY, *OF_CHOICE, PRACTICE, PRACTISED)
     order = {name: place for place, name in enumerate(("", *names))}
     kept.sort(key=lambda row: (order[row[0]], order[row[1]], int(row[2]), order[row[4]], order[row[5]]))
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows(kept)
+    write_rows(path, COLUMNS, [dict(zip(COLUMNS, row, strict=True)) for row in kept])
 
 
 def _played(artefact: Artefact) -> list[dict[str, str]]:
@@ -117,14 +111,7 @@ def _played(artefact: Artefact) -> list[dict[str, str]]:
 
 def _read(path: Path) -> list[dict[str, str]]:
     """The rows; in files from before there was a policy all options are planned."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [{"policy": "" if row["method"] in BASELINES else PLANNED, **row} for row in rows]
-
-
-def _numbers(run: Path) -> list[dict[str, str]]:
-    with (run / "evaluation" / "numbers.csv").open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return [{"policy": "" if row["method"] in BASELINES else PLANNED, **row} for row in read_rows(path)]
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -153,19 +140,16 @@ def tables(path: Path) -> Iterator[str]:
         yield from table(["", *layouts], ([agents[agent], *cells(agent)] for agent in shown))
 
     def shares(agent: tuple[str, str]) -> Iterator[str]:
-        for solved, uniform in zip(
-            values_of(agent, "agent", "success"), values_of(agent, "uniform", "success"), strict=True
-        ):
+        choosers = [values_of(agent, chooser, "success") for chooser in ("agent", "uniform")]
+        for solved, uniform in zip(*choosers, strict=True):
             yield "-" if np.isnan(solved) else f"{solved:.2f} / {uniform:.2f}"
 
     def practice(agent: tuple[str, str]) -> Iterator[str]:
-        for steps, solved in zip(
-            values_of(agent, "agent", PRACTICE), values_of(agent, "agent", PRACTISED), strict=True
-        ):
+        practices = [values_of(agent, "agent", quantity) for quantity in (PRACTICE, PRACTISED)]
+        for steps, solved in zip(*practices, strict=True):
             yield "-" if np.isnan(steps) else f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
 
-    yield f"Mean over {len(layouts)} layouts with a 95 % interval; of choices, where they are defined."
-    yield ""
+    yield f"Mean over {len(layouts)} layouts with a 95 % interval; of choices, where they are defined.\n"
     yield from table(
         ["", "solved by uniform-random choice", *SHOWN.values(), "95 % solved on"],
         (
@@ -201,16 +185,14 @@ def rooms(path: Path) -> Iterator[str]:
     """Settings side by side, and joint beside D-BAT; every other number is in the rows."""
     settings = {which: _read(path.with_stem(path.stem + suffix)) for which, suffix in ROOMS.items()}
     methods = [method for method in IN_ROOMS if any(len(solved_by(r, method, "agent")) for r in settings.values())]
-    yield SHARES
-    yield ""
+    yield f"{SHARES}\n"
     yield from table(["", *settings], ([METHODS[m], *(_shown(rows, m) for rows in settings.values())] for m in methods))
     newest = settings["seeds 400 to 409"]
     rows = []
     for method, title in ENSEMBLES.items():
         if method != "joint" and len(solved_by(newest, f"{method}-truth-shape", "agent")):
             rows.append([title, *(_joint_minus(newest, method, truth) for truth in TRUTHS)])
-    yield "Joint minus the other, seed by seed, with Student's interval."
-    yield ""
+    yield "Joint minus the other, seed by seed, with Student's interval.\n"
     yield from table(["", *TRUTHS], rows)
 
 
@@ -233,11 +215,8 @@ def _reached(shares: NDArray[np.float64]) -> str:
 
 def main() -> None:
     """Take the numbers of a run, or draw the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
-    parser.add_argument("csv", type=Path, help="the file of rows")
+    parser = parser_of(__doc__, run="the folder of the sweep")
     parser.add_argument("--baselines", type=Path, help="the folder of the sweep of baselines")
-    parser.add_argument("--tables", action="store_true", help="print the tables only")
     arguments = parser.parse_args()
     if not arguments.tables:
         collect(arguments.run, arguments.csv, arguments.baselines)

@@ -12,7 +12,6 @@ learn in layouts 1000 to 1199 for 200,000 steps. Commits: 7347275 (``grid``, pla
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.domains.doorkey.domain import DOMAIN
-from studies.cells import difference, interval, read_rows, table
+from studies.cells import difference, interval, parser_of, read_rows, table
 
 METHODS = {
     "grid": "D-BAT, distilled, grid, 200 layouts",
@@ -107,12 +106,10 @@ def tables(path: Path) -> Iterator[str]:
             ]
         )
     yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals."
-    yield "Picked: the member that is best on 50 layouts learned in."
-    yield ""
+    yield "Picked: the member that is best on 50 layouts learned in.\n"
     titles = ["options", "mean member", "picked member", "false positives", "seeds"]
     yield from table(titles, rows)
-    yield "Differences over the seeds that both have."
-    yield ""
+    yield "Differences over the seeds that both have.\n"
     contrasts = (_contrast(within, methods) for methods in CONTRASTS)
     yield from table(["difference", "mean member", "picked member", "seeds"], contrasts)
 
@@ -147,8 +144,7 @@ def tables_of_agents(path: Path) -> Iterator[str]:
             if agents := cells[world, options]:
                 shares = [_beside_uniform(agents, score) for score in SCORES]
                 rows.append([f"{world_title}, {title}", *shares, str(len(agents))])
-    yield "100 new layouts, without learning there, those that can be solved: agent / uniform-random choice."
-    yield ""
+    yield "100 new layouts, without learning there, those that can be solved: agent / uniform-random choice.\n"
     yield from table(["world, options", *SCORES.values(), "seeds"], rows)
 
 
@@ -163,9 +159,7 @@ def _column(agents: list[dict[str, str]], name: str) -> NDArray[np.float64]:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="distilled.csv or distilled-agents.csv")
-    path = parser.parse_args().csv
+    path = parser_of(__doc__).parse_args().csv
     drawn = tables_of_agents if path.stem.endswith("agents") else tables
     print("\n".join(drawn(path)))
 

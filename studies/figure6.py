@@ -200,36 +200,22 @@ def tables(path: Path) -> Iterator[str]:
             f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
         ]
 
-    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts with a 95 % interval."
-    yield ""
+    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts with a 95 % interval.\n"
     titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest"]
     yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
     frozen = [method for method in methods if len(finite(values_of(method, "success", "frozen")))]
-    yield "Without further training: the agent / uniform-random choice among its own options."
-    yield ""
-    yield from table(
-        ["", "solved", "length / shortest", "within 1.5 shortest paths", "layouts"],
-        (
-            [
-                METHODS[method],
-                *(
-                    " / ".join(interval(finite(values_of(method, quantity, who)), 2) for who in ("frozen", UNIFORM))
-                    for quantity in ("success", "length_over_shortest", "near")
-                ),
-                str(len(finite(values_of(method, "success", "frozen")))),
-            ]
-            for method in frozen
-        ),
-    )
-    yield "95 % at, in thousands of steps, layout by layout."
-    yield ""
-    yield from table(
-        ["", *layouts],
-        (
-            [METHODS[method], *(_thousands(steps) for steps in values_of(method, "steps_to_95").tolist())]
-            for method in methods
-        ),
-    )
+    yield "Without further training: the agent / uniform-random choice among its own options.\n"
+    rows_of_play = []
+    for method in frozen:
+        cells = [METHODS[method]]
+        for quantity in ("success", "length_over_shortest", "near"):
+            both = [finite(values_of(method, quantity, who)) for who in ("frozen", UNIFORM)]
+            cells.append(" / ".join(interval(values, 2) for values in both))
+        rows_of_play.append([*cells, str(len(finite(values_of(method, "success", "frozen"))))])
+    yield from table(["", "solved", "length / shortest", "within 1.5 shortest paths", "layouts"], rows_of_play)
+    yield "95 % at, in thousands of steps, layout by layout.\n"
+    reached = [[METHODS[method], *map(_thousands, values_of(method, "steps_to_95").tolist())] for method in methods]
+    yield from table(["", *layouts], reached)
 
 
 def draw(path: Path, out: Path) -> None:

@@ -20,7 +20,6 @@ is the one with the highest cross-fitted ranking, mean over sub-goals and seeds 
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -39,7 +38,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import Training
-from studies.cells import Row, difference, interval, parser_of, printed, run_cells, table
+from studies.cells import Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -120,9 +119,9 @@ Numbers = dict[Cell, dict[int, dict[str, NDArray[np.float64]]]]  # by step and c
 def read(path: Path, layouts: str) -> Numbers:
     """The finished seeds of some layouts: for each cell, step and column the members' numbers (K,)."""
     numbers: Numbers = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["layouts"] == layouts]
-    for row in rows:
+    for row in read_rows(path):
+        if row["layouts"] != layouts:
+            continue
         steps = numbers.setdefault((row["method"], row["sub_goal"], int(row["seed"])), {})
         columns = steps.setdefault(int(row["step"]), {name: np.empty(0) for name in COLUMNS[len(KEYS) :]})
         for name, values in columns.items():
@@ -174,19 +173,16 @@ def tables(path: Path) -> Iterator[str]:
     choice, test = read(path, "choice"), read(path, "test")
     chosen = lengths(choice)
     scores = "ranking / balanced accuracy at 0.5 of the cross-fitted best member, by steps"
-    yield f"Layouts for choosing, {_seeds(choice)}: {scores}; in bold the chosen length."
-    yield ""
+    yield f"Layouts for choosing, {_seeds(choice)}: {scores}; in bold the chosen length.\n"
     yield from _curves(choice, chosen, LOOKS)
     first = min(seed for _, _, seed in choice)
     alone = {cell: steps for cell, steps in choice.items() if cell[2] == first}
-    yield f"Seed {first} alone, trained longer: the same."
-    yield ""
+    yield f"Seed {first} alone, trained longer: the same.\n"
     yield from _curves(alone, dict.fromkeys(chosen, 0), LONG)
     tested = [method for method in chosen if any(name == method for name, _, _ in test)]
     if not tested:
         return
-    yield f"Test layouts, {_seeds(test)}, mean over the five sub-goals with a 95 % interval over seeds."
-    yield ""
+    yield f"Test layouts, {_seeds(test)}, mean over the five sub-goals with a 95 % interval over seeds.\n"
     every = DOMAIN.sub_goals
     yield from table(
         ["", "steps", *SHOWN],
@@ -195,8 +191,7 @@ def tables(path: Path) -> Iterator[str]:
             for m in tested
         ),
     )
-    yield "D-BAT minus the other, cross-fitted ranking, seed by seed (seeds in which D-BAT is above)."
-    yield ""
+    yield "D-BAT minus the other, cross-fitted ranking, seed by seed (seeds in which D-BAT is above).\n"
     yield from table(["", "all", *every], _differences(test, chosen, tested))
 
 

@@ -121,9 +121,8 @@ def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     for groups in range(1, 8):
         if distances := read(path, groups):
-            yield from _tables(
-                groups, distances, read(path, groups, "reached_base"), read(path, groups, "inside_at_start")
-            )
+            reached, inside = read(path, groups, "reached_base"), read(path, groups, "inside_at_start")
+            yield from _tables(groups, distances, reached, inside)
             yield from _leads(groups, {"": distances, ", without the rule": read(path, groups, "stop_distance")})
 
 
@@ -148,37 +147,26 @@ def _tables(groups: int, distances: Distances, reached: Distances, inside: Dista
     methods = [method for method in METHODS if any(name == method for name, _ in distances)]
     learned = [method for method in methods if method != "oracle"]  # the control may lag behind
     whole = [ladder for ladder in LADDERS if all((method, ladder) in distances for method in learned)]
-    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one if equal)."
-    yield ""
-    yield from table(
-        ["ladder", *(METHODS[method][0] for method in methods), "started inside: D-BAT, no diversity, CNN"],
-        (
-            [
-                ladder,
-                *(_three(distances.get((method, ladder), {})) for method in methods),
-                " / ".join(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned),
-            ]
-            for ladder in whole
-        ),
-    )
+    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one if equal).\n"
+    rows = []
+    for ladder in whole:
+        stops = [_three(distances.get((method, ladder), {})) for method in methods]
+        began = " / ".join(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned)
+        rows.append([ladder, *stops, began])
+    titles = [METHODS[method][0] for method in methods]
+    yield from table(["ladder", *titles, "started inside: D-BAT, no diversity, CNN"], rows)
     if len(whole) < FEWEST:
         return
     seeds = sorted(set.intersection(*(set(distances[method, ladder]) for method in learned for ladder in whole)))
-    yield f"Mean over {len(whole)} ladders with a 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
-    yield ""
-    yield from table(
-        ["", "best member", "mean member", f"best within {NEAR} of a base", "mean member minus D-BAT's"],
-        (
-            [
-                METHODS[method][0],
-                interval(over(distances, method, whole, seeds, np.min), 1),
-                interval(over(distances, method, whole, seeds, np.mean), 1),
-                interval(over(reached, method, whole, seeds, np.max), 2),
-                _against(distances, method, whole, seeds),
-            ]
-            for method in learned
-        ),
-    )
+    yield f"Mean over {len(whole)} ladders with a 95 % interval over ladders; seeds {', '.join(map(str, seeds))}.\n"
+    rows = []
+    for method in learned:
+        best = interval(over(distances, method, whole, seeds, np.min), 1)
+        mean = interval(over(distances, method, whole, seeds, np.mean), 1)
+        within = interval(over(reached, method, whole, seeds, np.max), 2)
+        rows.append([METHODS[method][0], best, mean, within, _against(distances, method, whole, seeds)])
+    titles = ["", "best member", "mean member", f"best within {NEAR} of a base", "mean member minus D-BAT's"]
+    yield from table(titles, rows)
 
 
 def best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:

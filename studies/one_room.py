@@ -8,14 +8,13 @@ The cells are of commits f88cd87 (seed 20) and 5bdde7c; ``examples/one_room.py``
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.cells import difference, interval, table
+from studies.cells import difference, interval, parser_of, table
 from studies.ladder_options import LADDERS, Distances, best_mean_worst, read
 
 METHODS = {"holds-dbat": "D-BAT", "holds-none": "no diversity", "oracle": "true sub-goal"}
@@ -39,21 +38,18 @@ GROUPS = {
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     distances = read(path, 1)
-    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds."
-    yield ""
+    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds.\n"
     rows = []
     for ladder in (*LADDERS, *ON_BASES):
         rows.append([ladder, *(_bold(distances.get((method, ladder), {})) for method in METHODS)])
     yield from table(["ladder", *(_titled(distances, method) for method in METHODS)], rows)
-    yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders."
-    yield ""
+    yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders.\n"
     rows = []
     for method, title in METHODS.items():
         rows.append([title, *(interval(_values(_of_group(distances, method, each)), 1) for each in GROUPS.values())])
     rows.append(["no diversity minus D-BAT, same seeds", *(_gap(distances, each) for each in GROUPS.values())])
     yield from table(["", *GROUPS], rows)
-    yield "Each part left out: best / **mean** / worst member, mean over the same seeds."
-    yield ""
+    yield "Each part left out: best / **mean** / worst member, mean over the same seeds.\n"
     cells = {(method, ladder): distances[method, ladder] for method in PARTS for ladder in OF_PARTS}
     shared = set.intersection(*map(set, cells.values()))
     rows = []
@@ -95,9 +91,7 @@ def _values(by_seed: dict[int, float]) -> NDArray[np.float64]:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of cells")
-    print("\n".join(tables(parser.parse_args().csv)))
+    print("\n".join(tables(parser_of(__doc__).parse_args().csv)))
 
 
 if __name__ == "__main__":

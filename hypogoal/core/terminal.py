@@ -7,10 +7,11 @@ import sys
 from typing import Any
 
 
-def say(text: object, *, err: bool = False) -> None:
-    """Print a text on standard output or error."""
+def say(*lines: object, err: bool = False) -> None:
+    """Print lines on standard output or error."""
     stream = sys.stderr if err else sys.stdout
-    print(text, file=stream, flush=True)
+    for line in lines:
+        print(line, file=stream, flush=True)
 
 
 def drawn(table: Any, width: int) -> str:

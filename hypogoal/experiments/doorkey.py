@@ -42,13 +42,12 @@ def doorkey(
         yield Command(ensemble, f"train-ensemble @data --seed {seed}", {"agent": "ensemble", "seed": seed})
     for layout, seed in agents:
         at = "" if is_one else f"/layout-{layout}-seed-{seed}"
-        commands = {"meta": f"train-meta @{ensembles[seed]}"}
+        meta = f"train-meta @{ensembles[seed]}"
+        commands = {"meta": meta}
         if pretrain:
-            options = f"train-options @{ensembles[seed]}"
-            commands = {"options": options, "meta": f"{commands['meta']} --options @options{at}"}
+            commands = {"options": f"train-options @{ensembles[seed]}", "meta": f"{meta} --options @options{at}"}
         for control in controls:
-            words = f"train-meta @{ensembles[seed]} {CONTROLS[control]} --set steps={steps}"
-            commands[f"meta-{control}"] = words
+            commands[f"meta-{control}"] = f"{meta} {CONTROLS[control]} --set steps={steps}"
         for baseline in baselines:
             commands[baseline] = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
         for agent, words in commands.items():

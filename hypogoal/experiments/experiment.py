@@ -72,10 +72,8 @@ def experiment(domain: str | None = None, preset: str | None = None) -> Callable
         for name, parameter in parameters.items():
             if name == STAGE:
                 continue
-            if name not in hints or parameter.default is parameter.empty:
-                where = f"{function.__name__}: {name}"
-                raise UserError("this argument cannot be a setting", where, "Give it a type and a default.")
-            fields[name] = (hints[name], parameter.default)
+            is_required = parameter.default is parameter.empty
+            fields[name] = (hints.get(name, Any), ... if is_required else parameter.default)
         return Experiment(function, [*parameters], run_config(fields), domain, preset)
 
     return decorated

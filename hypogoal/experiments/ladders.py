@@ -17,7 +17,6 @@ METHODS = {
 }
 ENSEMBLES = "ensembles: D-BAT, the same without diversity, a single CNN"
 OPTION_GROUPS = "the N whose ensembles get options; they must be among 'groups'"
-OPTION_METHODS = "the ensembles that get options; they must be among 'methods'"
 
 
 @experiment("montezuma")
@@ -28,7 +27,6 @@ def montezuma_ladders(
     methods: Names = setting(tuple(METHODS), ENSEMBLES, source="Figure 3", choices=METHODS),
     ladders: Names = setting((), "ladders to learn options on; empty for none", source="Figure 4"),
     option_groups: Integers = setting((2,), OPTION_GROUPS, low=1, high=7),
-    option_methods: Names = setting(tuple(METHODS), OPTION_METHODS, choices=METHODS),
 ) -> Iterator[Command]:
     """The states and ensembles of each N, then the options of each ladder and seed with their oracle."""
     for count in groups:
@@ -38,12 +36,12 @@ def montezuma_ladders(
         columns: Columns = {"method": method, "groups": count, "seed": seed}
         yield Command(f"ensemble/{method}/groups-{count}-seed-{seed}", words, columns)
     for ladder, seed in product(ladders, seeds):
-        for count, method in product(option_groups, option_methods):
+        for count, method in product(option_groups, methods):
             ensemble = f"@ensemble/{method}/groups-{count}-seed-{seed}"
             words = f"train-options {ensemble} --set start={ladder} --seed {seed}"
             place = f"options/{method}/groups-{count}-ladder-{ladder}-seed-{seed}"
             yield Command(place, words, {"method": method, "groups": count, "ladder": ladder, "seed": seed})
-        if option_groups and option_methods:  # any ensemble will do: what these options end at is not learned
+        if option_groups and methods:  # any ensemble will do: what these options end at is not learned
             place = f"options/oracle/ladder-{ladder}-seed-{seed}"
             words = f"{words} --set termination=oracle"
             yield Command(place, words, {"method": "oracle", "ladder": ladder, "seed": seed})

@@ -2,8 +2,8 @@
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ def plan(
 
     known = {**config.model_dump(), STAGE: settings}
     commands = experiment.function(**{argument: known[argument] for argument in experiment.arguments})
-    cells = [*_cells_of(commands, run, _Shared(preset, device, of_stage))]
+    cells = [*_cells_of(commands, run, partial(_with_shared, preset, device, of_stage))]
     stages = dict.fromkeys(cell.stage for cell in cells)
     for stage in of_stage.keys() - stages:
         raise UserError("no such stage in --set", stage, f"This run has {', '.join(stages)}.")
@@ -64,8 +64,11 @@ def plan(
     return cells, config.workers
 
 
-def _cells_of(commands: Iterable[Any], run: Path, shared: "_Shared") -> Iterator[Cell]:
-    """A cell for each command, in which ``@NAME`` is the output of the cell of that name before it."""
+def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any]) -> Iterator[Cell]:
+    """A cell for each command, in which ``@NAME`` is the output of the cell of that name before it.
+
+    ``completed`` gives a command's words with those that it shares, and the domain that it plays.
+    """
     cells: dict[str, Cell] = {}
     domains: dict[str, str] = {}  # by place
     for command in commands:
@@ -74,7 +77,7 @@ def _cells_of(commands: Iterable[Any], run: Path, shared: "_Shared") -> Iterator
             words = shlex.split(text)
             needs = [cells[output[2]].place for output in map(OUTPUT.search, words) if output]
             words = [OUTPUT.sub(lambda match: f"{match[1]}{HERE}/{cells[match[2]].place}", word) for word in words]
-            words, domain = shared.added_to(words, domains[needs[0]] if needs else DOMAIN)
+            words, domain = completed(words, domains[needs[0]] if needs else DOMAIN)
             cell = Cell(name=name, words=words, needs=needs, columns=dict(columns), run=run)
         except UserError as error:
             error.add_note(f"in the command {command[0]}")
@@ -89,34 +92,31 @@ def _cells_of(commands: Iterable[Any], run: Path, shared: "_Shared") -> Iterator
         yield cell
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """What all commands of a run are given, except where their own words say otherwise."""
+def _with_shared(
+    preset: str | None,
+    device: str,
+    settings: Mapping[str, Mapping[str, str]],
+    words: Sequence[str],
+    domain: str,
+) -> tuple[list[str], str]:
+    """A command's words with the preset, device and settings (by stage) of its run, unless they say otherwise.
 
-    preset: str | None
-    device: str
-    settings: Mapping[str, Mapping[str, str]]  # by stage
-
-    def added_to(self, words: Sequence[str], domain: str) -> tuple[list[str], str]:
-        """The words with those shared, and the domain played, if it is not the one of the states that are read.
-
-        What the stage does not take is a ``UserError``.
-        """
-        stage, *rest = words
-        values, typed = load_stage(stage).parsed([*rest, "--out", stage])
-        domain = values.get("domain") or domain
-        if stage not in STAGES:
-            return [*words], domain
+    And the domain played; ``domain`` is that of the states that are read. What the stage does not take is a
+    ``UserError``.
+    """
+    stage, *rest = words
+    values, typed = load_stage(stage).parsed([*rest, "--out", stage])
+    domain = values.get("domain") or domain
+    more: list[str] = []
+    if stage in STAGES:
         allow(words)  # a TOML file's names are allowed already, others are those of code that the user gave
-        more: list[str] = []
-        preset = values["preset"] or self.preset
         if preset and not values["preset"]:
             more += ["--preset", preset]
-        if values.get("device") == "auto" and self.device != "auto":
-            more += ["--device", self.device]
-        shared = self.settings.get(stage, {})
-        config = settings_of(stage, domain, preset, typed, inherited=shared)
+        if device != "auto" and values.get("device") == "auto":
+            more += ["--device", device]
+        shared = settings.get(stage, {})
+        config = settings_of(stage, domain, values["preset"] or preset, typed, inherited=shared)
         for name, value in shared.items():
             if name in type(config).model_fields and name not in typed:
                 more += ["--set", f"{name}={value}"]
-        return [*words, *more], domain
+    return [*words, *more], domain

@@ -32,7 +32,7 @@ def test_help_is_in_groups_with_a_line_to_start_from() -> None:
     named = [match[1] for line in lines if (match := re.match(r"│ ([a-z][a-z-]+)  +\S", line))]
     assert panels == ["Options", "Make", "Look", "Own"]
     assert sorted(named) == sorted(COMMANDS)
-    assert named.index("collect") < named.index("train-ensemble") < named.index("run") < named.index("show")
+    assert named.index("run") < named.index("collect") < named.index("train-ensemble") < named.index("show")
     assert any(line.strip().startswith("Start here: hypogoal run") for line in lines)
     assert max(map(len, lines)) <= 80
 

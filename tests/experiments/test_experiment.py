@@ -96,7 +96,7 @@ NO_FUNCTION = [
     ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "a name of its own"),
     ("--members {size}", "--members {size} --set stepps=3", "(?s)train-ensemble has no setting.*ensemble/size-1"),
     ("--members {size}", "--members {size} --steps 0", "(?s)steps.*ensemble/size-1"),
-    ("small: bool = False", "small: bool", "cannot be a setting"),
+    ("small: bool = False", "small: bool", "Field required"),
     ("def members", "members = 3\ndef other", "not an experiment"),
 ]
 NO_TOML = [
@@ -215,7 +215,7 @@ def test_controls_and_baselines_keep_the_agents_budget() -> None:
     with pytest.raises(UserError, match="no such stage"):
         cells_of("montezuma-ladders", "train-meta.steps=3")
     with pytest.raises(UserError, match="no cell before it makes"):
-        cells_of("montezuma-ladders", "option_methods=none", "methods=dbat", "ladders=1L")
+        cells_of("montezuma-ladders", "option_groups=4", "groups=1", "ladders=1L")
 
 
 def test_the_papers_figures_are_experiments() -> None:
