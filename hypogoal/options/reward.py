@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import warnings
 from pathlib import Path
 from typing import Any, SupportsFloat, TypeAlias
 
@@ -19,6 +20,11 @@ from hypogoal.options.parts import Flags, Floats
 from hypogoal.options.termination import load_rule
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
+STARTS = ("unpaid", "paid", "refuse")
+MEANINGS = {
+    "unpaid": "nothing is paid until it has been negative (start='unpaid')",
+    "paid": "a policy that does nothing is paid (start='paid')",
+}
 
 
 def require_observations(env: Env, ensemble: Ensemble) -> Reader:
@@ -102,14 +108,28 @@ class SubgoalReward:
         scale: float = 1.0,
         add: bool = False,
         ends: bool = True,
+        start: str = "unpaid",
+        away: int = 1,
     ) -> RewardedEnv:
         """An environment that pays ``scale`` where the sub-goal holds, else 0.
 
-        ``add``: that is added to its own reward instead of replacing it. ``ends``: its episode terminates there; else
-        an agent can stay where it is rewarded. ``info["subgoal"]`` is whether the sub-goal holds. An environment with
-        other observations than those of training is a ``UserError``.
+        Args:
+            env: one whose observations are those of training.
+            scale: what it pays.
+            add: that is added to its own reward instead of replacing it.
+            ends: its episode terminates where it pays; else an agent can stay where it is rewarded.
+            start: of an episode that begins where the prediction is positive, so that doing nothing would be paid:
+                ``unpaid`` until the prediction has been negative, ``paid``, or ``refuse``, a ``UserError`` by
+                ``reset``. The first such start is a warning.
+            away: how many steps in a row the prediction has to be negative before what is ``unpaid`` pays. More than 1
+                is for a prediction that flickers: positive, negative, positive, while nothing has happened.
+
+        ``info["subgoal"]`` is ``{"predicted": bool, "paid": float}``, of ``reset`` and of every step.
+
+        Raises:
+            UserError: other observations than those of training; an unknown ``start``; ``away`` below 1.
         """
-        return RewardedEnv(env, self, scale, add, ends)
+        return RewardedEnv(env, self, scale, add, ends, start, away)
 
 
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -122,31 +142,68 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         scale: float,
         add: bool,
         ends: bool,
+        start: str,
+        away: int,
     ):
-        kept = {"reward": reward, "scale": scale, "add": add, "ends": ends}
+        kept = {"reward": reward, "scale": scale, "add": add, "ends": ends, "start": start, "away": away}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
         gymnasium.Wrapper.__init__(self, env)
+        if start not in STARTS:
+            raise UserError("unknown way with starts inside", f"start={start!r}", f"Choose one of {', '.join(STARTS)}.")
+        if away < 1:
+            raise UserError("a prediction is negative for at least one step", f"away={away}", "Give 1 or more.")
         self._reader = require_observations(env, reward.ensemble)
         self.reward, self.scale, self.add, self.ends = reward, scale, add, ends
+        self.start, self.away = start, away
         self._rule = copy.deepcopy(reward.ends)
         self._age = 0
+        self._negatives = 0  # steps in a row
+        self._pays = True  # the prediction has been negative since the episode began
+        self._warned = False
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Like the environment's own."""
-        self._age = 0
-        return self.env.reset(**kwargs)
+        """Like the environment's own; nothing is paid."""
+        observation, info = self.env.reset(**kwargs)
+        self._age = self._negatives = 0
+        inside = self._positive(self._log_odds(observation))
+        if inside:
+            self._meet_start_inside()
+        self._pays = not inside or self.start == "paid"
+        return observation, info | {"subgoal": {"predicted": inside, "paid": 0.0}}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step with reward and end changed."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        seen = self._reader.read(observation)[None]
-        [log_odds] = self.reward.ensemble.log_odds(seen)
+        log_odds = self._log_odds(observation)
         members = np.arange(len(log_odds))
         reached = self._rule.reached(log_odds, members, np.full_like(members, self._age))
         self._age += 1
-        [holds] = self.reward.decide(reached[None]).tolist()
-        paid = self.scale if holds else 0.0
-        if self.add:
-            paid += float(reward)
+        [predicted] = self.reward.decide(reached[None]).tolist()
+        if not self._pays:
+            self._negatives = 0 if self._positive(log_odds) else self._negatives + 1
+            self._pays = self._negatives >= self.away
+        holds = predicted and self._pays
+        of_sub_goal = self.scale if holds else 0.0
+        paid = of_sub_goal + float(reward) if self.add else of_sub_goal
         terminated = bool(terminated) or (holds and self.ends)
-        return observation, paid, terminated, truncated, info | {"subgoal": holds}
+        told = {"predicted": predicted, "paid": of_sub_goal}
+        return observation, paid, terminated, truncated, info | {"subgoal": told}
+
+    def _log_odds(self, observation: Any) -> Floats:
+        """Of each member, float32 (K,)."""
+        seen = self._reader.read(observation)[None]
+        [log_odds] = self.reward.ensemble.log_odds(seen)
+        return log_odds
+
+    def _positive(self, log_odds: Floats) -> bool:
+        """The prediction of one state, whatever the rule says of executions."""
+        [positive] = self.reward.decide(self._rule.positive(log_odds)[None]).tolist()
+        return bool(positive)
+
+    def _meet_start_inside(self) -> None:
+        fault = "an episode begins where the sub-goal's prediction is positive"
+        if self.start == "refuse":
+            raise UserError(fault, "start='refuse'", 'Give start="unpaid", or label such states as failures.')
+        if not self._warned:
+            warnings.warn(f"{fault}: {MEANINGS[self.start]}", stacklevel=3)
+            self._warned = True

@@ -294,7 +294,8 @@ def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) 
     env.reset(seed=0)
     told = [env.step(action) for action in (0, 1, 1, 1, 1)]
     assert [paid for _, paid, _, _, _ in told] == [0, 0, 0, 0, 1]
-    assert [info["subgoal"] for *_, info in told] == [False] * 4 + [True]
+    assert [info["subgoal"]["predicted"] for *_, info in told] == [False] * 4 + [True]
+    assert [info["subgoal"]["paid"] for *_, info in told] == [0, 0, 0, 0, 1]
     rewards = reward(np.stack([observation for observation, *_ in told]))
     assert rewards.dtype == np.float32 and rewards.tolist() == [0, 0, 0, 0, 1]
     both = reward.wrap(corridor(), scale=0.5, add=True)
@@ -325,9 +326,51 @@ def test_a_reward_is_shared_by_environments_side_by_side(ensemble: Ensemble, vec
     assert [step[1].tolist() for step in told] == [[0, 0], [0, 0], [0, 1]]
     ended, info = told[-1][2], told[-1][-1]
     assert ended.tolist() == [False, True]
-    held = info["subgoal"] if isinstance(info, dict) else [each["subgoal"] for each in info]
+    of_dict = isinstance(info, dict)
+    held = info["subgoal"]["predicted"] if of_dict else [each["subgoal"]["predicted"] for each in info]
     assert np.array(held).tolist() == [False, True]
     envs.close()
+
+
+class FromLeftEnd(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """Episodes begin at the left end, where one of the sub-goals holds."""
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        _, info = self.env.reset(**kwargs)
+        self.env.step(0)
+        return self.env.step(0)[0], info
+
+
+@pytest.mark.parametrize(
+    ("start", "away", "paid"),
+    [
+        ("unpaid", 1, [0, 0, 1, 0, 0, 0, 1]),
+        ("unpaid", 2, [0, 0, 0, 0, 0, 0, 1]),
+        ("paid", 1, [1, 0, 1, 0, 0, 0, 1]),
+    ],
+)
+def test_an_episode_that_begins_inside(made: Path, start: str, away: int, paid: list[int]) -> None:
+    """Doing nothing there is not paid, unless one wants it to be; the first such start is a warning."""
+    reward = hypogoal.SubgoalReward(made / "ensemble", "left-end")
+    env = reward.wrap(FromLeftEnd(corridor()), ends=False, start=start, away=away)
+    with pytest.warns(UserWarning, match="an episode begins where the sub-goal's prediction is positive"):
+        assert env.reset(seed=0)[1]["subgoal"] == {"predicted": True, "paid": 0.0}
+    for _ in range(2):
+        told = [env.step(action) for action in (0, 1, 0, 1, 1, 0, 0)]
+        assert [info["subgoal"]["predicted"] for *_, info in told] == [True, False, True, False, False, False, True]
+        assert [got for _, got, *_ in told] == paid
+        env.reset(seed=0)  # without a warning, which would be an error here
+
+
+def test_an_episode_that_begins_inside_can_be_refused(made: Path) -> None:
+    reward = hypogoal.SubgoalReward(made / "ensemble", "left-end")
+    env = reward.wrap(FromLeftEnd(corridor()), start="refuse")
+    with pytest.raises(UserError, match="begins where the sub-goal's prediction is positive"):
+        env.reset(seed=0)
+    with pytest.raises(UserError, match="Choose one of unpaid, paid, refuse"):
+        reward.wrap(corridor(), start="free")
+    with pytest.raises(UserError, match="Give 1 or more"):
+        reward.wrap(corridor(), away=0)
 
 
 def test_mistakes_are_one_line(made: Path, options: Options, ensemble: Ensemble) -> None:

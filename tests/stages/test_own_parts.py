@@ -235,7 +235,7 @@ def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest
         act, held = policies(option), []
         while len(held) < info["duration"]:
             observation, *_, paid = rewarded.step(act(observation))
-            held.append(paid["subgoal"])
+            held.append(paid["subgoal"]["predicted"])
         assert held == [False] * (len(held) - 1) + [info["reached"]]
     reached = [execution.reached for execution in executions]
     assert any(reached) == (rule != f"{__name__}:Never") and (rule == "learned" or not all(reached))
