@@ -5,21 +5,23 @@
 
 Three worlds: DoorKey (collect-blue-key, the layout 100 + number), rooms (layout 100 + number), and a field of numbers.
 A classifier is the truth and a planted fault: an extra set of states, a background cue (another sub-goal, a bright
-picture, a side of the field), a threshold too low (states near success), a start inside; or it is right, or wrong where no policy gets
-within the cap. It is *payable* if some policy from the start comes to a false positive within the cap, with no positive
-state before, which would have ended the execution: found by going through all reachable states.
+picture, a side of the field), a threshold too low (states near success), a start inside; or it is right, or wrong where
+no policy gets within the cap. It is *payable* if some policy from the start comes to a false positive within the cap,
+with no positive state before, which would have ended the execution: found by going through all reachable states.
 
-Of each world classifiers are drawn by seed until a third of the places of either truth is taken: 40 are scored, 10
-others choose the rule. Rule, written before the run: the statistic (policy, play, or the larger of both) and the
-threshold that have the highest F1 on the ten; of equals the first. Expected: precision above .9; recall below, since a
-policy goes to the nearest positive state, which is success where that is nearer.
+Classifiers are drawn by seed, from the three worlds in turn, until there are 25 of either truth. The first five of
+either choose the rule, the other forty are scored. Rule, written before the run: the statistic below and the threshold
+that have the highest F1 on the ten; of equals the first. Expected: precision 1, since what was reached can be reached;
+recall below .9 without the policy ``search``, since a policy goes to the nearest positive state, which is success where
+that is nearer; above with it.
 """
 
 from __future__ import annotations
 
 import functools
+import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,17 +42,20 @@ Ints = NDArray[np.int64]
 SIDE = 21  # of the field
 MOVES = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])
 WORLDS = ("doorkey", "rooms", "studies.audits:FIELD")
+ROOMS = 1
 SUB_GOALS = ("collect-blue-key", "right-room", "corner")
 CAPS = (30, 1, 20)  # steps of an execution
-STEPS = (40_000, 4_000, 40_000)
+STEPS = (80_000, 8_000, 80_000)  # of both policies
 FAULTS = ("extra", "cue", "low", "inside", "right", "remote")
 PLACES = 25  # of either truth, over the three worlds
 TO_CHOOSE = 5  # of these, to choose the rule by
 NEVER = -1  # steps to where no policy gets
-STATISTICS: dict[str, Callable[[pd.DataFrame], pd.Series[Any]]] = {
-    "policy": lambda cells: cells["policy"],
-    "play": lambda cells: cells["play"],
-    "either": lambda cells: cells[["policy", "play"]].max(axis=1),
+STATISTICS = {  # the largest of these shares
+    "policy": ["policy"],
+    "play": ["play"],
+    "policy or play": ["policy", "play"],
+    "search": ["search"],
+    "any": ["policy", "play", "search"],
 }
 THRESHOLDS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.5)
 
@@ -81,7 +86,12 @@ def in_corner(cells: NDArray[np.integer]) -> Flags:
     return np.asarray((cells >= SIDE - 3).all(axis=-1))
 
 
-FIELD = GymnasiumDomain(Field, {"corner": lambda env: bool(in_corner(env.unwrapped.cell))})
+def at_corner(env: Any) -> bool:
+    """The sub-goal."""
+    return bool(in_corner(env.unwrapped.cell))
+
+
+FIELD = GymnasiumDomain(Field, {"corner": at_corner})
 
 
 @dataclass(frozen=True)
@@ -239,7 +249,8 @@ def chosen() -> Iterator[tuple[Planted, str]]:
 
 def play(run: Path) -> Iterator[dict[str, Any]]:
     """Audit each; a row of a cell."""
-    from hypogoal.tools.audit import audit, read
+    from hypogoal.evaluation.audit import shares_of
+    from hypogoal.tools.audit import audit
 
     for one, use in chosen():
         out = run / f"{one.world}-{one.number}"
@@ -252,28 +263,29 @@ def play(run: Path) -> Iterator[dict[str, Any]]:
             option_timeout=CAPS[one.world],
             steps=STEPS[one.world],
             mend=0,
+            search=True,
+            restart_options=one.world != ROOMS,  # where an episode is one step
             seed=one.number,
             resume=True,
             quiet=True,
         )
-        shares = read(out)["paid_falsely"]
+        report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
         yield {
             "world": WORLDS[one.world].rpartition(":")[2].lower(),
             "number": one.number,
             "fault": one.fault,
             "use": use,
             "payable_after": one.payable,
-            "policy": shares["before"],
-            "play": shares["play"],
+            **shares_of(report),
         }
 
 
 def rule_by(cells: pd.DataFrame) -> tuple[str, float]:
     """The statistic and the threshold with the highest F1; of equals the first."""
     best, rule = -1.0, ("", 0.0)
-    for name, statistic in STATISTICS.items():
+    for name, shares in STATISTICS.items():
         for threshold in THRESHOLDS:
-            found = statistic(cells) > threshold
+            found = cells[shares].max(axis=1) > threshold
             true = cells["payable_after"] != NEVER
             f1 = 2 * (found & true).sum() / (found.sum() + true.sum())
             if f1 > best:
@@ -286,7 +298,7 @@ def tables(path: Path) -> Iterator[str]:
     cells = pd.read_csv(path)
     name, threshold = rule_by(cells[cells["use"] == "rule"])
     scored = cells[cells["use"] == "score"]
-    found = STATISTICS[name](scored) > threshold
+    found = scored[STATISTICS[name]].max(axis=1) > threshold
     true = scored["payable_after"] != NEVER
     hits = int((found & true).sum())
     yield f"Rule, chosen on ten others: {name} above {threshold:g}."

@@ -5,7 +5,7 @@ its positive predictions. So options are learned that end at these, and the trut
 up.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,10 +32,11 @@ from hypogoal.options.recording import Execution
 from hypogoal.options.tables import Exploits
 from hypogoal.options.termination import Terminations, load_rule
 
-POLICIES = ("before", "mended")
+BEFORE, MENDED, SEARCH = POLICIES = ("before", "mended", "search")
 CHUNK = 256  # observations that own code is given at once
 CELL = 8  # of positions that count as one place
 FILMS = 4  # kinds that are shown
+NEVER = -100.0  # log-odds
 RANDOM_STEPS = 4_000  # of random play
 DECIMALS = 6  # of a threshold, which float32 log-odds round
 Classifier = Callable[[Observations], NDArray[np.floating]]  # observations (n, *obs) -> log-odds (n,)
@@ -87,13 +88,25 @@ def own_classifier(name: str) -> Classifier:
     return classify
 
 
-def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Setup, Engine], Terminations]:
-    """A function of an engine: options that end at a classifier's positives, one for each threshold (K,)."""
+def terminations_of(
+    target: Target,
+    column: int,
+    policies: Mapping[str, float],
+) -> Callable[[Setup, Engine], Terminations]:
+    """A function of an engine: options that end at a classifier's positives, one for each policy's threshold.
+
+    That of the policy ``search`` ends at false positives alone, where sub-goal number ``column`` does not hold.
+    """
+    edges = np.array([*policies.values()])
+    names = [*policies]
 
     def ends(setup: Setup, engine: Engine) -> Terminations:
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
             of_states = target.classify(engine.images(ids)).astype(np.float32)
-            return np.repeat(of_states[:, None], len(edges), axis=1)
+            every = np.repeat(of_states[:, None], len(edges), axis=1)
+            if SEARCH in names:
+                every[engine.labels(ids)[:, column], names.index(SEARCH)] = NEVER
+            return every
 
         if engine.observation_dtype != PICTURE:
             engine.standard = target.standard or standard_of(engine.observation_shape)
@@ -105,12 +118,12 @@ def terminations_of(target: Target, edges: NDArray[np.float64]) -> Callable[[Set
     return ends
 
 
-def report_of(loop: OptionLoop, edges: Sequence[float], sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
+def report_of(loop: OptionLoop, policies: Iterable[str], sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
     """Each policy's findings, and its threshold at the end of learning; None for a policy that was not wanted."""
     report: dict[str, Any] = dict.fromkeys(POLICIES)
-    for option, name in enumerate(POLICIES[: len(edges)]):
+    for option, name in enumerate(policies):
         threshold = float(expit(loop.terminations.thresholds[option].astype(np.float64)))
-        report[name] = {"threshold": round(threshold, DECIMALS), **findings(loop, option, sub_goals, folder)}
+        report[name] = {"threshold": round(threshold, DECIMALS), **findings(loop, option, name, sub_goals, folder)}
     return report
 
 
@@ -123,10 +136,25 @@ def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict
     truth = engine.labels(ids)[:, column]
     positive = loop.terminations.of(ids)[:, :1]
     scores = {name: score.item() for name, score in member_scores(positive, truth).items()}
-    return {"states": len(ids), "positives": int(truth.sum()), **scores}
+    false_positives = float((positive[:, 0] & ~truth).mean())
+    return {"states": len(ids), "positives": int(truth.sum()), "false_positives": false_positives, **scores}
 
 
-def findings(loop: OptionLoop, option: int, sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
+def shares_of(report: Mapping[str, Any]) -> dict[str, float]:
+    """The shares of false positives: of the last executions of policies, of the states that random play met."""
+    shares = {"policy": report[BEFORE]["fires_far"]}
+    if report[SEARCH]:
+        shares["search"] = report[SEARCH]["fires_far"]
+    return {**shares, "play": report["random_play"]["false_positives"]}
+
+
+def findings(
+    loop: OptionLoop,
+    option: int,
+    name: str,
+    sub_goals: Sequence[str],
+    folder: Path,
+) -> dict[str, Any]:
     """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
 
     Of each of the most frequent kinds of false positives a film is put into ``folder``, of pictures.
@@ -138,9 +166,9 @@ def findings(loop: OptionLoop, option: int, sub_goals: Sequence[str], folder: Pa
     fooled = [executions[row] for row in np.flatnonzero(positive & ~near)]
     kinds = []
     for number, alike in enumerate(kinds_of(loop.engine, fooled)):
-        film = f"{POLICIES[option]}-{number + 1}.gif"
+        film = f"{name}-{number + 1}.gif"
         shortest = min(alike, key=lambda row: row.duration)
-        drawn = number < FILMS and _write_film(folder / film, loop, shortest)
+        drawn = number < FILMS and _write_film(folder / film, loop, name, shortest)
         end = np.array(shortest.states[-1:])
         holds = np.array(sub_goals)[loop.engine.labels(end)[0]].tolist()
         at = loop.engine.positions(end)[0].tolist() if loop.engine.position_names else []
@@ -172,7 +200,7 @@ def kinds_of(engine: Engine, fooled: Sequence[Execution]) -> list[list[Execution
     return sorted(kinds, key=len, reverse=True)
 
 
-def _write_film(path: Path, loop: OptionLoop, execution: Execution) -> bool:
+def _write_film(path: Path, loop: OptionLoop, name: str, execution: Execution) -> bool:
     """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
     ids = np.array([execution.began, *execution.states])
     if loop.engine.observation_dtype != PICTURE or not loop.engine.remembers(ids).all():
@@ -181,9 +209,9 @@ def _write_film(path: Path, loop: OptionLoop, execution: Execution) -> bool:
     positive = loop.terminations.of(ids)[:, execution.option].tolist()
     frames = []
     for step, picture in enumerate(loop.engine.images(ids)):
-        frames.append(Frame(picture, step, execution.option, (positive[step],), timeout - step, ""))
+        frames.append(Frame(picture, step, 0, (positive[step],), timeout - step, ""))
     frames[-1] = replace(frames[-1], ended="fooled")
-    path.write_bytes(episode_gif(frames, POLICIES, 1, timeout))
+    path.write_bytes(episode_gif(frames, [name], 1, timeout))
     return True
 
 
@@ -195,6 +223,8 @@ def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
         if row := report[name]:
             ends = f"fooled in {row['fooled']} of {row['executions']} executions, there in {row['there']}"
             yield f"{name}, positive above {row['threshold']:.4g}: {ends}"
+            if row["positive_at_start"]:
+                yield f"  {row['positive_at_start']} begin where it is positive already, so that doing nothing is paid"
             for kind in row["kinds"][:FILMS]:
                 sub_goals = " and ".join(kind["holds"]) or "no sub-goal"
                 yield f"  {kind['film'] or '':12s} {kind['executions']:4d} x  while {sub_goals} holds"

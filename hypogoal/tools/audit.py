@@ -35,8 +35,6 @@ def audit(
     if sub_goal is None:
         raise UserError("which sub-goal is the truth?", domain, "Give --sub-goal NAME.")
 
-    import numpy as np
-
     from hypogoal.core.processes import prepare
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
@@ -53,37 +51,40 @@ def audit(
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
     member = member or 0
     target = played.target_of(classifier, sub_goal, member, domain, device)
-    edges = _edges(config, target.threshold)
+    policies = _policies(config, target.threshold)
     ensemble_config = {
         "sub_goals": [sub_goal],
-        "members": len(edges),
+        "members": len(policies),
         "domain": domain,
         "domain_config": target.domain_config,
     }
     setup = Setup(world, ensemble_config, Path(), config, call.seed, device)
     settings = agents.description(setup, classifier=classifier, member=member)
     with call.training("audit", settings, target.inputs, config.steps) as work:
-        loop = assemble(setup, played.terminations_of(target, np.array(edges)))
+        loop = assemble(setup, played.terminations_of(target, column, policies))
         agents.learn(work, setup, loop, config.steps)
         files = work.draft.files
         rng = rng_for(call.seed, "random-play")
-        report = played.report_of(loop, edges, world.sub_goals, files)
+        report = played.report_of(loop, policies, world.sub_goals, files)
         report["random_play"] = played.random_play(loop, column, rng)
         (files / "audit.json").write_text(as_json(report) + "\n", encoding="utf-8")
     return Done([*played.lines_of(report)])
 
 
-def _edges(config: Any, threshold: float) -> list[float]:
-    """The probabilities above which predictions are positive: of the classifier, and of the mended one if wanted."""
+def _policies(config: Any, threshold: float) -> dict[str, float]:
+    """The probability above which predictions are positive for each policy that is wanted."""
     if config.termination == "oracle":
         raise UserError("an audit takes one classifier only", "termination=oracle", "Leave it out.")
     threshold = config.threshold or threshold
-    if not config.mend:
-        return [threshold]
-    if config.mend <= threshold:
+    policies = {"before": threshold}
+    if config.mend:
+        policies["mended"] = config.mend
+    if config.search:
+        policies["search"] = threshold
+    if 0 < config.mend <= threshold:
         fault = f"mend must be above the threshold {threshold:g}"
         raise UserError(fault, f"mend={config.mend:g}", "Give a higher one, or 0.")
-    return [threshold, config.mend]
+    return policies
 
 
 def _on_recorded_data(call: Call, source: str, sub_goal: str | None, member: int | None) -> Done:
