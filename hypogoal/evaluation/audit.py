@@ -140,7 +140,7 @@ def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict
     return {"states": len(ids), "positives": int(truth.sum()), "false_positives": false_positives, **scores}
 
 
-def shares_of(report: Mapping[str, Any]) -> dict[str, float]:
+def shares_of(report: Mapping[str, Any]) -> dict[str, float | None]:
     """The shares of false positives: of the last executions of policies, of the states that random play met."""
     shares = {"policy": report[BEFORE]["fires_far"]}
     if report[SEARCH]:

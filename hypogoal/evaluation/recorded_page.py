@@ -1,23 +1,25 @@
 """The audit of an ensemble on recorded data: its findings, its page, and the states to label next (Spec I6)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.special import expit
 
 from hypogoal.core.artefacts import TO_FILL_IN, Artefact
 from hypogoal.core.errors import UserError
-from hypogoal.data import States, joined, open_dataset
+from hypogoal.data import Dataset, States, joined
 from hypogoal.evaluation import page
+from hypogoal.evaluation.audit import own_classifier
 from hypogoal.evaluation.pictures import coloured
 from hypogoal.evaluation.plots import slug
 from hypogoal.evaluation.recorded import density_of, disagreement, member_table, sketches_of, to_label
-from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.observations import PICTURE, Observations, digest, fields_of, spread_rows
 
 COMPARED = 4_000  # unlabelled states, spread over the file
@@ -50,17 +52,34 @@ class Findings:
     disputed: NDArray[np.float64]  # how much members disagree on them
 
 
-def findings_of(artefact: Artefact, data: Path, sub_goal: str, device: str) -> Findings:
-    """What one sub-goal's members do on the data file, and the states to label next."""
-    dataset = open_dataset(data)
-    ensemble = read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
-    thresholds = ensemble.thresholds.cpu().numpy()
+@dataclass(frozen=True)
+class Judges:
+    """Who judges states: the members of an ensemble, or one function."""
+
+    predict: Callable[[Observations], NDArray[np.floating]]  # observations (n, *obs) -> probabilities (n, K)
+    thresholds: NDArray[np.floating]  # (K,), above which a prediction is positive
+
+    @classmethod
+    def of_members(cls, artefact: Artefact, sub_goal: str, device: str) -> Self:
+        ensemble = read_ensemble(artefact.path, artefact.config, sub_goal).to(device)
+        return cls(ensemble.predict, ensemble.thresholds.cpu().numpy())
+
+    @classmethod
+    def of_function(cls, name: str) -> Self:
+        """Code of the user's own, ``module:function``."""
+        classify = own_classifier(name)
+        return cls(lambda observations: expit(classify(observations))[:, None], np.array([THRESHOLD]))
+
+
+def findings_of(judges: Judges, dataset: Dataset, sub_goal: str) -> Findings:
+    """What they say of a data file's states, and which to label next."""
+    thresholds = judges.thresholds
     splits = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
     known = joined([States(split.observations, split.labels) for split in splits])
     unlabelled = dataset.unlabelled()
     if not len(unlabelled):
-        raise UserError("there are no unlabelled states to audit on", data, "Import or collect some.")
-    known_scores, scores = ensemble.predict(known.observations), ensemble.predict(unlabelled)
+        raise UserError("there are no unlabelled states to audit on", dataset.path, "Import or collect some.")
+    known_scores, scores = judges.predict(known.observations), judges.predict(unlabelled)
 
     compared = spread_rows(len(unlabelled), COMPARED)
     sketches = sketches_of(unlabelled[compared])

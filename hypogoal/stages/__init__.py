@@ -134,6 +134,8 @@ class Done:
     lines: Sequence[str] = ()
     path: Path | None = None  # where to look, if not at the output or its page
     then: str = ""  # the next command, if not the stage's
+    told: str = ""  # a line for programs, in the place of all that
+    code: int = 0  # what the command exits with
 
 
 def load_stage(name: str) -> "Stage":
@@ -212,7 +214,7 @@ class Stage:
             typed = self._typed(values)
             source = values.pop(self.source.name)
             call, done = self.run(source, values.pop("out"), values, typed)
-            if not call.quiet:
+            if not (call.quiet or done.told):
                 for line in done.lines:
                     say(line)
                 if then := done.then or self.then:
@@ -220,7 +222,8 @@ class Stage:
                     words = [word.format(**places) for word in then.split()]
                     say(f"next: {own_code.command(*words)}")
             page = call.out / "index.html"
-            say(done.path or (page if page.is_file() else call.out))
+            say(done.told or done.path or (page if page.is_file() else call.out))
+            raise typer.Exit(done.code)
 
         source = self.source.replace(kind=Parameter.KEYWORD_ONLY)
         parameters = [source, self.out, *self.options, *self._settings()]

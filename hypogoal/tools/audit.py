@@ -1,40 +1,67 @@
 """Spec H5: how often policies fool a success classifier, where, and what a mend changes."""
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Argument, Option
 
 from hypogoal.core.artefacts import TO_FILL_IN
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.terminal import say
 from hypogoal.stages import Call, Done, stage
 
-WHERE = "Where to play; without it, look at the data that the members were trained with."
+REPORT = "audit.json"
+WHERE = "Where to play; without it, look at recorded data."
+WHICH = "The labelled data to look at. Default: what the members were trained with."
+TRUTH = "The sub-goal that is the truth."
+LIMIT = "Exit with code 3 if a larger share of executions, or of what play meets, is a false positive."
+FAILED = 3
 
 
 @stage(
     "audit ensemble --domain doorkey --sub-goal go-to-goal --out audit",
-    often=["steps", "layout_seed", "option_timeout", "mend"],
+    often=["steps", "layout_seed", "option_timeout", "mend", "search"],
 )
 def audit(
     call: Call,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
     *,
     domain: Annotated[str | None, Option(help=WHERE)] = None,
-    sub_goal: Annotated[str | None, Option(help="The domain's sub-goal that is the truth.")] = None,
+    data: Annotated[Path | None, Option(help=WHICH)] = None,
+    sub_goal: Annotated[str | None, Option(help=TRUTH)] = None,
     member: Annotated[int | None, Option(min=0, help="Which member of the ensemble. Default: 0.")] = None,
+    fail_above: Annotated[float | None, Option(metavar="SHARE", min=0, max=1, help=LIMIT)] = None,
+    as_json: Annotated[bool, Option("--json", metavar="", help="Print one line of JSON.")] = False,
 ) -> Done:
     """How often, and where, do policies fool a success classifier?
 
     A policy is trained against it, and beside it one against the mended one. The classifier is a ``member`` of an
     ensemble artefact, or ``module:function`` from observations (N, *obs) to probabilities (N,). The truth is that of
-    the domain's ``sub_goal``. Without a domain an ensemble is audited on its recorded data.
+    the domain's ``sub_goal``. Without a domain it is audited on recorded data.
     """
     if domain is None:
-        return _on_recorded_data(call, classifier, sub_goal, member)
-    if sub_goal is None:
-        raise UserError("which sub-goal is the truth?", domain, "Give --sub-goal NAME.")
+        lines, shares = _on_recorded_data(call, classifier, data, sub_goal, member)
+    elif sub_goal is None or data is not None:
+        raise UserError("where is played, the domain has the truth", domain, "Give --sub-goal NAME, and no --data.")
+    else:
+        lines, shares = _in_play(call, classifier, domain, sub_goal, member or 0)
 
+    is_failed = fail_above is not None and any(share is None or share > fail_above for share in shares.values())
+    if is_failed:
+        lines.append(f"FAILED: more than {fail_above:.1%} are false positives")
+    told = {"out": str(call.out), "false_positives": shares, "fail_above": fail_above, "failed": is_failed}
+    return Done(lines, told=json.dumps(told) if as_json else "", code=FAILED if is_failed else 0)
+
+
+def _in_play(
+    call: Call,
+    classifier: str,
+    domain: str,
+    sub_goal: str,
+    member: int,
+) -> tuple[list[str], dict[str, float | None]]:
+    """Train and play the policies: the findings in lines, and the shares of false positives."""
     from hypogoal.core.processes import prepare
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
@@ -49,7 +76,6 @@ def audit(
     config = call.settings(domain)
     world = load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
-    member = member or 0
     target = played.target_of(classifier, sub_goal, member, domain, device)
     policies = _policies(config, target.threshold)
     ensemble_config = {
@@ -60,15 +86,19 @@ def audit(
     }
     setup = Setup(world, ensemble_config, Path(), config, call.seed, device)
     settings = agents.description(setup, classifier=classifier, member=member)
-    with call.training("audit", settings, target.inputs, config.steps) as work:
-        loop = assemble(setup, played.terminations_of(target, column, policies))
-        agents.learn(work, setup, loop, config.steps)
-        files = work.draft.files
-        rng = rng_for(call.seed, "random-play")
-        report = played.report_of(loop, policies, world.sub_goals, files)
-        report["random_play"] = played.random_play(loop, column, rng)
-        (files / "audit.json").write_text(as_json(report) + "\n", encoding="utf-8")
-    return Done([*played.lines_of(report)])
+    try:
+        with call.training("audit", settings, target.inputs, config.steps) as work:
+            loop = assemble(setup, played.terminations_of(target, column, policies))
+            agents.learn(work, setup, loop, config.steps)
+            files = work.draft.files
+            rng = rng_for(call.seed, "random-play")
+            report = played.report_of(loop, policies, world.sub_goals, files)
+            report["random_play"] = played.random_play(loop, column, rng)
+            (files / REPORT).write_text(as_json(report) + "\n", encoding="utf-8")
+    except Complete as complete:  # what was found stands, and may still fail
+        say(complete, err=True)
+    found = json.loads((call.out / REPORT).read_text(encoding="utf-8"))
+    return [*played.lines_of(found)], played.shares_of(found)
 
 
 def _policies(config: Any, threshold: float) -> dict[str, float]:
@@ -87,14 +117,20 @@ def _policies(config: Any, threshold: float) -> dict[str, float]:
     return policies
 
 
-def _on_recorded_data(call: Call, source: str, sub_goal: str | None, member: int | None) -> Done:
-    """An audit where there is no simulator: all members of an ensemble, on the data that they were trained with."""
+def _on_recorded_data(
+    call: Call,
+    source: str,
+    data: Path | None,
+    sub_goal: str | None,
+    member: int | None,
+) -> tuple[list[str], dict[str, float | None]]:
+    """An audit where there is no simulator, of a function or of all members of an ensemble: as :func:`_in_play`."""
     from hypogoal.tools.audit_recorded import audit_recorded
 
-    if not Path(source).is_dir() or member is not None or call.typed or call.preset or call.resume:
-        do = "Give --domain and --sub-goal; or an ensemble's folder alone."
-        raise UserError("on recorded data an audit takes an ensemble, all members, without settings", source, do)
-    lines = audit_recorded(call, Path(source), sub_goal)
+    if member is not None or call.typed or call.preset or call.resume or not (data or Path(source).is_dir()):
+        do = "Give --domain and --sub-goal; or, without settings, an ensemble's folder or --data FILE."
+        raise UserError("an audit plays in a domain, or looks at recorded data", source, do)
+    lines, shares = audit_recorded(call, source, data, sub_goal)
     table = call.out / "next" / "SUB_GOAL" / TO_FILL_IN
     lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it; see docs/audit.md")
-    return Done(lines)
+    return lines, shares

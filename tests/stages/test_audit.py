@@ -17,6 +17,7 @@ from own_domain import CorridorDomain, TallCorridor
 from PIL import Image
 from toy_data import files_of, reseal
 
+from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey.engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS, lines_of
@@ -48,6 +49,10 @@ left_end = partial(white_at, cell=0)
 
 def too_soon(pictures: Pictures) -> list[float]:
     return [0.6 if soon else 0.1 for soon in white_at(pictures, 1)]
+
+
+def everywhere(pictures: Pictures) -> NDArray[np.bool_]:
+    return np.ones(len(pictures), np.bool_)
 
 
 def beside_the_start(pictures: Pictures) -> NDArray[np.bool_]:
@@ -139,6 +144,27 @@ def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> Non
     assert truth["mended"] is None
     assert (truth["random_play"]["accuracy"], truth["before"]["fires_far"]) == (1.0, 0.0)
     assert truth["before"]["there"] >= 50
+
+
+def test_an_audit_fails_a_build(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 3, at a complete output too, and one line of JSON; the truth passes, whatever is searched for."""
+    words = [*CORRIDOR, *settings("steps=900", "mend=0", "search=true"), "--fail-above", "0.05", "--json", "-q"]
+    for classifier, code, resumed in (("too_soon", 3, []), ("too_soon", 3, ["--resume"]), ("left_end", 0, [])):
+        out = tmp_path / classifier
+        capsys.readouterr()
+        assert main(["audit", f"{__name__}:{classifier}", "--out", str(out), *words, *resumed]) == code
+        told = json.loads(capsys.readouterr().out)
+        assert (told["out"], told["failed"], told["fail_above"]) == (str(out), code == 3, 0.05)
+        shares = told["false_positives"]
+        assert shares.keys() == {"policy", "search", "play"}
+        assert all((share > 0.05) == (code == 3) for share in (shares["policy"], shares["search"]))
+
+
+def test_executions_that_begin_inside_are_said(tmp_path: Path) -> None:
+    report, _ = audited(tmp_path / "audit", "everywhere", *CORRIDOR, *settings("steps=200", "mend=0", "warm_up=200"))
+    assert report["before"]["positive_at_start"] == 100
+    lines = lines_of(report)
+    assert "  100 begin where it is positive already, so that doing nothing is paid" in lines
 
 
 def test_places_are_kinds_of_their_own(tmp_path: Path) -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
 import pytest
 from command_line import refuses, run, settings
+from numpy.typing import NDArray
 
+from hypogoal.cli import main
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.recorded_page import picture_of
@@ -49,6 +52,30 @@ def test_an_audit_of_recorded_data(audited: Path) -> None:
     page = (audit / "index.html").read_text()
     assert "To label next" in page and page.count("data:image/webp") >= 20
     assert "Content-Security-Policy" in page and "http" not in page.replace("http-equiv", "")
+
+
+def often(observations: Any) -> NDArray[np.float64]:
+    """A success check in code."""
+    return (observations["state"].mean(axis=1) > 0).astype(np.float64)
+
+
+def test_a_function_is_audited_on_labels_by_hand(audited: Path, tmp_path: Path, capsys: Any) -> None:
+    """Its share of known failures is that of the data; a larger one than allowed is exit code 3, and one JSON line."""
+    data = open_dataset(audited / "data.h5")
+    splits = data.labelled(GOAL), data.heldout(GOAL)
+    failures = [often(split.observations[~split.labels]) for split in splits]
+    share = float(np.concatenate(failures).mean())
+    assert 0.1 < share < 0.9
+    words = ["audit", f"{__name__}:often", "--data", str(audited / "data.h5"), "--json"]
+    capsys.readouterr()
+    for number, (limit, code) in enumerate(((share - 0.01, 3), (share + 0.01, 0))):
+        out = tmp_path / str(number)
+        assert main([*words, "--fail-above", str(limit), "--out", str(out)]) == code
+        told = json.loads(capsys.readouterr().out)
+        assert told == {
+            "out": str(out), "false_positives": {"failures": pytest.approx(share)}, "fail_above": limit,
+            "failed": code == 3,
+        }  # fmt: skip
 
 
 def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path) -> None:
@@ -110,11 +137,11 @@ def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path) -> No
     """No ensemble, settings, an unknown sub-goal, another artefact; nothing is left behind."""
     ensemble, out = str(audited / "ensemble"), tmp_path / "audit"
     for words, fault in [
-        (["mine:classify"], "on recorded data an audit takes an ensemble"),
+        (["mine:classify"], "an audit plays in a domain, or looks at recorded data"),
         ([ensemble, "--set", "steps=3"], "without settings"),
-        ([ensemble, "--member", "1"], "all members"),
+        ([ensemble, "--member", "1"], "an audit plays in a domain"),
         ([ensemble, "--sub-goal", "other"], "unknown sub-goal"),
-        ([ensemble, "--domain", "doorkey"], "which sub-goal is the truth?"),
+        ([ensemble, "--domain", "doorkey"], "the domain has the truth"),
         ([audited / "audit"], "but ensemble is needed"),
     ]:
         refuses(fault, "audit", *words, "--out", out)
