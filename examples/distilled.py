@@ -201,8 +201,7 @@ class Learner(LightLearner):
         of_best = scores.masked_fill(self.tensor(~best), -torch.inf).logsumexp(2)
         loss = of_best.neg().sum() / max(1, int(leads.sum()))
         fallen = min(1.0, self.steps / self.last)
-        for group in networks.optimiser.param_groups:
-            group["lr"] = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
+        networks.optimiser.lr = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
         where = f"in the batch of update {networks.updates}, step {self.steps}"
         descend(loss, networks.online, networks.optimiser, "the options", where, GRADIENT_NORM)
         networks.updates += 1

@@ -33,6 +33,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
+from hypogoal.core.adam import Adam
 from hypogoal.diversity import Context, Objective, load_objective
 from hypogoal.hypotheses.batches import Numbers, TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -60,7 +61,7 @@ def fit(
     frozen: Sequence[nn.Sequential],
     states: TrainingStates,
     batches: Iterable[tuple[Numbers, Numbers]],
-    optimiser: torch.optim.Optimizer,
+    optimiser: Adam,
     config: EnsembleConfig,
     taught: Tensor | None = None,
 ) -> Iterator[Losses]:

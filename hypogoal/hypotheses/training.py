@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hypogoal.core import seeding
+from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Bools
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
@@ -156,12 +157,8 @@ class Training(Resumable):
         self.networks = [self.ensemble.networks[member].train() for member in self.rounds[number]]
         self._round_seed = seeding.seed_for(self.seed, "batches", number)
         self.states.begin(self._round_seed)
-        self.optimiser = torch.optim.Adam(
-            nn.ModuleList(self.networks).parameters(),
-            lr=self.config.learning_rate,
-            weight_decay=self.config.l2_weight,
-            fused=True,
-        )
+        weights = nn.ModuleList(self.networks).parameters()
+        self.optimiser = Adam(weights, self.config.learning_rate, weight_decay=self.config.l2_weight)
 
     def _round(self) -> Iterator[tuple[int, Losses]]:
         """Train the members of the round that has begun."""

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 from torch.nn.utils import clip_grad_norm_
 
+from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints, tensor
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import NumericalError
@@ -74,7 +75,7 @@ class DoubleDQN(Resumable):
     def __init__(self, online: nn.Module, config: Any, largest: float = math.inf):
         self.online, self.config, self.largest = online, config, largest
         self.target = copy.deepcopy(online).requires_grad_(False).eval()
-        self.optimiser = torch.optim.Adam(online.parameters(), lr=config.option_learning_rate, fused=True)
+        self.optimiser = Adam(online.parameters(), config.option_learning_rate)
         self.updates = 0
         # What is updated in place, read once: it takes as long to gather as to change.
         self._followed = [*zip(self.target.state_dict().values(), online.state_dict().values(), strict=True)]
@@ -136,7 +137,7 @@ class DoubleDQN(Resumable):
 def descend(
     loss: Tensor,
     network: nn.Module,
-    optimiser: torch.optim.Optimizer,
+    optimiser: Adam,
     owner: str,
     where: str,
     largest: float = math.inf,

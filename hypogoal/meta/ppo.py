@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Columns, tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import drawing_from, rng_for, torch_generator
@@ -66,12 +67,7 @@ class MetaPolicy(Chooser):
                 )
             self.head = networks.HEADS[config.head](options)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head}).to(self.device)
-        self.optimiser = torch.optim.Adam(
-            self.policy.parameters(),
-            lr=config.meta_learning_rate,
-            eps=1e-5,
-            fused=True,
-        )
+        self.optimiser = Adam(self.policy.parameters(), config.meta_learning_rate, eps=1e-5)
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         count = engine.count

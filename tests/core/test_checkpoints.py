@@ -1,12 +1,15 @@
 """Spec G1, G3: a state on disk is the state, the last good one stays, and signals wait until it is whole."""
 
 import resource
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from hypogoal.core.adam import Adam
 from hypogoal.core.checkpoints import Checkpoints, restored, snapshot_of
 from hypogoal.core.errors import UserError
 
@@ -36,20 +39,21 @@ def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
     assert np.isnan(found["nan"][0]) and np.isnan(found["nan"][1][0]) and found["empty"] == {}
 
 
-def test_an_optimiser_goes_on_as_if_it_had_not_stopped() -> None:
+@pytest.mark.parametrize("kind", [Adam, partial(torch.optim.Adam, fused=True)], ids=["ours", "torch's"])
+def test_an_optimiser_goes_on_as_if_it_had_not_stopped(kind: Any) -> None:
     """Spec G1: moments and step counts, with steps of the same size before and after."""
 
-    def steps(weight: torch.Tensor, optimiser: torch.optim.Optimizer, count: int) -> None:
+    def steps(weight: torch.Tensor, optimiser: Any, count: int) -> None:
         for _ in range(count):
             optimiser.zero_grad()
             (weight**4).sum().backward()
             optimiser.step()
 
     weights = [torch.ones(5, requires_grad=True) for _ in range(2)]
-    unbroken, first = (torch.optim.Adam([weight], lr=0.1, fused=True) for weight in weights)
+    unbroken, first = (kind([weight], lr=0.1) for weight in weights)
     steps(weights[0], unbroken, 7)
     steps(weights[1], first, 4)
-    resumed = torch.optim.Adam([weights[1]], lr=0.1, fused=True)
+    resumed = kind([weights[1]], lr=0.1)
     restored(resumed, snapshot_of(first))
     steps(weights[1], resumed, 3)
     assert torch.equal(*weights)
