@@ -33,8 +33,14 @@ def choosing(
         yield Command(f"ensemble/method-{method}-seed-{seed}", words, {"method": method, "seed": seed})
     for (layout, seed), method in product(agents_of(layouts, seeds), methods):
         place = f"method-{method}-layout-{layout}-seed-{seed}"
-        ensemble, of_agent = f"@ensemble/method-{method}-seed-{seed}", f"--seed {seed} --layout-seed {layout}"
-        columns: Columns = {"policy": "learned", "method": method, "layout_seed": layout, "seed": seed}
+        ensemble = f"@ensemble/method-{method}-seed-{seed}"
+        of_agent = f"--seed {seed} --layout-seed {layout}"
+        columns: Columns = {
+            "policy": "learned",
+            "method": method,
+            "layout_seed": layout,
+            "seed": seed,
+        }
         words = f"train-meta {ensemble} {of_agent} --set network=planned"
         yield Command(f"planned/{place}", words, {**columns, "policy": "planned"})
         yield Command(f"options/{place}", f"train-options {ensemble} {of_agent}", columns)

@@ -17,7 +17,7 @@ from hypogoal.experiments.experiment import STAGE, Command
 from hypogoal.experiments.named import find_experiment
 from hypogoal.stages import load_stage
 
-OUTPUT = re.compile("(^|=)@(.+)")  # in a word an output: @data, --data=@data
+OUTPUT = re.compile("(|.*=)@(.+)")  # in a word an output: @data, --data=@data
 MEND = "An experiment yields (name, command) or (name, command, columns), see docs/formats.md."
 
 
@@ -59,8 +59,9 @@ def plan(
         raise UserError("no such stage in --set", stage, f"This run has {', '.join(stages)}.")
     if config.evaluate:
         everything = [cell.place for cell in cells]
-        cells.append(Cell(name="evaluation", words=["evaluate", HERE], needs=everything, run=run))
-        cells.append(Cell(name="report", words=["report", HERE], needs=["evaluation"], run=run))
+        evaluation = Cell(name="evaluation", words=["evaluate", HERE], needs=everything, run=run)
+        report = Cell(name="report", words=["report", HERE], needs=[evaluation.place], run=run)
+        cells += [evaluation, report]
     return cells, config.workers
 
 
@@ -74,10 +75,16 @@ def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any])
     for command in commands:
         try:
             name, text, columns = Command(*command)
-            words = shlex.split(text)
-            needs = [cells[output[2]].place for output in map(OUTPUT.search, words) if output]
-            words = [OUTPUT.sub(lambda match: f"{match[1]}{HERE}/{cells[match[2]].place}", word) for word in words]
-            words, domain = completed(words, domains[needs[0]] if needs else DOMAIN)
+            words: list[str] = []
+            needs: list[str] = []
+            for word in shlex.split(text):
+                if output := OUTPUT.match(word):
+                    option, other = output.groups()
+                    needs.append(cells[other].place)
+                    word = f"{option}{HERE}/{needs[-1]}"
+                words.append(word)
+            domain = domains[needs[0]] if needs else DOMAIN
+            words, domain = completed(words, domain)
             cell = Cell(name=name, words=words, needs=needs, columns=dict(columns), run=run)
         except UserError as error:
             error.add_note(f"in the command {command[0]}")
