@@ -321,12 +321,12 @@ def shade_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 class Patience(Terminations):
-    """``one_room:Patience:STEPS``: after so many steps of an option that hardly ever arrives its threshold falls.
+    """After ``steps`` steps of an option that hardly ever arrives its threshold falls.
 
     It falls to ``NEXT`` of the highest log-odds among these steps, never below ``LEAST`` of the first threshold.
     """
 
-    NUMBERED = True
+    steps = 10_000
     CHANGING = (*Terminations.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
 
     def __init__(self, *arguments: Any, **more: Any):
@@ -347,7 +347,7 @@ class Patience(Terminations):
         np.add.at(self._executions, options, 1)
         np.add.at(self._reaches, options, reached)
         np.maximum.at(self._highest, options, self._best[environments])
-        due = self._steps >= self.length
+        due = self._steps >= self.steps
         rarely = self._reaches < ENOUGH * self._executions
         lower = np.maximum(LEAST * self._first, NEXT * self._highest)
         self.thresholds = np.where(due & rarely, np.minimum(self.thresholds, lower), self.thresholds)

@@ -387,7 +387,9 @@ def by_table(ids: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 def patient(thresholds: tuple[float, float], length: int, environments: int = 1) -> Patience:
-    return Patience(by_table, 2, None, np.array(thresholds, dtype=np.float32), environments, length)
+    rule = Patience(by_table, 2, None, np.array(thresholds, dtype=np.float32), environments)
+    rule.steps = length
+    return rule
 
 
 def execution(rule: Terminations, option: int, states: tuple[int, ...]) -> list[bool]:
