@@ -17,8 +17,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.config import Config, setting
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import drawing_from, rng_for, seed_for, torch_generator
+from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.domains.montezuma.emulator import SCREEN, SIDE, pixel
 from hypogoal.hypotheses.networks import folded
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
@@ -75,7 +76,7 @@ class AgentView(View):
         super().__init__()
         self.shape = (HEIGHT, WIDTH, observation_shape[2])
         self.settings = settings
-        with drawing_from(torch.Generator()):
+        with DrawsFrom(torch.Generator()):
             self.localiser = folded(heat_network(self.shape[2]).eval()).requires_grad_(False)
 
     def fit(self, labelled: Pictures, unlabelled: Pictures, origins: StateOrigins, seed: int) -> None:
@@ -87,7 +88,7 @@ class AgentView(View):
         labelled, places = labelled[alive], observed_pixel(positions[alive, :3])
         unlabelled, actions = unlabelled[acted], actions[acted]
         seed = seed_for(seed, "localiser")
-        with drawing_from(torch_generator(seed, "weights")):
+        with DrawsFrom(torch_generator(seed, "weights")):
             localiser = heat_network(labelled.shape[3])
             action_layer = nn.Conv2d(FEATURES, 2 * int(actions.max() + 1), kernel_size=1)
         weights = [*localiser.parameters(), *action_layer.parameters()]

@@ -117,7 +117,7 @@ def prepare(device: str = "auto") -> str:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """torch with its own default type and device; afterwards they are the caller's again, and so are its threads.
+    """torch as if nobody had changed its settings; afterwards they are the caller's again.
 
     Most are of the whole process, so its threads take turns.
     """
@@ -128,7 +128,8 @@ def own_settings() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
         torch.set_default_device(None)
         try:
-            yield
+            with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+                yield
         finally:
             torch.set_num_threads(threads)
             torch.set_flush_denormal(False)

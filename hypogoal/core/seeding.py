@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import zlib
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,17 +38,3 @@ def torch_generator(seed: int, *names: str | int) -> torch.Generator:
     generator = torch.Generator()
     generator.manual_seed(seed_for(seed, *names))
     return generator
-
-
-@contextlib.contextmanager
-def drawing_from(generator: torch.Generator) -> Iterator[None]:
-    """What is drawn from torch's global generator comes from this one: modules cannot be passed any for their weights.
-
-    Afterwards the global one is as it was.
-    """
-    import torch
-
-    with torch.random.fork_rng(devices=[]):
-        torch.set_rng_state(generator.get_state())
-        yield
-        generator.set_state(torch.get_rng_state())

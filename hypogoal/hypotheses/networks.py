@@ -23,9 +23,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
-from hypogoal.core.seeding import drawing_from
 from hypogoal.hypotheses.load import ByKey
 from hypogoal.observations import (
     NUMBERS,
@@ -210,7 +210,7 @@ def build_network(
 ) -> nn.Sequential:
     """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
-    ``generator`` draws the initial weights (PyTorch's default distributions); None: torch's global one.
+    ``generator`` draws the initial weights (PyTorch's default distributions); None: that of the ``DrawsFrom`` around.
     Of mixed observations, of type ``dtype``, each key has its network without the last layer; a dense layer joins them.
     An unknown network (see :func:`load_network`), or observations that it does not take, for example images too small
     for it, are a ``UserError``.
@@ -218,7 +218,7 @@ def build_network(
     by_key = _by_key(name, generator, dtype) if dtype.names else None
     example = torch.zeros(1, values_in((), dtype)) if by_key else as_input(torch.zeros(1, *observation_shape))
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
-    with drawing_from(torch.Generator().manual_seed(seed)):
+    with DrawsFrom(torch.Generator().manual_seed(seed)):
         layers, hidden = ([by_key], (JOINT,)) if by_key else load_network(name)(observation_shape)
         features = _features(layers, example)
         if features is None:

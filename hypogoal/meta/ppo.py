@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Columns, tensor
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import drawing_from, rng_for, torch_generator
+from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
@@ -55,7 +56,7 @@ class MetaPolicy(Chooser):
     ):
         self.engine, self.config, self.device = engine, config, torch.device(device)
         shape, name = engine.observation_shape, config.meta_network
-        with drawing_from(torch_generator(seed, "meta-weights")):
+        with DrawsFrom(torch_generator(seed, "meta-weights")):
             if name == "paper":
                 self.network: nn.Module = networks.PaperMetaNetwork(shape, options)
             else:

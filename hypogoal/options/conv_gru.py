@@ -19,8 +19,9 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
 from hypogoal.core.arrays import Columns
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import drawing_from, torch_generator
+from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import DoubleDQN, ReplayBatch
@@ -144,7 +145,7 @@ class PaperLearner(Learner):
         self.members = []
         shape, actions = self.engine.observation_shape, self.engine.n_actions
         for option in range(self.options):
-            with drawing_from(torch_generator(seed, "option-weights", option)):
+            with DrawsFrom(torch_generator(seed, "option-weights", option)):
                 network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), config))
         self.windows = np.zeros((self.engine.count, config.recurrence), np.int64)  # of running executions

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import drawing_from, torch_generator
+from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import DoubleDQN, ReplayBatch
@@ -68,7 +69,7 @@ class LightLearner(Learner):
     def network(self, config: LightConfig, seed: int) -> networks.LightQNetwork:
         """One with fresh weights."""
         engine = self.engine
-        with drawing_from(torch_generator(seed, "option-weights")):
+        with DrawsFrom(torch_generator(seed, "option-weights")):
             network = networks.LightQNetwork(
                 engine.observation_shape,
                 self.options,

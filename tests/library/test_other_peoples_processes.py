@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -72,14 +73,38 @@ def strict_warnings() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def drawing_beside() -> Iterator[None]:
+    """Another thread draws from the global generators all the time."""
+    over = threading.Event()
+
+    def draw() -> None:
+        while not over.wait(1e-4):
+            torch.rand(3)
+            np.random.rand(3)  # noqa: NPY002
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
 SETTINGS: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "another type": lambda: setting(torch.set_default_dtype, torch.float64, torch.float32),
     "another device": lambda: setting(torch.set_default_device, "meta", None),
     "more threads": lambda: setting(torch.set_num_threads, 2, 1),
+    "no gradients": torch.no_grad,
+    "gradients off": lambda: setting(torch.set_grad_enabled, False, True),
+    "inference": torch.inference_mode,
+    "half precision": lambda: torch.autocast("cpu", torch.bfloat16),
     "deterministic": lambda: setting(torch.use_deterministic_algorithms, True, False),
     "anomalies": lambda: setting(torch.autograd.set_detect_anomaly, True, False),
     "NumPy's errors": lambda: np.errstate(all="raise"),
     "warnings are errors": strict_warnings,
+    "a thread that draws": drawing_beside,
 }
 
 
@@ -93,7 +118,10 @@ def test_the_callers_settings_change_nothing(name: str, data: Path, plain: dict[
 
 
 def settings_of_torch() -> tuple[Any, ...]:
-    return torch.get_default_dtype(), torch.get_default_device(), torch.get_num_threads()
+    return (
+        *(torch.get_default_dtype(), torch.get_default_device(), torch.get_num_threads()),
+        *(torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.is_autocast_enabled("cpu")),
+    )
 
 
 def test_threads_take_turns(data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:

@@ -1,0 +1,35 @@
+"""Random numbers for modules of torch, which ask for no generator when they draw their first weights."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+IN_PLACE = (Tensor.bernoulli_, Tensor.exponential_, Tensor.normal_, Tensor.random_, Tensor.uniform_)
+NEW = (torch.bernoulli, torch.multinomial, torch.normal, torch.rand, torch.randint, torch.randn, torch.randperm)
+DRAWING = {*IN_PLACE, *NEW}
+
+
+class DrawsFrom(TorchFunctionMode):
+    """A context: what would be drawn from torch's generator, which all threads share, comes from this one.
+
+    The numbers are those of torch's generator in the same state. Only this thread's draws are meant.
+    """
+
+    def __init__(self, generator: torch.Generator):
+        super().__init__()
+        self.generator = generator
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: Any = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        given = dict(kwargs or {})
+        if given.get("generator") is None and ("generator" in given or func in DRAWING):
+            given["generator"] = self.generator
+        return func(*args, **given)
