@@ -32,7 +32,7 @@ from hypogoal.diversity.dbat import pair_loss  # noqa: E402
 from hypogoal.domains.base import settings_of  # noqa: E402
 from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
-from hypogoal.hypotheses.training import Training  # noqa: E402
+from hypogoal.hypotheses.training import EnsembleTraining  # noqa: E402
 
 WANTED = {"doorkey": {"hypogoal": 4.0}, "montezuma": {"hypogoal": 2.5}}
 SUB_GOAL = {"doorkey": "open-red-door", "montezuma": "climb-down-ladder"}
@@ -92,7 +92,7 @@ def plain(split: States, unlabelled: np.ndarray, config: EnsembleConfig, steps: 
 
 def ours(split: States, unlabelled: np.ndarray, config: EnsembleConfig) -> float:
     """Seconds of a step of a training, the first left out."""
-    training = Training(split.observations, split.labels, unlabelled, config, 0)
+    training = EnsembleTraining(split.observations, split.labels, unlabelled, config, 0)
     times = [time.process_time() for _ in training.steps()]
     return statistics.median(np.diff(times))
 

@@ -30,7 +30,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import attributed, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import ranking
-from hypogoal.hypotheses.training import Training
+from hypogoal.hypotheses.training import EnsembleTraining
 from hypogoal.observations import spread_rows
 from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 from studies.ladders import METHODS as OF_LADDERS
@@ -122,7 +122,7 @@ def run_cell(method: str, seed: int) -> list[Row]:
             rows.append(place | {name: float(numbers[member]) for name, numbers in columns.items()})
 
     config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": LOOKS[-1]})
-    training = Training(
+    training = EnsembleTraining(
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,

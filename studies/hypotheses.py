@@ -37,7 +37,7 @@ from hypogoal.evaluation.house import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
-from hypogoal.hypotheses.training import Training
+from hypogoal.hypotheses.training import EnsembleTraining
 from studies.cells import Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -99,7 +99,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
             place = dict(zip(KEYS, (layouts, method, sub_goal, seed, step, member), strict=True))
             rows.append(place | {name: float(values[member]) for name, values in columns.items()})
 
-    training = Training(
+    training = EnsembleTraining(
         data.labelled.observations,
         data.labelled.labels[:, column],
         data.unlabelled.observations,

@@ -34,7 +34,7 @@ from hypogoal.evaluation.house import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
-from hypogoal.hypotheses.training import Training
+from hypogoal.hypotheses.training import EnsembleTraining
 from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -87,7 +87,7 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> lis
             rows.append(place | {name: float(values[member]) for name, values in columns.items()})
 
     config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": looks[-1]})
-    training = Training(
+    training = EnsembleTraining(
         data.labelled.observations,
         data.labelled.labels[:, 0],
         data.unlabelled.observations,

@@ -12,7 +12,7 @@ from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import as_input, as_tensor
+from hypogoal.hypotheses.networks import inputs_of
 from hypogoal.hypotheses.views import full_view
 from hypogoal.observations import PICTURE, Observations
 
@@ -36,12 +36,11 @@ class _Network:
     states: Observations
 
     def ensemble(self) -> Ensemble:
-        view = full_view(self.states, self.states)
+        view = full_view(self.states)
         return Ensemble(self.name, view.shape, 2, torch_generator(0, "check"), view)
 
     def inputs(self, ensemble: Ensemble) -> Tensor:
-        seen = as_tensor(ensemble.see(self.states))
-        return as_input(seen, self.states.dtype)
+        return inputs_of(ensemble.see(self.states))
 
     def logits(self) -> str:
         """Members get the same tensor, one after the other."""

@@ -10,7 +10,7 @@ Both must stay finite and differentiable at extreme logits and for N = 0 (``hypo
 your own as ``module:function``, a function of two arguments or of one. Other packages add theirs under the entry point
 group ``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` with one of these functions.
 
-:func:`hypogoal.hypotheses.fit.disagreement` puts them into Eq. (1).
+:func:`hypogoal.hypotheses.fit.disagreement_of` puts them into Eq. (1).
 """
 
 from __future__ import annotations
@@ -97,19 +97,8 @@ def load_objective(name: str) -> Objective:
     if not callable(loaded):
         do = "Give a pair_loss(logits_a, logits_b) or an ensemble_loss(context)."
         raise UserError("this is not a diversity objective", name, do)
-    if _arguments(loaded) == 1:
+    parameters = inspect.signature(loaded).parameters.values()
+    required = [parameter for parameter in parameters if parameter.default is parameter.empty]
+    if len(required) == 1:
         return Objective(name, ensemble_loss=loaded)
     return Objective(name, pair_loss=loaded)
-
-
-def _arguments(function: Callable[..., Any]) -> int:
-    """The number of required positional arguments; 0 if unknown."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return 0
-    required = 0
-    for parameter in signature.parameters.values():
-        positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-        required += positional and parameter.default is parameter.empty
-    return required

@@ -22,11 +22,7 @@ from hypogoal.data import require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import (
-    as_input,
-    as_tensor,
-    at_once,
-)
+from hypogoal.hypotheses.networks import at_once, inputs_of
 from hypogoal.hypotheses.views import Origins
 from hypogoal.observations import Observations, values_in
 
@@ -38,9 +34,8 @@ NONE = np.zeros(0, dtype=np.int64)
 class TrainingStates(Resumable):
     """Labelled states (N, *obs) with labels (N,), and unlabelled ones (M, *obs), each numbered from 0.
 
-    On a CPU the arrays are kept and not copied. Pictures of which many patches are equal are kept as tables, see
-    :mod:`hypogoal.hypotheses.patches`. Mixed observations' numbers are standardised in each batch, since a standardised
-    copy would have copies of the pictures, too.
+    Pictures are kept and not copied. Those of which many patches are equal are kept as tables, see
+    :mod:`hypogoal.hypotheses.patches`.
 
     Args:
         ensemble: whose members will see the states, on its device and by its view.
@@ -69,24 +64,14 @@ class TrainingStates(Resumable):
         self.labels, self.n_unlabelled = labels, len(unlabelled)
         self.view, self.device = ensemble.view, ensemble.thresholds.device
         self._origins = origins
-        self._dtype = observations.dtype
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(self.device)
-        self._standard: list[Tensor] = []
-        if self._dtype.names:
-            self._standard = [torch.from_numpy(values).to(self.device) for values in self.view.standard or ()]
-        else:
-            observations, unlabelled = self.view.to_change(observations), self.view.to_change(unlabelled)
-        kept = [np.require(states, requirements=["C", "W"]) for states in (observations, unlabelled)]
+        kept = self.view.to_change(observations), self.view.to_change(unlabelled)
         self._tables: patches.Tables | None = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
             self._tables = patches.make_tables(kept[0], ensemble.networks[0], kept[1])
-        self._states: list[Tensor] = []
-        if self._tables is None:
-            self._states = [as_tensor(states).to(self.device) for states in kept]
-        self._at_once = at_once(
-            EVALUATED_AT_ONCE,
-            (values_in(kept[0].shape[1:], self._dtype),),
-        )
+        self._states = kept if self._tables is None else ()
+        size = values_in(observations.shape[1:], observations.dtype)
+        self._at_once = at_once(EVALUATED_AT_ONCE, (size,))
 
     def begin(self, seed: int) -> None:
         """Begin the random changes of one training; before any :meth:`logits`."""
@@ -163,7 +148,7 @@ class TrainingStates(Resumable):
         self,
         groups: tuple[Numbers, Numbers],
         changing: bool,
-    ) -> Tensor | patches.Batch:
+    ) -> Tensor | patches.PatchBatch:
         """The networks' inputs for labelled and unlabelled states: pictures, or their patches."""
         if self._tables is not None:
             labelled, unlabelled = groups
@@ -173,15 +158,11 @@ class TrainingStates(Resumable):
         for states, numbers, rng in zip(self._states, groups, self.changes, strict=True):
             if not len(numbers):
                 continue
-            seen = states[torch.from_numpy(numbers).to(self.device)]
+            seen = states[numbers]
             if self.view.changes:
-                changed = self.view.change(
-                    seen.cpu().numpy(),
-                    rng if changing else None,
-                )
-                seen = torch.from_numpy(np.ascontiguousarray(changed)).to(self.device)
+                seen = self.view.change(seen, rng if changing else None)
             rows.append(seen)
-        return as_input(torch.cat(rows), self._dtype, self._standard)
+        return inputs_of(np.concatenate(rows), self.device)
 
 
 def _draws(
@@ -203,12 +184,12 @@ def _draws(
 
 def _forward(
     network: nn.Sequential,
-    inputs: Tensor | patches.Batch,
+    inputs: Tensor | patches.PatchBatch,
     sizes: Sequence[int],
     counted: bool,
 ) -> Tensor:
     """A network's outputs, up to rounding the same for either kind of inputs (a test asserts it)."""
-    if isinstance(inputs, patches.Batch):
+    if isinstance(inputs, patches.PatchBatch):
         return patches.forward(network, inputs, counted)
     return plain_forward(network, inputs, sizes, counted)
 

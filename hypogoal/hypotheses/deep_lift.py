@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import TYPE_CHECKING, Any
@@ -23,11 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.arrays import Doubles
-from hypogoal.hypotheses.networks import (
-    as_input,
-    as_tensor,
-    at_once,
-)
+from hypogoal.hypotheses.networks import as_input, at_once, inputs_of
 from hypogoal.observations import (
     NUMBERS,
     PICTURE,
@@ -99,31 +94,6 @@ def by_key(
     return parts
 
 
-def explanation(
-    attributions: Attributions,
-    picked: Sequence[tuple[int, str]],
-) -> list[dict[str, Any]]:
-    """Spec F2: the check by state and member, for n states ``picked`` as (index, kind)."""
-    sums = attributions.sums()
-    frames = np.abs(attributions.values).reshape(*sums.shape, -1, attributions.values.shape[-1]).sum(2)
-    total = frames.sum(-1)
-    columns = {
-        "log_odds": attributions.log_odds,
-        "baseline_log_odds": np.broadcast_to(attributions.baseline_log_odds, sums.shape),
-        "attributed": sums,
-        "completeness_error": attributions.completeness_error(),
-        "last_frame": np.divide(frames[..., -1], total, out=np.full_like(sums, np.nan), where=total > 0),
-    }
-    rows: list[dict[str, Any]] = []
-    for state, (_, kind) in enumerate(picked):
-        members = []
-        for member in range(sums.shape[1]):
-            numbers = {name: float(values[state, member]) for name, values in columns.items()}
-            members.append({"member": member, **numbers})
-        rows.append({"kind": kind, "method": attributions.method, "members": members})
-    return rows
-
-
 def method_of(member: nn.Module) -> str:
     """How a member is explained: by DeepLift if it is a chain of layers with valid rules, each used once."""
     layers = list(member.children())
@@ -143,8 +113,7 @@ def attributed(
     """
     method = method_of(ensemble.members[0])
     explained = _deep_lift if method == DEEP_LIFT else _integrated
-    inputs = as_input(as_tensor(observations), observations.dtype)
-    reference = as_input(as_tensor(baseline[None]), baseline.dtype)
+    inputs, reference = inputs_of(observations), inputs_of(baseline[None])
     values, log_odds, baselines = [], [], []
     for member in ensemble.members:
         network, of_member = explained(member, inputs, reference)

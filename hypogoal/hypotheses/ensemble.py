@@ -56,7 +56,7 @@ def predicting(device: torch.device) -> Iterator[None]:
 
 
 class Ensemble(nn.Module):
-    """K member networks of one sub-goal with fresh weights; a ``training.Training`` trains them.
+    """K member networks of one sub-goal with fresh weights; a ``training.EnsembleTraining`` trains them.
 
     Args:
         network: a name in ``networks.NETWORKS``.
@@ -66,7 +66,7 @@ class Ensemble(nn.Module):
         view: what members see of an observation; None: a whole picture.
 
     Attributes:
-        members: K ``nn.Sequential``, from ``networks.as_input`` of the view (for pictures float (N, C, h, w) in 0..1)
+        members: K ``nn.Sequential``, from ``networks.inputs_of`` the view (for pictures float (N, C, h, w) in 0..1)
             to logits (N, 2).
         networks: the members with their layers in the fastest order; weights and BatchNorm statistics are shared.
         thresholds: float32 (K,), the probabilities above which members' predictions are positive.
@@ -228,8 +228,7 @@ class Ensemble(nn.Module):
             )
         logits = []
         for start in range(0, len(observations), size):
-            states = networks.as_tensor(observations[start : start + size]).to(device)
-            inputs = networks.as_input(states, observations.dtype)
+            inputs = networks.inputs_of(observations[start : start + size], device)
             logits.append(torch.stack([member(inputs) for member in members]))
         return torch.cat(logits, dim=1)
 
@@ -283,7 +282,7 @@ def read_ensemble(
     state = load_tensors(path)
     try:
         shape = tuple(config["observation_shape"])
-        view = saved_view(shape, config, state)
+        view = saved_view(shape, config)
         return Ensemble.from_state(
             config["network"],
             shape,

@@ -1,6 +1,6 @@
 """Spec C5: member networks, chosen by name.
 
-Each is an ``nn.Sequential`` from :func:`as_input`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2), with
+Each is an ``nn.Sequential`` from :func:`inputs_of`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2), with
 "positive" in column 1. Built-in networks consist of plain modules used once, each ReLU before its MaxPool: DeepLift is
 valid for no others. :func:`reordered` has an order that is faster to train. A user's network may begin with any module,
 an encoder.
@@ -13,7 +13,7 @@ network, which the paper does not have.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from math import prod
 from typing import Any, TypeAlias
@@ -34,7 +34,6 @@ from hypogoal.observations import (
     Observations,
     Shape,
     fields_of,
-    standardised,
     values_in,
 )
 
@@ -289,53 +288,24 @@ def folded(network: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*layers).eval()
 
 
-def as_tensor(observations: Observations) -> Tensor:
-    """Observations (N, ...) in the same memory; mixed ones as their bytes, uint8 (N, B), for :func:`as_input`."""
-    if observations.dtype.names:
-        observations = observations.view(np.uint8).reshape(
-            len(observations),
-            observations.dtype.itemsize,
-        )
-    return torch.from_numpy(observations)
-
-
-def as_input(
-    observations: Tensor,
-    dtype: DType = PICTURE,
-    standard: Sequence[Tensor] = (),
-) -> Tensor:
+def as_input(observations: Tensor) -> Tensor:
     """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
 
-    Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too. Mixed ones
-    of type ``dtype``, as bytes, become float32 (N, D), the inputs of all keys in a row, their numbers standardised by
-    mean and deviation, (numbers,) each, if these are given.
+    Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too.
     """
-    if dtype.names:
-        return _inputs_by_key(observations, dtype, standard)
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
 
 
-def _inputs_by_key(
-    rows: Tensor,
-    dtype: DType,
-    standard: Sequence[Tensor],
-) -> Tensor:
-    """See :func:`as_input`."""
-    inputs, first = [], 0
-    for key, (kind, shape) in fields_of((), dtype).items():
-        start = dtype.fields[key][1]  # type: ignore[index]
-        part = rows[:, start : start + dtype[key].itemsize].clone(memory_format=torch.contiguous_format)
-        if kind == NUMBERS:
-            part = part.view(torch.float32)
-            last = first + prod(shape)
-            if standard:
-                mean, deviation = standard
-                part = standardised(part, mean[first:last], deviation[first:last])
-            first = last
-        of_key = as_input(part.reshape(-1, *shape))
-        inputs.append(of_key.flatten(1))
-    return torch.cat(inputs, dim=1)
+def inputs_of(observations: Observations, device: torch.device | str = "cpu") -> Tensor:
+    """What networks take of observations (N, ...), see :func:`as_input`; of mixed ones all keys' in a row, (N, D)."""
+    if not observations.dtype.names:
+        return as_input(torch.from_numpy(observations).to(device))
+    parts = []
+    for key in observations.dtype.names:
+        part = np.ascontiguousarray(observations[key])
+        parts.append(inputs_of(part, device).flatten(1))
+    return torch.cat(parts, dim=1)
 
 
 def at_once(most: int, shape: Shape) -> int:

@@ -45,7 +45,7 @@ class Tables:
 
 
 @dataclass(frozen=True)
-class Batch:
+class PatchBatch:
     """The patches in groups of images, group after group.
 
     BatchNorm sees each group on its own; all other layers see all groups at once.
@@ -190,7 +190,7 @@ def _distinct_items(items: NDArray[np.uint8]) -> tuple[Ids, NDArray[np.uint8]]:
     return index, distinct.reshape(-1, size)
 
 
-def take(tables: Tables, *groups: Ints) -> Batch:
+def take(tables: Tables, *groups: Ints) -> PatchBatch:
     """The patches in groups of images, by index (B,); repeated images count repeatedly."""
     parts: list[list[Ints]] = [[] for _ in tables.levels]
     shares: list[list[tuple[Tensor, int]]] = [[] for _ in tables.levels]
@@ -210,7 +210,7 @@ def take(tables: Tables, *groups: Ints) -> Batch:
         last.append(ranks.reshape(len(images), -1).astype(np.int64) + offset)
     first, *above = [torch.from_numpy(np.concatenate(of_groups)) for of_groups in parts]
     patches = tables.colours[first]
-    return Batch(
+    return PatchBatch(
         patches,
         [part.flatten() for part in above],
         shares,
@@ -227,7 +227,7 @@ def _positions(values: Ids, among: Ints) -> Ints:
 
 def forward(
     network: nn.Sequential,
-    batch: Batch,
+    batch: PatchBatch,
     counted: bool = True,
 ) -> Tensor:
     """The logits (B, 2) of ``network`` for the images of ``batch``, in training or evaluation mode.

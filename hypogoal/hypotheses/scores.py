@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from hypogoal.core.arrays import (
     Bools,
@@ -59,12 +60,9 @@ def ranking(
     pairs = positives * (len(labels) - positives)
     if not pairs:
         return np.full(probabilities.shape[1], np.nan)
-    wins = []
-    for high, low in zip(probabilities[labels].T, np.sort(probabilities[~labels], axis=0).T, strict=True):
-        below = np.searchsorted(low, high, side="left")
-        not_above = np.searchsorted(low, high, side="right")
-        wins.append(below.sum() + not_above.sum())
-    return np.array(wins) / (2 * pairs)
+    ranks = rankdata(probabilities, axis=0)  # from 1; ties share their mean
+    won = ranks[labels].sum(axis=0) - positives * (positives + 1) / 2
+    return np.asarray(won / pairs)
 
 
 def best_threshold(
@@ -139,8 +137,8 @@ def ratio(
 def best_mean_worst(scores: Doubles) -> dict[str, float]:
     """Spec F1: best, mean and worst of members' scores (K,) without undefined ones; NaN if none is defined."""
     defined = scores[~np.isnan(scores)]
-    if len(defined) == 0:
-        return dict.fromkeys(("best", "mean", "worst"), math.nan)
+    if not len(defined):
+        defined = np.array([math.nan])
     return {
         "best": float(defined.max()),
         "mean": float(defined.mean()),

@@ -19,7 +19,7 @@ from hypogoal.diversity import load_objective
 from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.hypotheses.training import Training
+from hypogoal.hypotheses.training import EnsembleTraining
 from hypogoal.observations import spread_rows
 
 LOOKED_AT = 1_000  # held-out states, cheap beside training
@@ -66,7 +66,7 @@ def train_sub_goal(
     unlabelled = joined([open_dataset(file).unlabelled_states() for file in others or [data]])
     checkpoints = draft.checkpoints(sub_goal)
     saved = checkpoints.load()
-    training = Training(
+    training = EnsembleTraining(
         labelled.observations,
         labelled.labels,
         unlabelled.observations,

@@ -38,7 +38,7 @@ from hypogoal.observations import Observations
 CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
 
 
-class Training(Resumable):
+class EnsembleTraining(Resumable):
     """One sub-goal's members in training: all at once, or one after the other (``schedule=sequential``).
 
     On one CPU in one thread the same arguments give the same bytes. Where a network of the user's own draws from
@@ -206,8 +206,8 @@ class Training(Resumable):
 
 
 def train(*arguments: Any, **more: Any) -> Ensemble:
-    """The ensemble of a :class:`Training` with these arguments."""
-    training = Training(*arguments, **more)
+    """The ensemble of a :class:`EnsembleTraining` with these arguments."""
+    training = EnsembleTraining(*arguments, **more)
     for _ in training.steps():
         pass
     return training.ensemble

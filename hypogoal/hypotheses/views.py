@@ -133,21 +133,16 @@ class FullView(View):
         return seen
 
 
-def full_view(like: Observations, *observations: Observations) -> FullView:
-    """All of observations ``like`` these, their numbers standardised by mean and deviation of ``observations``."""
-    shape, dtype = like.shape[1:], like.dtype
-    size = standard_shape(shape, dtype)
-    if not prod(size):
+def full_view(*observations: Observations) -> FullView:
+    """All of observations like these, their numbers standardised by the mean and deviation that they have here."""
+    shape, dtype = observations[0].shape[1:], observations[0].dtype
+    numbers = [numbers_of(some) for some in observations]
+    count = numbers[0].shape[1]
+    if not count:
         return FullView(shape, None, dtype)
-    rows = [numbers_of(some).reshape(len(some), *size) for some in observations]
+    size = shape if dtype == NUMBERS else (count,)
+    rows = [some.reshape(len(some), *size) for some in numbers]
     return FullView(shape, standard_of(size, *rows), dtype)
-
-
-def standard_shape(shape: Shape, dtype: DType) -> Shape:
-    """The shape of an observation's standard: that of numbers, else (D,), how many numbers it has."""
-    if dtype == NUMBERS:
-        return shape
-    return (sum(prod(size) for kind, size in fields_of(shape, dtype).values() if kind == NUMBERS),)
 
 
 def own_view(name: str, settings: Sequence[str], observation_shape: Shape) -> View:
@@ -162,18 +157,12 @@ def own_view(name: str, settings: Sequence[str], observation_shape: Shape) -> Vi
     return view
 
 
-def saved_view(observation_shape: Shape, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> View:
-    """The view that the settings ask for, without its weights."""
-    dtype = type_of(config["observation_dtype"])
+def saved_view(observation_shape: Shape, config: Mapping[str, Any]) -> View:
+    """The view that the settings ask for, before it has learned, to load what it learned into."""
     if config.get("view", FULL) != FULL:
         return own_view(config["view"], config["view_settings"], observation_shape)
-    size = standard_shape(observation_shape, dtype)
-    if dtype == PICTURE or not prod(size):
-        return FullView(observation_shape, None, dtype)
-    standard = state["view.mean"].numpy(), state["view.deviation"].numpy()
-    if standard[0].shape != size:  # a damaged manifest may ask for terabytes
-        raise ValueError(observation_shape)
-    return FullView(observation_shape, standard, dtype)
+    no_states = np.zeros((0, *observation_shape), type_of(config["observation_dtype"]))
+    return full_view(no_states)
 
 
 def view_of(
@@ -181,7 +170,7 @@ def view_of(
 ) -> View:
     """The members' view; ``fitted``: it has learned from the states, else what it learned is to be loaded."""
     if config.view == FULL:
-        return full_view(observations, *([observations, unlabelled] if fitted else []))
+        return full_view(observations, unlabelled)
     view = own_view(config.view, config.view_settings, observations.shape[1:])
     if observations.dtype != view.dtype:
         raise UserError(f"the view is of {view.dtype}, these observations are {observations.dtype}", config.view)

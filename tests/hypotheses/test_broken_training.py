@@ -10,7 +10,7 @@ from test_training import assert_same, toy
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.training import Training
+from hypogoal.hypotheses.training import EnsembleTraining
 from hypogoal.stages.train_ensemble import train_ensemble
 
 OWN = EnsembleConfig(members=2, steps=12, batch_size=16, diversity_weight=1e-2, view="own_view:Moved")
@@ -40,19 +40,19 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
     Whoever drew from the global generator before; a teacher is not asked again.
     """
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    unbroken = Training(*toy(), config, 0)
+    unbroken = EnsembleTraining(*toy(), config, 0)
     expected = {step: losses.numbers() for step, losses in unbroken.steps()}
     torch.rand(7)
     checkpoints = Checkpoints(tmp_path / "ensemble.safetensors")
     total = len(expected)
     for last in (total // 4, total // 2 + 1, total):
-        training = Training(*toy(), config, 0, saved=checkpoints.load())
+        training = EnsembleTraining(*toy(), config, 0, saved=checkpoints.load())
         for step, losses in training.steps():
             assert losses.numbers() == expected[step]
             if step == last:
                 checkpoints.save(training.snapshot())
                 break
-    finished = Training(*toy(), config, 0, saved=checkpoints.load())
+    finished = EnsembleTraining(*toy(), config, 0, saved=checkpoints.load())
     assert list(finished.steps()) == []
     assert_same(finished.ensemble.state(), unbroken.ensemble.state())
 

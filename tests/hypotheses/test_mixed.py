@@ -17,7 +17,7 @@ from stable_baselines3 import DQN, PPO
 import hypogoal
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.hypotheses.networks import as_input, as_tensor, build_network, network_for
+from hypogoal.hypotheses.networks import as_input, build_network, inputs_of, network_for
 from hypogoal.hypotheses.views import full_view
 from hypogoal.observations import packed, type_of, type_text
 from tests.mixed import FRONT, STATE, WRIST, DoorEnv, arrays, states
@@ -72,15 +72,15 @@ def test_a_network_sees_what_the_keys_hold() -> None:
     """Bytes of a mixed state, in whatever row, become the same inputs as each key's own array."""
     seen, _ = states(5)
     mixed = packed(seen)
-    inputs = as_input(as_tensor(mixed), mixed.dtype)
+    inputs = inputs_of(mixed)
     assert inputs.shape == (5, np.prod(FRONT) + np.prod(WRIST) + 4)
     for key in ("front", "state", "wrist"):
         own = as_input(torch.from_numpy(seen[key])).flatten(1)
         first = {"front": 0, "state": np.prod(FRONT), "wrist": np.prod(FRONT) + 4}[key]
         torch.testing.assert_close(inputs[:, first : first + own.shape[1]], own, rtol=0, atol=0)
-        one = as_input(as_tensor(mixed[3:4]), mixed.dtype)
+        one = inputs_of(mixed[3:4])
         torch.testing.assert_close(one, inputs[3:4], rtol=0, atol=0)
-    view = full_view(mixed, mixed)
+    view = full_view(mixed)
     np.testing.assert_allclose(view.see(mixed)["state"].mean(0), 0, atol=1e-5)
     np.testing.assert_array_equal(view.see(mixed)["front"], seen["front"])
 
@@ -91,11 +91,11 @@ def test_a_joint_network_uses_every_key(made: Path) -> None:
     network = build_network("auto", (), torch.Generator().manual_seed(0), dtype=dtype).eval()
     mixed = packed(states(4)[0])
     with torch.no_grad():
-        before = network(as_input(as_tensor(mixed), dtype))
+        before = network(inputs_of(mixed))
         for key in dtype.names or ():
             other = mixed.copy()
             other[key] = other[key][::-1]
-            assert not torch.allclose(network(as_input(as_tensor(other), dtype)), before, atol=1e-7)
+            assert not torch.allclose(network(inputs_of(other)), before, atol=1e-7)
 
 
 def test_attributions_are_by_key_and_complete(made: Path) -> None:

@@ -11,7 +11,7 @@ from test_training import TOY, follows, toy
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.fit import taught_losses
-from hypogoal.hypotheses.training import Training, train
+from hypogoal.hypotheses.training import EnsembleTraining, train
 
 CONFIG = TOY.model_copy(update={"diversity": "none", "teacher": "test_teacher:easy_and_hard"})
 calls: list[tuple[object, ...]] = []
@@ -62,7 +62,7 @@ def test_teaching_weighs_in_proportion_to_the_scores() -> None:
 
 def test_a_teacher_is_one_more_term_of_the_loss() -> None:
     """It is asked once, and each member learns its own row."""
-    steps = Training(*toy(), CONFIG.model_copy(update={"steps": 2}), 0).steps()
+    steps = EnsembleTraining(*toy(), CONFIG.model_copy(update={"steps": 2}), 0).steps()
     for _, losses in steps:
         assert losses.loss > losses.labelled.sum() + 0.1
     assert len(calls) == 1

@@ -16,7 +16,7 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.thresholds import thresholds
-from hypogoal.hypotheses.training import Training, train
+from hypogoal.hypotheses.training import EnsembleTraining, train
 
 TOY = EnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, diversity_weight=0.03)
 
@@ -70,7 +70,7 @@ def test_a_single_member_is_the_plain_cnn() -> None:
     """Spec C1: K = 1 has no pairs, needs no unlabelled states, and learns."""
     observations, labels, unlabelled = toy()
     config = TOY.model_copy(update={"members": 1})
-    training = Training(observations, labels, unlabelled[:0], config, 0)
+    training = EnsembleTraining(observations, labels, unlabelled[:0], config, 0)
     assert all(losses.disagreement == 0 for _, losses in training.steps())
     predicted = training.ensemble.predict(observations)
     assert predicted.shape == (64, 1)
@@ -120,7 +120,10 @@ def test_the_loss_is_that_of_equation_1(diversity: str) -> None:
     """Eq. (1): the sum of labelled losses + weight x sum over ordered pairs, at every step."""
     observations, labels, unlabelled = toy()
     config = TOY.model_copy(update={"members": 3, "steps": 4, "diversity": diversity, "diversity_weight": 0.5})
-    steps = [(step, losses.numbers()) for step, losses in Training(observations, labels, unlabelled, config, 0).steps()]
+    steps = [
+        (step, losses.numbers())
+        for step, losses in EnsembleTraining(observations, labels, unlabelled, config, 0).steps()
+    ]
     assert [step for step, _ in steps] == [1, 2, 3, 4]
     for _, numbers in steps:
         assert numbers["loss"] == pytest.approx(3 * numbers["labelled"] + 0.5 * numbers["diversity"], rel=1e-5)
@@ -135,7 +138,7 @@ def test_a_look_leaves_no_trace(schedule: str) -> None:
     """
     observations, labels, unlabelled = toy()
     config = TOY.model_copy(update={"steps": 6, "schedule": schedule})
-    training = Training(observations, labels, unlabelled, config, 0)
+    training = EnsembleTraining(observations, labels, unlabelled, config, 0)
     looked = []
     for _ in training.steps():
         training.ensemble.predict(unlabelled)

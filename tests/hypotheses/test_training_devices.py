@@ -9,7 +9,7 @@ from far_device import FAR, FarTensor, far_device
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.training import Training, train
+from hypogoal.hypotheses.training import EnsembleTraining, train
 from hypogoal.options.termination import learned_terminations
 
 SHAPE = (41, 41, 3)
@@ -35,14 +35,14 @@ def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPat
     arguments = (images[:60], labels, images[60:], config, 1)
     near = train(*arguments)
     with far_device(monkeypatch):
-        training = Training(*arguments, device=FAR)
+        training = EnsembleTraining(*arguments, device=FAR)
         for _ in training.steps():
             snapshot = training.snapshot()
         far = training.ensemble
         assert all(isinstance(weight, FarTensor) for weight in far.parameters())
         state = far.state()
         np.testing.assert_allclose(far.log_odds(images), near.log_odds(images), atol=1e-6)  # in batches of other sizes
-        finished = Training(*arguments, device=FAR, saved=snapshot)
+        finished = EnsembleTraining(*arguments, device=FAR, saved=snapshot)
         assert list(finished.steps()) == []
         again = finished.ensemble
     for name, value in near.state().items():
