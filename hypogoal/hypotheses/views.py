@@ -161,8 +161,8 @@ def saved_view(observation_shape: Shape, config: Mapping[str, Any]) -> View:
     """The view that the settings ask for, before it has learned, to load what it learned into."""
     if config.get("view", FULL) != FULL:
         return own_view(config["view"], config["view_settings"], observation_shape)
-    no_states = np.zeros((0, *observation_shape), type_of(config["observation_dtype"]))
-    return full_view(no_states)
+    one_state = np.zeros((1, *observation_shape), type_of(config["observation_dtype"]))
+    return full_view(one_state)
 
 
 def view_of(
