@@ -284,6 +284,21 @@ class Dataset:
         """The held-out states of one sub-goal with their true labels, for evaluation only."""
         return self._states("heldout", sub_goal)
 
+    def all_heldout(self) -> dict[str, States]:
+        """The held-out states of every sub-goal; one array of those that the file holds once."""
+        import h5py
+
+        read: dict[int, Observations] = {}
+        states = {}
+        with reading(self.path) as file:
+            for sub_goal in self.sub_goals:
+                group = file[f"heldout/{sub_goal}"]
+                place = h5py.h5o.get_info(group["observations"].id).addr
+                if place not in read:
+                    read[place] = self._observations(group)
+                states[sub_goal] = States(read[place], _labels(group), _origins(group))
+        return states
+
     def unlabelled(self) -> Observations:
         """The unlabelled states: uint8 or float32 (M, *obs)."""
         return self.unlabelled_states().observations

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -41,20 +42,28 @@ def allowed(wanted: int) -> int:
     return min(wanted, int(os.environ.get(CORES, wanted))) if wanted else cores()
 
 
-def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
+def in_processes(
+    tasks: Sequence[Callable[[], T]],
+    workers: int,
+    done: Callable[[int, T], None],
+    *,
+    forked: bool = False,
+) -> None:
     """Run tasks, ``workers`` at once; ``done`` gets each task's number and result.
 
     One at once runs in this process, and so do all in a process that may not have others, as those of a ``Pool``. In
     other processes tasks and results must be picklable. If a task fails, or at Ctrl-C, running ones are ended.
+
+    Processes are spawned, and import what they need, for some 3 s each: a fork copies the caller's locks, and CUDA does
+    not survive it. ``forked`` is for tasks that need neither; it holds on Linux only.
     """
     if min(workers, len(tasks)) <= 1 or multiprocessing.current_process().daemon:
         for number, task in enumerate(tasks):
             done(number, task())
         return
     others = set(multiprocessing.active_children())
-    # Spawned, not forked: a fork would copy the caller's threads and locks.
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (own_code.environment(),))
+    context = multiprocessing.get_context("fork" if forked and sys.platform == "linux" else "spawn")
+    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _begin, (own_code.environment(),))
     try:
         futures = {pool.submit(_run, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):

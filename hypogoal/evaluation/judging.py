@@ -15,37 +15,35 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.processes import in_processes, prepare
 from hypogoal.core.progress import Progress
 from hypogoal.data import States, open_dataset
-from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.names import places_of
 from hypogoal.evaluation.run import Contents, most_used
-from hypogoal.observations import Observations, fields_of
+from hypogoal.observations import Observations
 
 if TYPE_CHECKING:
     from hypogoal.hypotheses.ensemble import Ensemble
 
-# Bytes of states times members from which on more processes pay for their start (3 s): about 100 s of Montezuma's.
-SPREAD_FROM = 4e9
+SPREAD_FROM = 4e9  # bytes of states times members from which on more processes pay where each starts in 3 s
 WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"}  # values of the origin ``seen``
 
 
 class Case(NamedTuple):
-    """One sub-goal's ensemble and the data file that it is judged on."""
+    """An ensemble artefact and the data file that it is judged on."""
 
     data: Path
-    sub_goal: str
     ensemble: Path
     config: dict[str, Any]
 
-    def read(self) -> Ensemble:
-        """The ensemble."""
+    def read(self, sub_goal: str) -> Ensemble:
+        """The ensemble of a sub-goal."""
         from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report does not need
 
-        return read_ensemble(self.ensemble, self.config, self.sub_goal)
+        return read_ensemble(self.ensemble, self.config, sub_goal)
 
 
 class Judged(NamedTuple):
     """What K members say of N held-out and M unlabelled states."""
 
+    split: States  # the held-out states' labels and origins, without the states
     probabilities: NDArray[np.float32]  # (N, K), that the sub-goal is reached
     predictions: NDArray[np.bool_]  # (N, K), each at its member's own threshold
     unlabelled: NDArray[np.bool_]  # (M, K), the predictions on unlabelled states
@@ -54,38 +52,17 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """A case with its states and what the members say of them."""
+    """What the members of one sub-goal say."""
 
-    number: int  # the ensemble's, among those of the run
-    case: Case  # the sub-goal's ensemble and its data
-    split: States  # N held-out states
-    unlabelled: Observations  # of M states
-    domain: Domain | None  # None where it is not installed here
-    judged: Judged  # what K members say
+    number: int  # the ensemble artefact's, among those of the run
+    case: Case
+    sub_goal: str
+    judged: Judged
 
-    def see(self, ensemble: Ensemble, states: NDArray[np.int64]) -> tuple[Any, Any]:
-        """What an ensemble sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
-        from hypogoal.hypotheses.deep_lift import mean_state
-
-        return ensemble.see(self.split.observations[states]), mean_state(ensemble.see(self.unlabelled))
-
-    def write_states(self, group: Any, states: NDArray[np.int64]) -> list[str]:
-        """Put held-out states (n,) and what members predict of them into ``group``; returns where they are from.
-
-        ``observations`` and ``labels`` (n,), ``probabilities`` and ``predictions`` (n, K).
-        """
-        for name, part in parts_of(self.split.observations[states], "observations"):
-            group[name] = part
-        group["probabilities"] = self.judged.probabilities[states]
-        group["predictions"] = self.judged.predictions[states]
-        group["labels"] = self.split.labels[states]
-        return [place_of(self.split.origins, state) for state in states]
-
-
-def parts_of(observations: Observations, name: str) -> Iterator[tuple[str, Observations]]:
-    """Observations (n, ...) under their name; mixed ones by key, ``name/key``."""
-    for key in fields_of(observations.shape[1:], observations.dtype):
-        yield (f"{name}/{key}", observations[key]) if key else (name, observations)
+    @property
+    def split(self) -> States:
+        """The held-out states' labels and origins."""
+        return self.judged.split
 
 
 def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:
@@ -120,18 +97,15 @@ class Work:
 
     def place_of(self, judgement: Judgement) -> dict[str, Any]:
         """Where the numbers of a sub-goal's members stand."""
-        return {**self.place(self.contents.ensembles[judgement.number]), "sub_goal": judgement.case.sub_goal}
+        return {**self.place(self.contents.ensembles[judgement.number]), "sub_goal": judgement.sub_goal}
 
 
 def cases_of(ensembles: Sequence[Artefact]) -> list[tuple[int, Case]]:
-    """Every sub-goal of every ensemble with the ensemble's number, those on the same states one after another."""
-    cases = [
-        (number, Case(artefact.input("data"), sub_goal, artefact.path, artefact.config))
-        for number, artefact in enumerate(ensembles)
-        for sub_goal in artefact.config["sub_goals"]
-    ]
-    order = {path: open_dataset(path).sub_goals for path in {case.data for _, case in cases}}
-    return sorted(cases, key=lambda item: (item[1].data, order[item[1].data].index(item[1].sub_goal)))
+    """Every ensemble with its number, those on the same states one after another."""
+    cases = []
+    for number, artefact in enumerate(ensembles):
+        cases.append((number, Case(artefact.input("data"), artefact.path, artefact.config)))
+    return sorted(cases, key=lambda numbered: numbered[1].data)
 
 
 def processes_for(cases: Sequence[Case], cores: int) -> int:
@@ -140,44 +114,61 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
     for case in cases:
         dataset = open_dataset(case.data)
         counts = dataset.counts()
-        states = counts["heldout"][case.sub_goal]["states"] + counts["unlabelled"]
-        work += case.config["members"] * states * dataset.observation_bytes
+        for sub_goal in case.config["sub_goals"]:
+            states = counts["heldout"][sub_goal]["states"] + counts["unlabelled"]
+            work += case.config["members"] * states * dataset.observation_bytes
     return min(cores, len(cases)) if work >= SPREAD_FROM else 1
 
 
 def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[], None]) -> Iterator[Judgement]:
-    """Every case judged, ``workers`` processes at once, one after another with its states: the same for any number.
+    """Every sub-goal of every case judged, ``workers`` processes at once: the same for any number.
 
     Cases, each with its ensemble's number, come with those on the same states one after another, since each process
     keeps the last ones that it read. ``done`` is called as soon as one of them is judged.
     """
-    judged: dict[int, Judged] = {}
+    judged: dict[int, dict[str, Judged]] = {}
 
-    def keep(index: int, result: Judged) -> None:
+    def keep(index: int, result: dict[str, Judged]) -> None:
         judged[index] = result
         done()
 
-    in_processes([partial(judge, case) for _, case in cases], workers, keep)
+    if workers > 1:
+        in_processes([partial(judge, case) for _, case in cases], workers, keep, forked=True)
     for index, (number, case) in enumerate(cases):
-        split, unlabelled = states_of(case.data, case.sub_goal)
-        domain = installed_domain(open_dataset(case.data).domain)
-        yield Judgement(number, case, split, unlabelled, domain, judged.pop(index))
+        if workers == 1:
+            keep(index, judge(case))
+        for sub_goal, of_goal in judged.pop(index).items():
+            yield Judgement(number, case, sub_goal, of_goal)
     states_of.cache_clear()
 
 
-def judge(case: Case) -> Judged:
-    """What the members of one case say."""
+def judge(case: Case) -> dict[str, Judged]:
+    """What the members of each sub-goal say."""
+    from hypogoal.hypotheses.ensemble import together
+
     prepare()
-    split, unlabelled = states_of(case.data, case.sub_goal)
-    ensemble = case.read()
-    thresholds = ensemble.thresholds.numpy()
-    probabilities = ensemble.predict(split.observations)
-    unlabelled_predictions = ensemble.predict(unlabelled)
-    return Judged(probabilities, probabilities > thresholds, unlabelled_predictions > thresholds, thresholds)
+    heldout, unlabelled = states_of(case.data)
+    sub_goals = case.config["sub_goals"]
+    ensembles = [case.read(sub_goal) for sub_goal in sub_goals]
+    observations = [heldout[sub_goal].observations for sub_goal in sub_goals]
+    every = together(ensembles)
+    if every is not None and all(each is observations[0] for each in observations):
+        on_heldout = np.split(every.predict(observations[0]), len(ensembles), axis=1)
+        on_unlabelled = np.split(every.predict(unlabelled), len(ensembles), axis=1)
+    else:
+        on_heldout = [ensemble.predict(each) for ensemble, each in zip(ensembles, observations, strict=True)]
+        on_unlabelled = [ensemble.predict(unlabelled) for ensemble in ensembles]
+    judged = {}
+    for sub_goal, ensemble, probabilities, others in zip(sub_goals, ensembles, on_heldout, on_unlabelled, strict=True):
+        states = heldout[sub_goal]
+        split = States(states.observations[:0].copy(), states.labels, states.origins)
+        above = ensemble.thresholds.numpy()
+        judged[sub_goal] = Judged(split, probabilities, probabilities > above, others > above, above)
+    return judged
 
 
 @lru_cache(maxsize=1)
-def states_of(data: Path, sub_goal: str) -> tuple[States, Observations]:
-    """A sub-goal's held-out states and the unlabelled ones: the largest things here, read once for all ensembles."""
+def states_of(data: Path) -> tuple[dict[str, States], Observations]:
+    """Every sub-goal's held-out states, and the unlabelled ones: the largest things here, read once for all."""
     dataset = open_dataset(data)
-    return dataset.heldout(sub_goal), dataset.unlabelled()
+    return dataset.all_heldout(), dataset.unlabelled()

@@ -61,7 +61,9 @@ def find(run: Path) -> Contents:
     None, or a damaged one, is a ``UserError``.
     """
     metas, learned = find_artefacts(run, "meta"), find_artefacts(run, "options")
-    inputs = [artefact.place_of(entry) for artefact in metas for entry in artefact.manifest.inputs]
+    inputs: list[Path] = []
+    for artefact in metas:
+        inputs += map(artefact.place_of, artefact.manifest.inputs)
     continued = [artefact for artefact in learned if artefact.path.resolve() in inputs]
     ladders: list[Artefact] = []
     silent: list[Artefact] = []

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.house import tidy_members
-from hypogoal.evaluation.judging import Judgement, Work
+from hypogoal.evaluation.judging import Judgement, Work, place_of, states_of
 from hypogoal.evaluation.page import Drawn, Results, picture
 from hypogoal.evaluation.pictures import SIGNED, attribution_image, coloured
 from hypogoal.evaluation.plots import legend_below, panels, plot, styled
@@ -34,72 +34,76 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
     numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
     """
-    if judgement.number != work.browsed or not len(judgement.split.labels):
+    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, mean_state, method_of
+
+    case, sub_goal, split = judgement.case, judgement.sub_goal, judgement.split
+    if judgement.number != work.browsed or not len(split.labels):
         return
     place = work.place_of(judgement)
     looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})
-    group = work.arrays.create_group(f"saliency/{judgement.case.sub_goal}")
-    is_of_pictures = judgement.split.observations.dtype == PICTURE
-    facts, attributions, values = (_look_at_states if is_of_pictures else _look_at_numbers)(group, judgement)
+    group = work.arrays.create_group(f"saliency/{sub_goal}")
+    dataset, ensemble = open_dataset(case.data), case.read(sub_goal)
+    heldout, unlabelled = states_of(case.data)
+    observations = heldout[sub_goal].observations
+    if dataset.observation_dtype == PICTURE:
+        kinds, states = states_to_show(judgement)
+        few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
+        explained = states[: max(len(kinds), few // len(case.config["sub_goals"]))]
+    else:
+        kinds, explained = [], spread_rows(len(split.labels), AVERAGED)
+    seen = ensemble.see(observations[explained])
+    attributions = attributed(ensemble, seen, mean_state(ensemble.see(unlabelled)))
     error = attributions.completeness_error()
-    facts |= {"how": attributions.method, "completeness_error": float(error.max())}
-    looked_at["sub_goals"][judgement.case.sub_goal] = facts
+    facts = {"kinds": kinds, "how": attributions.method, "completeness_error": float(error.max())}
+    looked_at["sub_goals"][sub_goal] = facts
+    if dataset.observation_dtype == PICTURE:
+        values: NDArray[np.floating] = attributions.values
+        default = 3 if dataset.observation_shape[-1] == 3 else 1
+        facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
+        facts["places"] = [place_of(split.origins, state) for state in states]
+        shown = {
+            "observations": observations[states],
+            "labels": split.labels[states],
+            "probabilities": judgement.judged.probabilities[states],
+            "predictions": judgement.judged.predictions[states],
+            "seen": seen,
+        }
+        for name, array in shown.items():
+            group[name] = array
+    else:
+        values = of_features(attributions.values.reshape(*error.shape, -1), seen.dtype)
+        facts["features"] = dataset.features()
     group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
-    for row, kind in enumerate(facts["kinds"]):
+    for row, kind in enumerate(kinds):
         columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
         yield tidy_members(columns, **place, scope=f"state: {kind}")
 
 
-def _look_at_states(group: Any, judgement: Judgement) -> tuple[dict[str, Any], Any, NDArray[np.floating]]:
-    """States to look through, those of the figures first, of which the first are explained."""
-    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, method_of
-
+def states_to_show(judgement: Judgement) -> tuple[list[str], NDArray[np.int64]]:
+    """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
     split, judged = judgement.split, judgement.judged
-    sub_goals = len(judgement.case.config["sub_goals"])
     unseen = split.origins.get("seen", np.zeros(len(split.labels))) == 0
     allowed = unseen if split.labels[unseen].any() else np.ones_like(unseen)
     kinds = pick_to_explain(judged.probabilities, judged.predictions, split.labels, allowed)
     places = {name: split.origins[name] for name in PLACES if name in split.origins}
-    rng = rng_for(0, "browse", judgement.case.sub_goal)
+    rng = rng_for(0, "browse", judgement.sub_goal)
     browsed = pick_for_gallery(judged.predictions, split.labels, places, rng)
-    states = pd.unique(np.array([*kinds.values(), *browsed]))[: GALLERY // sub_goals]
-    ensemble = judgement.case.read()
-    few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
-    seen, baseline = judgement.see(ensemble, states[: max(len(kinds), few // sub_goals)])
-    attributions = attributed(ensemble, seen, baseline)
-    group["seen"] = seen
-    facts = {
-        "kinds": [*kinds],
-        "places": judgement.write_states(group, states),
-        "colours": _colours(judgement),
-    }
-    return facts, attributions, attributions.values
+    states = pd.unique(np.array([*kinds.values(), *browsed]))
+    return [*kinds], states[: GALLERY // len(judgement.case.config["sub_goals"])]
 
 
-def _colours(judgement: Judgement) -> int:
-    """How many channels each frame of a stack has."""
-    dataset = open_dataset(judgement.case.data)
-    default = 3 if dataset.observation_shape[-1] == 3 else 1
-    return dataset.channels.get("", (1, default))[1]
+def of_features(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[np.floating]:
+    """Attributions (n, K, D) to each number; of mixed observations those to a picture are added up."""
+    from hypogoal.hypotheses.deep_lift import by_key
 
-
-def _look_at_numbers(group: Any, judgement: Judgement) -> tuple[dict[str, Any], Any, NDArray[np.floating]]:
-    """Attributions to each number, and to each picture as a whole, of states that are spread over all."""
-    from hypogoal.hypotheses.deep_lift import attributed, by_key
-
-    ensemble = judgement.case.read()
-    states = spread_rows(len(judgement.split.labels), AVERAGED)
-    seen, baseline = judgement.see(ensemble, states)
-    attributions = attributed(ensemble, seen, baseline)
-    values = attributions.values.reshape(*attributions.log_odds.shape, -1)
-    if seen.dtype.names:
-        of_keys = by_key(values, seen.dtype)
-        features = []
-        for key, (dtype, _) in fields_of((), seen.dtype).items():
-            flat = of_keys[key].reshape(*values.shape[:2], -1)
-            features.append(flat.sum(axis=-1, keepdims=True) if dtype == PICTURE else flat)
-        values = np.concatenate(features, axis=-1)
-    return {"kinds": [], "features": open_dataset(judgement.case.data).features()}, attributions, values
+    if not dtype.names:
+        return values
+    of_keys = by_key(values, dtype)
+    features = []
+    for key, (kind, _) in fields_of((), dtype).items():
+        flat = of_keys[key].reshape(*values.shape[:2], -1)
+        features.append(flat.sum(axis=-1, keepdims=True) if kind == PICTURE else flat)
+    return np.concatenate(features, axis=-1)
 
 
 def pick_to_explain(
@@ -220,13 +224,13 @@ def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
 def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
     says = state["predictions"][member]
     wrong = "" if says == state["labels"] else ", wrong"
-    return f"member {member}: {'positive' if says else 'negative'} {state['probabilities'][member]:.2f}{wrong}"
+    return f"member {member}\n{'positive' if says else 'negative'} {state['probabilities'][member]:.2f}{wrong}"
 
 
 def attributions_of_members(state: Mapping[str, NDArray[Any]], colours: int) -> Figure:
     """Figure 2: a state and what each member goes by in it; of a stack of frames the last."""
     truth = "positive" if state["labels"] else "negative"
-    shown = [(coloured(state["observations"], colours), f"truth: {truth}")]
+    shown = [(coloured(state["observations"], colours), f"truth\n{truth}")]
     for member, values in enumerate(state["attributions"]):
         shown.append((attribution_image(values, state["seen"], colours), _said(state, member)))
     return panels(shown, min(4, len(shown)), SIGNED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -252,6 +252,19 @@ class Ensemble(nn.Module):
             return cls(network, observation_shape, members, torch.Generator(), view)
 
         return load_fitting(make, state, where).eval()
+
+
+def together(ensembles: Sequence[Ensemble]) -> Ensemble | None:
+    """All members of ensembles with one network as one, in order; None unless all see whole pictures."""
+    first = ensembles[0]
+    if any(type(each.view) is not FullView or each.view.standard is not None for each in ensembles):
+        return None
+    every = Ensemble(first.network, first.observation_shape, 0, torch.Generator(), first.view)
+    for each in ensembles:
+        every.members.extend(each.members)
+        every.networks += each.networks
+    every.thresholds = torch.cat([each.thresholds for each in ensembles])
+    return every.eval()
 
 
 def write_ensemble(

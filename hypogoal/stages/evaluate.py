@@ -53,7 +53,9 @@ def evaluate(
         for path in trained:
             open_artefact(path)  # refuses changed files
         times = 1 + len(played)
-        parts = 2 * len(cases) + len(contents.ladders) + times * len(contents.agents)
+        parts = len(contents.ladders) + times * len(contents.agents)
+        for _, case in cases:
+            parts += 1 + len(case.config["sub_goals"])
         with (
             create_hdf5(draft.files / "arrays.h5") as arrays,
             Progress("evaluate", total=parts, quiet=call.quiet) as progress,
