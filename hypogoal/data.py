@@ -286,18 +286,8 @@ class Dataset:
 
     def all_heldout(self) -> dict[str, States]:
         """The held-out states of every sub-goal; one array of those that the file holds once."""
-        import h5py
-
         read: dict[int, Observations] = {}
-        states = {}
-        with reading(self.path) as file:
-            for sub_goal in self.sub_goals:
-                group = file[f"heldout/{sub_goal}"]
-                place = h5py.h5o.get_info(group["observations"].id).addr
-                if place not in read:
-                    read[place] = self._observations(group)
-                states[sub_goal] = States(read[place], _labels(group), _origins(group))
-        return states
+        return {sub_goal: self._states("heldout", sub_goal, read) for sub_goal in self.sub_goals}
 
     def unlabelled(self) -> Observations:
         """The unlabelled states: uint8 or float32 (M, *obs)."""
@@ -318,8 +308,14 @@ class Dataset:
                     counts[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
             return counts
 
-    def _states(self, split: str, sub_goal: str = "") -> States:
-        """The states of a split; what is not as the root's attributes say is a ``UserError``."""
+    def _states(self, split: str, sub_goal: str = "", read: dict[int, Observations] | None = None) -> States:
+        """The states of a split; what is not as the root's attributes say is a ``UserError``.
+
+        ``read``, by where they lie in the file: observations that need not be read again.
+        """
+        import h5py
+
+        read = {} if read is None else read
         if sub_goal not in ("", *self.sub_goals):
             goals = ", ".join(self.sub_goals)
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {goals}.")
@@ -329,7 +325,10 @@ class Dataset:
             has_shape = data.shape[1:] == self.observation_shape
             if not has_shape or data.dtype != self.observation_dtype:
                 raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
-            values = data[()]
+            place = h5py.h5o.get_info(data.id).addr
+            if place not in read:
+                read[place] = data[()]
+            values = read[place]
             if not np.isfinite(numbers_of(values)).all():
                 raise ValueError(f"{data.name} has numbers that are not finite")
             labels = np.zeros((len(values), 0), np.bool_)

@@ -1,4 +1,4 @@
-"""A page in a real browser: headless Chromium loads it, runs a script in it, and gives the document it ends with."""
+"""A page in a real browser: headless Chromium loads it and runs a script in it."""
 
 import html
 import os
@@ -24,39 +24,18 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-def document_of(page: Path, fragment: str, folder: Path, script: str = "") -> str:
-    """The document after loading ``page#fragment``.
+def run_in(page: Path, script: str, folder: Path) -> tuple[str, list[str]]:
+    """What a script at the end of a page makes its title, and the browser's lines: errors, what the policy blocked.
 
-    Args:
-        page: an HTML file.
-        fragment: what follows the ``#`` of the address.
-        folder: of the test's own, for the browser's profile and a copy of the page.
-        script: run at the end of the page, whose policy is told so; what it puts into ``document.title`` is the copy's
-            title.
+    The page's policy is told of the script. ``folder``, of the test's own, is for the browser.
     """
+    assert CHROMIUM is not None
     digest = b64encode(sha256(script.encode()).digest()).decode()
     text = page.read_text(encoding="utf-8").replace("script-src ", f"script-src 'sha256-{digest}' ", 1)
-    return loaded(text.replace("</body>", f"<script>{script}</script></body>"), folder, fragment)[0]
-
-
-def loaded(text: str, folder: Path, fragment: str = "") -> tuple[str, list[str]]:
-    """The document that a page of this text becomes, and the browser's lines on it: errors, what a policy blocked."""
-    assert CHROMIUM is not None
     copy = folder / "page.html"
-    copy.write_text(text, encoding="utf-8")
-    command = [
-        CHROMIUM,
-        *SWITCHES,
-        f"--user-data-dir={folder / 'profile'}",
-        "--dump-dom",
-        f"{copy.as_uri()}#{fragment}",
-    ]
+    copy.write_text(text.replace("</body>", f"<script>{script}</script></body>"), encoding="utf-8")
+    command = [CHROMIUM, *SWITCHES, f"--user-data-dir={folder / 'profile'}", "--dump-dom", copy.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    return done.stdout, [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
-
-
-def title_of(document: str) -> str:
-    """What the script reported."""
-    found = re.search(r"<title>(.*?)</title>", document, re.S)
-    assert found
-    return html.unescape(found[1])
+    title = re.search(r"<title>(.*?)</title>", done.stdout, re.S)
+    assert title
+    return html.unescape(title[1]), [line for line in done.stderr.splitlines() if ":CONSOLE" in line]

@@ -6,7 +6,7 @@ Every sentence is in ``templates/``; a question gives its template what it compu
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,11 @@ class Drawn:
     label: str  # what it shows
     figure: Figure
     about: Mapping[str, Any] = field(default_factory=dict)  # for its caption
+
+    @cached_property
+    def svg(self) -> bytes:
+        """Its file."""
+        return to_file(self.figure, "svg")
 
 
 @dataclass(frozen=True)
@@ -225,7 +230,7 @@ def source(data: bytes, kind: str) -> str:
 
 def svg(drawn: Drawn) -> str:
     """A figure as the source of an ``img``."""
-    return source(to_file(drawn.figure, "svg"), "svg+xml")
+    return source(drawn.svg, "svg+xml")
 
 
 def packaged(name: str) -> str:

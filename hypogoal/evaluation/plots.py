@@ -106,7 +106,7 @@ def panels(
     Each picture has a scale of its own, so the key has no numbers.
     """
     with styled():
-        figure, places = pictures(-(-len(shown) // columns), columns)
+        figure, places = pictures(-(-len(shown) // columns), columns, titles=0.5)
         for place, (image, title) in zip(places, shown, strict=False):
             show_picture(place, image, title)
         key = ScalarMappable(Normalize(-1, 1), signed)

@@ -13,24 +13,17 @@ from hypogoal.evaluation.page import DASH, Results
 from hypogoal.evaluation.run import Contents
 
 TITLE = "Data, settings, provenance"
+KEPT = {"kind", "seed", "config", "inputs", "command", "versions"}  # of a manifest
+VARYING = ("layout_seed", "start")  # settings that the paths tell
+ARTEFACTS = ["path", "kind", "command", "seed"]  # columns
+DATA = ["data", "sub-goal", "labelled", "positive", "unlabelled", "held-out", "positive there"]
 
 
 def provenance(contents: Contents, data: Sequence[Path]) -> dict[str, Any]:
     """Spec A8: what everything was made from and with."""
     artefacts = []
     for artefact in (*contents.everything(), *contents.continued):
-        manifest = artefact.manifest
-        artefacts.append(
-            {
-                "path": contents.name(artefact),
-                "kind": artefact.kind,
-                "seed": artefact.seed,
-                "config": artefact.config,
-                "inputs": [entry.model_dump() for entry in manifest.inputs],
-                "command": manifest.command,
-                "versions": manifest.versions,
-            }
-        )
+        artefacts.append({"path": contents.name(artefact)} | artefact.manifest.model_dump(include=KEPT))
     collected = []
     for path in data:
         dataset = open_dataset(path)
@@ -42,9 +35,9 @@ def provenance(contents: Contents, data: Sequence[Path]) -> dict[str, Any]:
 def domains_of(facts: Mapping[str, Any]) -> list[str]:
     """The domains of a run's data and artefacts."""
     recorded = facts["provenance"]
-    named = [data["domain"] for data in recorded["data"]]
-    named += [artefact["config"]["domain"] for artefact in recorded["artefacts"] if "domain" in artefact["config"]]
-    return sorted(set(named))
+    named = {data["domain"] for data in recorded["data"]}
+    named |= {artefact["config"].get("domain") for artefact in recorded["artefacts"]}
+    return sorted(named - {None})
 
 
 def context(results: Results) -> dict[str, Any]:
@@ -55,37 +48,25 @@ def context(results: Results) -> dict[str, Any]:
         counts = data["counts"]
         for sub_goal, labelled in counts["labelled"].items():
             heldout = counts["heldout"][sub_goal]
-            numbers = (labelled["states"], labelled["positives"], counts["unlabelled"], heldout["states"])
-            rows.append([data["path"], sub_goal, *(f"{number:,}" for number in (*numbers, heldout["positives"]))])
-    titles = ["data", "sub-goal", "labelled", "positive", "unlabelled", "held-out", "positive there"]
-    data = pd.DataFrame(rows, columns=titles).set_index(titles[:2])
-    artefacts = pd.DataFrame(
-        {
-            "artefact": [artefact["path"] for artefact in recorded["artefacts"]],
-            "kind": [artefact["kind"] for artefact in recorded["artefacts"]],
-            "command": [shlex.join(artefact["command"]) or DASH for artefact in recorded["artefacts"]],
-            "seed": [str(artefact["seed"]) for artefact in recorded["artefacts"]],
-        }
-    )
-    versions = sorted({pair for artefact in recorded["artefacts"] for pair in artefact["versions"].items()})
-    settings = [(f"{each['path']} ({each['domain']})", each["config"]) for each in recorded["data"]]
-    settings += [(f"{each['path']} ({each['kind']})", each["config"]) for each in _of_each_kind(recorded["artefacts"])]
+            numbers = (labelled["states"], labelled["positives"], counts["unlabelled"], *heldout.values())
+            rows.append([data["path"], sub_goal, *numbers])
+    states = pd.DataFrame(rows, columns=DATA).set_index(DATA[:2])
+    artefacts = pd.DataFrame(recorded["artefacts"], columns=ARTEFACTS)
+    artefacts["command"] = artefacts["command"].map(shlex.join).replace("", DASH)
+    configs = {f"{data['path']} ({data['domain']})": data["config"] for data in recorded["data"]}
+    versions: set[tuple[str, str]] = set()
+    for artefact in recorded["artefacts"]:
+        configs[f"{artefact['path']} ({artefact['kind']})"] = artefact["config"]
+        versions.update(artefact["versions"].items())
+    settings: dict[str, dict[str, str]] = {}
+    listed: set[tuple[str, str]] = set()
+    for name, config in configs.items():
+        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in config.items()}
+        settings[name] = {key: text for key, text in texts.items() if key not in VARYING and (key, text) not in listed}
+        listed.update(texts.items())
     return {
-        "data": data,
-        "artefacts": artefacts.set_index(["artefact", "kind", "command", "seed"]),
-        "versions": versions,
-        "settings": [(name, _lines(config)) for name, config in settings],
+        "data": states.map("{:,}".format),
+        "artefacts": artefacts.set_index(ARTEFACTS),
+        "versions": sorted(versions),
+        "settings": settings,
     }
-
-
-def _of_each_kind(artefacts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The first artefact of those whose settings are alike but for their layout and start."""
-    first: dict[str, dict[str, Any]] = {}
-    for artefact in artefacts:
-        varying = {key: value for key, value in artefact["config"].items() if key not in ("layout_seed", "start")}
-        first.setdefault(json.dumps([artefact["kind"], varying], sort_keys=True), artefact)
-    return [*first.values()]
-
-
-def _lines(config: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(key, value if isinstance(value, str) else json.dumps(value)) for key, value in config.items()]

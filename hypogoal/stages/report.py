@@ -24,8 +24,8 @@ def report(
 ) -> Done:
     """Draw the report of an evaluated run: one HTML file.
 
-    ``out`` gets the page ``index.html``, ``figures/*.svg``, ``figures/*.png`` and, of so many ``videos``, which the
-    first agent of the run plays, ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.
+    ``out`` gets the page ``index.html``, ``figures/*.svg`` and, of so many ``videos``, which the first agent of the run
+    plays, ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.
     """
     if figures is not None:
         from hypogoal.evaluation.figure_files import draw_figures
@@ -39,7 +39,6 @@ def report(
 
     from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
     from hypogoal.evaluation.page import source
-    from hypogoal.evaluation.plots import to_file
     from hypogoal.evaluation.questions import answers, render
     from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation, with_missing
 
@@ -68,9 +67,8 @@ def report(
         pictures.mkdir()
         for each in every:
             for drawn in each.context["figures"]:
-                for kind in ("svg", "png"):
-                    path = pictures / f"{drawn.name}.{kind}"
-                    path.write_bytes(to_file(drawn.figure, kind))
+                path = pictures / f"{drawn.name}.svg"
+                path.write_bytes(drawn.svg)
         moving = draft.files / "videos"
         for film in films:
             moving.mkdir(exist_ok=True)

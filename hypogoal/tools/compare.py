@@ -6,7 +6,7 @@ from pathlib import Path
 from hypogoal.core.artefacts import create
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation import compare as beside
-from hypogoal.evaluation.plots import slug, to_file
+from hypogoal.evaluation.plots import slug
 from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
 
 
@@ -44,5 +44,5 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
         folder.mkdir()
         for drawn in figures:
             path = folder / f"{slug(drawn.name)}.svg"
-            path.write_bytes(to_file(drawn.figure, "svg"))
+            path.write_bytes(drawn.svg)
     return out / "index.html"

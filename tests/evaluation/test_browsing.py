@@ -1,8 +1,11 @@
 """Spec F2, F6, F7: which states are browsed, and how they and their attributions become small pictures."""
 
 import io
+import json
 
 import numpy as np
+import pytest
+from browser import needs_browser, run_in
 from PIL import Image
 
 from hypogoal.evaluation.pictures import attribution_image, coloured, encoded, last_frame
@@ -54,3 +57,24 @@ def test_pictures_on_the_page_are_the_same_pixels_and_large_ones_reduced():
     reduced = np.asarray(Image.open(io.BytesIO(encoded(image)))).astype(float)
     assert reduced.shape == (100, 86, 3)
     np.testing.assert_allclose(reduced[1, 2], image[3:6, 6:9].mean((0, 1)), atol=1)
+
+
+FILTER = """
+const goals = document.querySelector("select[data-filter=goal]");
+goals.value = "open-red-door";
+goals.dispatchEvent(new Event("change"));
+const states = [...document.querySelectorAll(".gallery li")];
+const shown = states.filter((state) => !state.hidden).map((state) => state.dataset.goal);
+document.title = JSON.stringify([shown, states.length, document.querySelector("[role=status]").textContent]);
+"""
+
+
+@pytest.mark.browser
+@needs_browser
+def test_the_filters_of_the_gallery(tiny_run, tmp_path):
+    """Spec F2: states of the chosen sub-goal alone are left, and counted; the policy lets the page's own script run."""
+    title, complaints = run_in(tiny_run / "report" / "index.html", FILTER, tmp_path)
+    shown, states, count = json.loads(title)
+    assert complaints == []
+    assert {*shown} == {"open-red-door"} and len(shown) < states
+    assert count == f"{len(shown)} of {states} states"

