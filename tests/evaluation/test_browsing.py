@@ -8,8 +8,8 @@ import pytest
 from browser import needs_browser, run_in
 from PIL import Image
 
+from hypogoal.evaluation.attributing import pick_for_gallery
 from hypogoal.evaluation.pictures import attribution_image, coloured, encoded, last_frame
-from hypogoal.evaluation.saliency import pick_for_gallery
 
 
 def test_states_on_which_members_disagree_or_err_come_first():

@@ -7,10 +7,10 @@ import torch
 from torch import nn
 
 from hypogoal.data import Collected, States, write_dataset
+from hypogoal.evaluation.attributing import look, pick_to_explain
 from hypogoal.evaluation.house import joined
 from hypogoal.evaluation.judging import Case, Judged, Judgement, Work
 from hypogoal.evaluation.run import Contents
-from hypogoal.evaluation.saliency import look, pick_to_explain
 from hypogoal.hypotheses.deep_lift import (
     DEEP_LIFT,
     INTEGRATED,

@@ -1,0 +1,155 @@
+"""Which held-out states are shown, and attributions of members to them (Spec F2, F6)."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hypogoal.core.seeding import rng_for
+from hypogoal.data import open_dataset
+from hypogoal.evaluation.house import tidy_members
+from hypogoal.evaluation.judging import Judgement, Work, place_of, states_of
+from hypogoal.observations import PICTURE, fields_of, spread_rows
+
+GALLERY = 40  # states of all sub-goals
+EXPLAINED = 20  # of these with attributions: DeepLift takes .05 s for a state and member
+INTEGRATED = 5  # where they are integrated gradients: of a large network seconds
+AVERAGED = 64  # states over which attributions to features are averaged
+PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
+
+
+def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
+    """What members look at in a few held-out states, of the ensemble whose options were learned most often.
+
+    ``saliency/SUB_GOAL`` is written: states with what members predict, ``seen``, what members saw of the first of them,
+    and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
+    numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
+    """
+    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, mean_state, method_of
+
+    case, sub_goal, split = judgement.case, judgement.sub_goal, judgement.split
+    if judgement.number != work.browsed or not len(split.labels):
+        return
+    place = work.place_of(judgement)
+    looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})
+    group = work.arrays.create_group(f"saliency/{sub_goal}")
+    dataset, ensemble = open_dataset(case.data), case.read(sub_goal)
+    heldout, unlabelled = states_of(case.data)
+    observations = heldout[sub_goal].observations
+    if dataset.observation_dtype == PICTURE:
+        kinds, states = states_to_show(judgement)
+        few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
+        explained = states[: max(len(kinds), few // len(case.config["sub_goals"]))]
+    else:
+        kinds, explained = [], spread_rows(len(split.labels), AVERAGED)
+    seen = ensemble.see(observations[explained])
+    attributions = attributed(ensemble, seen, mean_state(ensemble.see(unlabelled)))
+    error = attributions.completeness_error()
+    facts = {"kinds": kinds, "how": attributions.method, "completeness_error": float(error.max())}
+    looked_at["sub_goals"][sub_goal] = facts
+    if dataset.observation_dtype == PICTURE:
+        values: NDArray[np.floating] = attributions.values
+        default = 3 if dataset.observation_shape[-1] == 3 else 1
+        facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
+        facts["places"] = [place_of(split.origins, state) for state in states]
+        shown = {
+            "observations": observations[states],
+            "labels": split.labels[states],
+            "probabilities": judgement.judged.probabilities[states],
+            "predictions": judgement.judged.predictions[states],
+            "seen": seen,
+        }
+        for name, array in shown.items():
+            group[name] = array
+    else:
+        values = of_features(attributions.values.reshape(*error.shape, -1), seen.dtype)
+        facts["features"] = dataset.features()
+    group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
+    for row, kind in enumerate(kinds):
+        columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
+        yield tidy_members(columns, **place, scope=f"state: {kind}")
+
+
+def states_to_show(judgement: Judgement) -> tuple[list[str], NDArray[np.int64]]:
+    """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
+    split, judged = judgement.split, judgement.judged
+    unseen = split.origins.get("seen", np.zeros(len(split.labels))) == 0
+    allowed = unseen if split.labels[unseen].any() else np.ones_like(unseen)
+    kinds = pick_to_explain(judged.probabilities, judged.predictions, split.labels, allowed)
+    places = {name: split.origins[name] for name in PLACES if name in split.origins}
+    rng = rng_for(0, "browse", judgement.sub_goal)
+    browsed = pick_for_gallery(judged.predictions, split.labels, places, rng)
+    states = pd.unique(np.array([*kinds.values(), *browsed]))
+    return [*kinds], states[: GALLERY // len(judgement.case.config["sub_goals"])]
+
+
+def of_features(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[np.floating]:
+    """Attributions (n, K, D) to each number; of mixed observations those to a picture are added up."""
+    from hypogoal.hypotheses.deep_lift import by_key
+
+    if not dtype.names:
+        return values
+    of_keys = by_key(values, dtype)
+    features = []
+    for key, (kind, _) in fields_of((), dtype).items():
+        flat = of_keys[key].reshape(*values.shape[:2], -1)
+        features.append(flat.sum(axis=-1, keepdims=True) if kind == PICTURE else flat)
+    return np.concatenate(features, axis=-1)
+
+
+def pick_to_explain(
+    probabilities: NDArray[np.float32],
+    predictions: NDArray[np.bool_],
+    labels: NDArray[np.bool_],
+    allowed: NDArray[np.bool_],
+) -> dict[str, int]:
+    """Figures 2 and 9: the few of N states, by kind, whose attributions are drawn, no state twice.
+
+    ``true positive``: where most of K members are right and surest on average; ``disagree``: where members differ and
+    their probabilities are furthest apart; ``false positive``: where most err, and are surest. Fewer where none are.
+    """
+    positive = predictions.sum(axis=1)
+    some = positive > 0
+    surest = -(positive + probabilities.mean(axis=1))
+    apart = probabilities.min(axis=1) - probabilities.max(axis=1)
+    candidates = {
+        "true positive": (labels & some, surest),
+        "disagree": (some & ~predictions.all(axis=1), apart),
+        "false positive": (~labels & some, surest),
+    }
+    free = allowed.copy()
+    picked = {}
+    for kind, (of_kind, order) in candidates.items():
+        among = of_kind & free
+        if among.any():
+            picked[kind] = int(np.where(among, order, np.inf).argmin())
+            free[picked[kind]] = False
+    return picked
+
+
+def outcomes(predictions: NDArray[np.bool_], labels: NDArray[np.bool_]) -> NDArray[np.str_]:
+    """Of predictions (n, K) of labels (n,): whether all members are right, all wrong, or they disagree."""
+    errors = (predictions != labels[:, None]).sum(axis=1)
+    return np.select([errors == 0, errors == predictions.shape[1]], ["all right", "all wrong"], "disagree")
+
+
+def pick_for_gallery(
+    predictions: NDArray[np.bool_],
+    labels: NDArray[np.bool_],
+    places: Mapping[str, NDArray[np.int64]],
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """States by how interesting they are, int64 (N,): kinds of outcome take turns, and within each the places.
+
+    Takes predictions (N, K), labels (N,), places (N,) each. States on which all members are right come last; ``rng``
+    draws among states alike.
+    """
+    kinds = pd.DataFrame({"outcome": outcomes(predictions, labels), "label": labels})
+    states = kinds.assign(**places).sample(frac=1, random_state=rng)
+    turn = states.groupby([*states]).cumcount()
+    states = states.assign(turn=turn).sort_values("turn", kind="stable")
+    turn = states.groupby([*kinds]).cumcount()
+    right = states["outcome"] == "all right"
+    return states.assign(turn=turn, right=right).sort_values(["right", "turn"], kind="stable").index.to_numpy()
