@@ -43,10 +43,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def short_evaluations() -> Iterator[None]:
     """Evaluations explain 5 states of the gallery instead of 20, and let agents play a fifth as long."""
-    from hypogoal.evaluation import frozen, saliency
+    from hypogoal.evaluation import attributing, frozen
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(saliency, "EXPLAINED", 5)
+        patch.setattr(attributing, "EXPLAINED", 5)
         patch.setattr(frozen, "STEPS", 200)
         yield
 
