@@ -43,7 +43,6 @@ class Case(NamedTuple):
 class Judged(NamedTuple):
     """What K members say of N held-out and M unlabelled states."""
 
-    split: States  # the held-out states' labels and origins, without the states
     probabilities: NDArray[np.float32]  # (N, K), that the sub-goal is reached
     predictions: NDArray[np.bool_]  # (N, K), each at its member's own threshold
     unlabelled: NDArray[np.bool_]  # (M, K), the predictions on unlabelled states
@@ -57,12 +56,8 @@ class Judgement:
     number: int  # the ensemble artefact's, among those of the run
     case: Case
     sub_goal: str
+    split: States  # the held-out states' labels and origins, without the states
     judged: Judged
-
-    @property
-    def split(self) -> States:
-        """The held-out states' labels and origins."""
-        return self.judged.split
 
 
 def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:
@@ -126,9 +121,9 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
     Cases, each with its ensemble's number, come with those on the same states one after another, since each process
     keeps the last ones that it read. ``done`` is called as soon as one of them is judged.
     """
-    judged: dict[int, dict[str, Judged]] = {}
+    judged: dict[int, dict[str, tuple[States, Judged]]] = {}
 
-    def keep(index: int, result: dict[str, Judged]) -> None:
+    def keep(index: int, result: dict[str, tuple[States, Judged]]) -> None:
         judged[index] = result
         done()
 
@@ -137,13 +132,13 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
     for index, (number, case) in enumerate(cases):
         if workers == 1:
             keep(index, judge(case))
-        for sub_goal, of_goal in judged.pop(index).items():
-            yield Judgement(number, case, sub_goal, of_goal)
+        for sub_goal, (split, of_goal) in judged.pop(index).items():
+            yield Judgement(number, case, sub_goal, split, of_goal)
     states_of.cache_clear()
 
 
-def judge(case: Case) -> dict[str, Judged]:
-    """What the members of each sub-goal say."""
+def judge(case: Case) -> dict[str, tuple[States, Judged]]:
+    """Each sub-goal's held-out labels and origins, and what its members say."""
     from hypogoal.hypotheses.ensemble import together
 
     prepare()
@@ -163,7 +158,7 @@ def judge(case: Case) -> dict[str, Judged]:
         states = heldout[sub_goal]
         split = States(states.observations[:0].copy(), states.labels, states.origins)
         above = ensemble.thresholds.numpy()
-        judged[sub_goal] = Judged(split, probabilities, probabilities > above, others > above, above)
+        judged[sub_goal] = split, Judged(probabilities, probabilities > above, others > above, above)
     return judged
 
 

@@ -50,7 +50,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     yield from rows_by_room(judgement.judged, split.labels, split.origins, place)
     picked = choose(judgement.judged.predictions, split.labels, split.origins["seen"])
     yield tidy(picked, **place, scope=VALIDATION)
-    work.validated[judgement.case.ensemble.resolve(), judgement.case.sub_goal] = picked[VALIDATED]
+    work.validated[judgement.case.ensemble.resolve(), judgement.sub_goal] = picked[VALIDATED]
 
 
 def rows_by_room(

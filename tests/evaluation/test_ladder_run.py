@@ -16,7 +16,7 @@ from toy_data import reseal
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.data import open_dataset
-from hypogoal.evaluation import judging, saliency
+from hypogoal.evaluation import attributing, judging
 from hypogoal.evaluation.distance import HIT, MISS, STOP
 from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.questions import summary
@@ -155,7 +155,7 @@ def test_attributions_are_of_the_ensemble_that_options_were_learned_with(results
     told = looked_at["sub_goals"][SUB_GOAL]
     assert 0 <= told["completeness_error"] < 1e-9
     explained = results.arrays[f"saliency/{SUB_GOAL}/attributions"]
-    assert explained.shape == (saliency.EXPLAINED, 2, 36, 36, 4)
+    assert explained.shape == (attributing.EXPLAINED, 2, 36, 36, 4)
     drawn = told["places"][: len(told["kinds"])]
     assert all(re.fullmatch(r"room (9|20) \(unseen\)", place) for place in drawn)
     assert {*told["places"]} >= {"room 9 (unseen)", "room 1 (labelled data from it)"}
@@ -170,8 +170,8 @@ def test_the_terminal_summary_fits(ladders, results):
     text = "\n".join(lines)
     assert re.search(r"no diversity, 2 members +│ 1 +│ +0\.\d\d │", text)
     means = table_of(ladders, "distance").sort_index().loc[DBAT, 2]["mean"]
-    assert re.search(rf"2 +│ {DBAT} +│ +{means['best']:.1f} │ +\S+ │ +{means['mean']:.1f} │ +\S+ │ +0 ", text)
-    assert re.search(r"– +│ oracle termination +│ +3\.0 │ +– │ +3\.0 │ +3\.0 │ +75 ", text)
+    assert re.search(rf"2 +│ {DBAT} +│ +{means['best']:.1f} │ +\S+ │ +{means['mean']:.1f} │ +\S+ │", text)
+    assert re.search(r"– +│ oracle termination +│ +3\.0 │ +– │ +3\.0 │ +3\.0 │", text)
 
 
 def test_the_page_shows_ladders_and_nothing_of_agents(ladders, page):

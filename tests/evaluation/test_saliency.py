@@ -186,7 +186,7 @@ def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
     labels = np.array([True, False, False])
     yes = np.array([[True], [True], [False]])
     sure = np.array([[0.9], [0.8], [0.1]], np.float32)
-    judged = Judged(States(observations[:0], labels), sure, yes, yes[2:], np.array([0.5], np.float32))
+    judged = Judged(sure, yes, yes[2:], np.array([0.5], np.float32))
     stored = States(observations, labels[:, None])
     data = Collected((1, 3, 1), ("down",), stored, States(observations[2:], np.zeros((1, 0), np.bool_)), stored)
     write_dataset(tmp_path / "data.h5", data, domain="x", config={}, seed=0)
@@ -195,7 +195,7 @@ def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
         work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None)
         work.browsed = 0
         monkeypatch.setattr(Work, "place_of", lambda work, judgement: {"artefact": "ensemble"})
-        rows = joined(look(work, Judgement(0, here, "down", judged)))
+        rows = joined(look(work, Judgement(0, here, "down", States(observations[:0], labels), judged)))
         group = arrays["saliency/down"]
         assert group["observations"].shape == (3, 1, 3, 1)
         assert group["seen"].shape == (3, 1, 2, 1)
