@@ -27,15 +27,17 @@ CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a fi
 
 
 def facts(work: Work) -> dict[str, Any]:
-    """The tasks of a run, in their domains' words, and the cap of their episodes, times the shortest path."""
-    tasks = {}
+    """The tasks of a run, in their domains' words, each agent's, and the cap of episodes, times the shortest path."""
+    tasks, task_of = {}, {}
     for artefact in (*work.contents.agents, *work.contents.ladders):
         config = artefact.config
         domain = installed_domain(config["domain"])
         if domain is not None:
             task = domain.task(domain.world(config.get("domain_config") or {}))
             tasks[task] = config.get("cap")
-    return {"tasks": [*filter(None, tasks)], "cap": max(filter(None, tasks.values()), default=None)}
+            task_of[work.place(artefact)["method"]] = task
+    cap = max(filter(None, tasks.values()), default=None)
+    return {"tasks": [*filter(None, tasks)], "task_of": task_of, "cap": cap}
 
 
 def outcome_of(difference: float, low: float, high: float) -> str:
@@ -84,6 +86,7 @@ def findings(results: Results) -> list[dict[str, Any]]:
     random = trained[trained["method"].isin([*chosen_by(results, "random")])]
     learned = chosen_by(results, "learned")
     single = [name for name in learned if learned[name]["members"] == 1]
+    task_of = results.facts.get("task_of", {})
     result: list[dict[str, Any]] = []
     for name in learned:
         if name in single:
@@ -93,6 +96,8 @@ def findings(results: Results) -> list[dict[str, Any]]:
         # random choice while learning has other options
         result += of_choosing or finding(CHOOSING, trained_runs, random, ["layout", "seed"])
         for other in single:
+            if task_of.get(name) != task_of.get(other):
+                continue
             theirs = played[played["method"] == other]
             if frozen.empty or theirs.empty:
                 frozen, theirs = trained_runs, trained[trained["method"] == other]

@@ -102,6 +102,14 @@ def test_several_members_are_compared_with_one_classifier() -> None:
     assert findings(run_of({ONE: [0.5]})) == findings(run_of({RANDOM: [0.5]})) == []
 
 
+def test_agents_of_different_tasks_are_not_compared() -> None:
+    """Two worlds that reward different features: one classifier in the one says nothing of members in the other."""
+    shares = {SEVERAL: [0.9, 0.8], ONE: [0.3, 0.2]}
+    for task, found in (("enter the red room", 1), ("enter the round room", 0)):
+        run = run_of(shares, task_of={SEVERAL: "enter the red room", ONE: task})
+        assert len(findings(run)) == found
+
+
 def test_an_own_chooser_has_its_finding() -> None:
     """Spec E6: beside the built-in one's, by its name."""
     own = "option agent, chooser=first:First"
