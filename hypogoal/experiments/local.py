@@ -2,8 +2,10 @@
 
 import multiprocessing
 import os
+import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -29,15 +31,17 @@ PRELOADED = [  # what stages import when they are called
     "hypogoal.evaluation.questions",
 ]
 POLL_SECONDS = 0.05
+CRASHED = (signal.SIGSEGV, signal.SIGABRT)  # torch aborts at a segmentation fault
+CRASHES = 3  # of a cell that are survived: the emulator of Montezuma's Revenge can crash in long runs (its issue 11)
 
 
 def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None], forked: bool | None = None) -> None:
     """Run cells that are not done, in their order, until each is done, has failed, or needs one that has.
 
     At most ``workers`` (0: one per core) run at once; those that start together share the cores. One that another
-    process is making, left over by a run that was killed, is waited for. At the end those that still run get SIGTERM.
-    ``forked``: cells start from one process that has imported what they need; by default on Linux
-    without CUDA.
+    process is making, left over by a run that was killed, is waited for. One that crashes goes on from its checkpoint,
+    at most ``CRASHES`` times. At the end those that still run get SIGTERM. ``forked``: cells start from one process
+    that has imported what they need; by default on Linux without CUDA.
     """
     if forked is None:
         forked = sys.platform == "linux" and not any("cuda" in cell.words for cell in cells)
@@ -46,6 +50,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
         context.set_forkserver_preload(PRELOADED)
     todo = [*cells]
     running: dict[Any, Cell] = {}  # by process
+    crashes: Counter[str] = Counter()
 
     def end(process: Any) -> Cell:
         process.join()
@@ -74,6 +79,10 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                         todo.append(cell)
                     elif cell.state == DONE:
                         say(f"{cell.name} done")
+                    elif -process.exitcode in CRASHED and crashes[cell.name] < CRASHES:
+                        crashes[cell.name] += 1
+                        todo.append(cell)
+                        say(f"{cell.name} crashed (signal {-process.exitcode}): it goes on from its last checkpoint")
                     else:
                         say(f"{cell.name} FAILED: {cell.last_words}")
         finally:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -130,6 +132,33 @@ def test_sigterm_has_each_cell_save(whole: Path, tmp_path: Path) -> None:
     assert states(out) == {"data": "done"} | dict.fromkeys([cell.name for cell in read_plan(out)[1:]], "waiting")
     assert (out / "logs/ensemble/seed-0.code").read_text() == "143\n"
     assert "stopped; the last checkpoint is kept" in (out / "logs/ensemble/seed-0.log").read_text()
+
+
+def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where an emulator ends with a segmentation fault: said in a line, and the same bytes."""
+    monkeypatch.setenv("HYPOGOAL_CHECKPOINT_SECONDS", "0")
+    toy, out = tmp_path / "toy.toml", tmp_path / "out"
+    toy.write_text((whole / "toy.toml").read_text().replace("steps=20", "steps=300"))
+    cells, _ = plan(str(toy), out, seeds="0")
+    chain = cells[:2]
+    said: list[str] = []
+    begin(chain, out)
+    running = threading.Thread(target=run_local, args=(chain,), kwargs={"workers": 1, "say": said.append})
+    running.start()
+    until = time.monotonic() + WAIT_SECONDS
+    while not list(out.glob("ensemble/.seed-0.partial/checkpoint/*.safetensors")):
+        assert running.is_alive() and time.monotonic() < until
+        time.sleep(0.01)
+    [child] = multiprocessing.active_children()
+    assert child.pid is not None
+    os.kill(child.pid, signal.SIGSEGV)
+    running.join()
+    assert said[-2:] == ["ensemble/seed-0 ...; 0 to come", "ensemble/seed-0 done"]
+    assert any(re.match(r"ensemble/seed-0 crashed \(signal (6|11)\): it goes on", line) for line in said)
+    unbroken = tmp_path / "unbroken"
+    run("train-ensemble", out / "data.h5", "--out", unbroken, "-q", *SMALL.replace("20", "300").split(), "--seed", "0")
+    name = "right-room.safetensors"
+    assert (out / "ensemble/seed-0" / name).read_bytes() == (unbroken / name).read_bytes()
 
 
 FAILS = f"""
