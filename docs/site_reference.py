@@ -53,7 +53,7 @@ PYTHON: dict[str, tuple[str | tuple[str, str], ...]] = {
         "hypogoal.diversity.dbat.pair_loss",
         ("hypogoal.diversity", "Context, load_objective"),
         ("hypogoal.hypotheses.fit", "fit, disagreement_of"),
-        ("hypogoal.hypotheses.training", "Training, train"),
+        ("hypogoal.hypotheses.training", "EnsembleTraining, train"),
     ),
     "Numbers": (
         (

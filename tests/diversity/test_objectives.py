@@ -14,21 +14,12 @@ from torch import Tensor
 from hypogoal.core.errors import UserError
 from hypogoal.diversity import ENTRY_POINTS, OBJECTIVES, Context, Objective, PairLoss, load_objective
 from hypogoal.hypotheses.fit import disagreement_of
+from tests.logits import confident, context_of
 
 PAIRED = ("dbat", "mutual-information", "none")
 DIVERSE = [name for name in PAIRED if name != "none"]
 ENSEMBLES = [name for name in OBJECTIVES if name not in PAIRED]
 EXTREME = (20.0, 100.0, 1e4)
-
-
-def context_of(members: int = 3, states: int = 7, frozen: int = 0, gap: float = 1.0) -> Context:
-    """Random members on 6 labelled and ``states`` unlabelled states; ``gap`` is the deviation of their logits."""
-    generator = torch.Generator().manual_seed(3)
-    labelled = gap * torch.randn(members, 6, 2, generator=generator)
-    unlabelled = gap * torch.randn(members + frozen, states, 2, generator=generator)
-    trained = unlabelled[:members].clone()
-    labels = torch.tensor([0, 1, 0, 1, 1, 0])
-    return Context(labels, labelled.requires_grad_(), trained.requires_grad_(), unlabelled[members:], 0.25)
 
 
 def pair_loss_of(name: str) -> PairLoss:
@@ -47,12 +38,6 @@ def logits_of(*probabilities: float) -> Tensor:
     """Logits (N, 2) of members that say "reached" with these probabilities."""
     p = torch.tensor(probabilities, dtype=torch.float64)
     return torch.stack([torch.log1p(-p), torch.log(p)], dim=-1)
-
-
-def confident(*classes: int, gap: float = 6.0) -> Tensor:
-    """Logits (N, 2) of members that are sure of these classes."""
-    sign = 2.0 * torch.tensor(classes, dtype=torch.float32) - 1.0
-    return torch.stack([-sign * gap / 2, sign * gap / 2], dim=-1)
 
 
 @pytest.mark.parametrize("name", DIVERSE)

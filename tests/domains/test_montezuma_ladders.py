@@ -22,13 +22,13 @@ from hypogoal.domains.montezuma.ladders import (
     ROOM_WIDTH,
     SHAFT_ENTRY,
     SHAFT_EXIT,
-    WALLS,
     distance_to,
     place_of,
     plane,
 )
 
 PHASES = range(2, 200, 17)  # twelve
+WALLS = {(9, 10), (20, 21)}  # between rooms of a row
 NAMES = [ladder.name for ladder in LADDERS]
 SHAFTS = [ladder for ladder in LADDERS if ladder.top.room != ladder.base.room]
 

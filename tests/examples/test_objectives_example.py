@@ -12,12 +12,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from hypogoal.check.objectives import check_objective, confident, context_of
+from hypogoal.check.objectives import check_objective
 from hypogoal.check.verdict import require
 from hypogoal.diversity import Objective, load_objective
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.scores import mean_disagreement
 from hypogoal.hypotheses.training import train
+from tests.logits import confident, context_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("repulsive", "ace")
