@@ -23,6 +23,7 @@ from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.domains.montezuma.emulator import SCREEN, SIDE, pixel
 from hypogoal.hypotheses.networks import folded
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
+from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.termination import Terminations
 
 Pictures = NDArray[np.uint8]  # (N, H, W, C): frames, the latest last
@@ -337,14 +338,12 @@ class Patience(Terminations):
         self._steps, self._executions, self._reaches = np.zeros((3, self.options), dtype=np.int64)
         self._highest = np.full(self.options, -np.inf, dtype=np.float32)
 
-    def reached(
-        self, log_odds: NDArray[np.float32], options: NDArray[np.int64], age: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
+    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
         self._best = np.where(age == 0, log_odds, np.maximum(self._best, log_odds))
         np.add.at(self._steps, options, 1)
         return self.positive(log_odds, options)
 
-    def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
+    def finished(self, environments: Ids, options: Ids, reached: Flags) -> None:
         np.add.at(self._executions, options, 1)
         np.add.at(self._reaches, options, reached)
         np.maximum.at(self._highest, options, self._best[environments])

@@ -205,7 +205,10 @@ def test_in_processes_of_a_stage(data: Path, tmp_path: Path) -> None:
         ended = subprocess.run(
             [*command, "--out", "out", "-q"], cwd=tmp_path, env=environment, capture_output=True, text=True
         )
-        assert (ended.returncode, ended.stderr.count("\n")) == (2, 1) and words in ended.stderr, ended.stderr
+        told, *others = ended.stderr.splitlines()
+        assert ended.returncode == 2 and words in told, ended.stderr
+        # Python's own tracker may say on a busy machine that it frees what an ended process held.
+        assert not [line for line in others if "resource_tracker" not in line and "warnings.warn" not in line]
         assert not [*tmp_path.glob("*out*")]
 
 

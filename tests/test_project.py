@@ -122,7 +122,8 @@ def test_versions_of_python_are_those_that_are_tested() -> None:
     others = re.search(r"^OTHERS := (.*)$", text_of("Makefile"), re.M)
     assert others and ["3.11", *others[1].split()] == named and PROJECT["requires-python"] == ">=3.11"
     sources = "".join(path.read_text("utf-8") for path in PACKAGE.rglob("*.py"))
-    extras = {*re.findall(r"hypogoal\[(\w+)\]", sources)}
+    named_extras = ",".join(re.findall(r"hypogoal\\*\[([\w,]+)\]", sources))
+    extras = {*named_extras.split(",")}
     assert extras == {"lerobot", "minari", "montezuma", "tensorboard"} <= PROJECT["optional-dependencies"].keys()
 
 

@@ -30,6 +30,8 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
         raise UserError(f"a package that reads this is not installed ({error})", path, do) from None
     except FileNotFoundError as error:
         raise UserError("no such file", error.filename or path, do) from None
+    except IsADirectoryError:
+        raise UserError(f"{subject} is a directory", path, do) from None
     except Exception as error:  # noqa: BLE001 - libraries raise what they like
         fault = f"{subject} cannot be read ({type(error).__name__}: {error})"[:250]
         if "h5clear" in fault:

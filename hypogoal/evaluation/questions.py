@@ -173,7 +173,7 @@ def summary(results: Results) -> Group:
     tables: list[Any] = []
     for each in answers(results):
         shown = getattr(each.words(), "shown", None)
-        if shown is not None:
+        if shown is not None and not shown.empty:
             tables.append(page.terminal(each.question.TITLE, shown))
     lines = Table.grid()
     lines.width = page.WIDTH

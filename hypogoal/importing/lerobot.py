@@ -34,7 +34,7 @@ def read_lerobot(
     info = json.loads(text)
     table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
     listed = _listed(source)
-    listed["episode_chunk"] = listed[OWNER] // info["chunks_size"]
+    listed["episode_chunk"] = listed[OWNER] // info.get("chunks_size", 1000)
     for row in listed.to_dict("records"):
         file = source / info["data_path"].format(**_facts(row, "data"))
         table = table_of(file)

@@ -23,7 +23,7 @@ from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.evaluation import saliency
+from hypogoal.evaluation import attributing
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
@@ -192,7 +192,7 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYPOGOAL_TRUST")
     lines = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", "").splitlines()
-    monkeypatch.setattr(saliency, "INTEGRATED", 2)
+    monkeypatch.setattr(attributing, "INTEGRATED", 2)
     two = settings("sub_goals=collect-red-key,open-red-door")
     few = {**SHORT, "collect": settings("unlabelled_seeds=1", "heldout_layouts=1")}
     few["train-ensemble"] = [*SHORT["train-ensemble"], *two]
@@ -251,7 +251,7 @@ def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: py
     members = pd.read_csv("runs/lamp/evaluation/tables/hypotheses.csv").set_index("quantity")["mean"]
     assert members["best"] > 0.95 and members["worst"] < 0.9
     assert "lamp-on" in Path("runs/lamp/report/index.html").read_text(encoding="utf-8")
-    agrees(Path("runs/lamp"), "", "No agent has been trained yet", "D-BAT")
+    agrees(Path("runs/lamp"), "", "No agent has been trained yet")
 
 
 @pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
@@ -268,6 +268,6 @@ def test_examples_are_short(example: Path) -> None:
         "objectives:ace": 90,
         "teacher=joint": 350,
         "class Learner(": 350,
-        "view=one_room": 350,
+        "view=one_room": 360,
     }
     assert len(text.splitlines()) <= next((lines for word, lines in longer.items() if word in text), 40)

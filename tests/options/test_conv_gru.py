@@ -114,7 +114,8 @@ def test_what_is_loaded_plays_the_same(recurrence: int) -> None:
         for member in learner.members:
             for weight in member.online.parameters():
                 weight.mul_(3.0)
-    saved = SavedOptions({"recurrence": recurrence}, learner.weights(), engine.observation_shape)
+    config = {"recurrence": recurrence, "sub_goals": ["end"], "members": 2}
+    saved = SavedOptions(config, learner.weights(), engine.observation_shape)
     policies, played = PaperPolicies(saved), set()
     act = None
     for _ in range(40):

@@ -195,6 +195,7 @@ def door_key() -> gymnasium.Env[Any, Any]:
     return gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0", layout_seed=100)
 
 
+@pytest.mark.filterwarnings("ignore:an episode begins where")
 @pytest.mark.parametrize("rule", ["learned", f"{__name__}:AtLeast", f"{__name__}:Never"])
 def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D1, H4: step by step, one's own learner and chooser in the loop, in ``OptionEnv`` and as a reward."""
@@ -230,7 +231,7 @@ def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest
         env = OptionEnv(door_key(), alone)
         env.reset(seed=0)
         info = env.step(option)[4]
-        rewarded = SubgoalReward(ensembles[option // 2], by=option % 2, termination=rule).wrap(door_key())
+        rewarded = SubgoalReward(ensembles[option // 2], by=option % 2, termination=rule).wrap(door_key(), start="paid")
         observation, _ = rewarded.reset(seed=0)
         act, held = policies(option), []
         while len(held) < info["duration"]:
