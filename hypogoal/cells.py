@@ -130,10 +130,10 @@ def write_results(run: Path, evaluation: Path) -> None:
     if not cells:
         return
     rows = [{"cell": cell.name, "stage": cell.stage, **cell.columns} for cell in cells]
-    made = pandas.DataFrame(rows, dtype=object)
+    outputs = pandas.DataFrame(rows, dtype=object)
     numbers = pandas.read_csv(evaluation / "numbers.csv", dtype=str, keep_default_na=False)
     of_ends = numbers.query("step == ''").rename(columns={"artefact": "cell"})[COLUMNS]
-    results = made.merge(of_ends, on="cell", suffixes=("_of_cell", ""))
+    results = outputs.merge(of_ends, on="cell", suffixes=("_of_cell", ""))
     results.to_csv(evaluation / "results.csv", index=False, lineterminator="\n")
 
 

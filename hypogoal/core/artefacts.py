@@ -318,8 +318,8 @@ def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> 
     if kind and resume:
         if kind != DATA:
             open_artefact(out)  # refuses changed files
-        made = _manifest_of(out).model_copy(update={"versions": {}})  # nothing is continued with others
-        _refuse_other(made, wanted, "the complete output was made")
+        complete = _manifest_of(out).model_copy(update={"versions": {}})  # nothing is continued with others
+        _refuse_other(complete, wanted, "the complete output was made")
         raise Complete(out)
     if kind and not force:
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")

@@ -64,9 +64,9 @@ class Config(BaseModel):
 
     @field_validator("*", mode="wrap")
     @classmethod
-    def _read(cls, given: Any, as_field: Callable[[Any], Any], info: ValidationInfo) -> Any:
+    def _read(cls, raw: Any, as_field: Callable[[Any], Any], info: ValidationInfo) -> Any:
         field = cls.model_fields[str(info.field_name)]
-        value = as_field(_typed(given, field.annotation))
+        value = as_field(_typed(raw, field.annotation))
         for item in value if isinstance(value, tuple) else (value,):
             if not _details(field).allow(item):
                 raise ValueError("value not allowed")
@@ -229,19 +229,19 @@ def near(word: str, candidates: Iterable[str]) -> str:
     return f"Did you mean {close[0]!r}? " if close else ""
 
 
-def _typed(given: Any, kind: Any) -> Any:
+def _typed(raw: Any, kind: Any) -> Any:
     """What was typed, as pydantic takes it: the items of a tuple; ``3e5`` for an integer; True is no number."""
     if get_origin(kind) is tuple:
         kind, *_ = get_args(kind)
-        items = _items(given, kind) if isinstance(given, str) else given
+        items = _items(raw, kind) if isinstance(raw, str) else raw
         if not isinstance(items, list | tuple):
             return items
         return [_typed(item, kind) for item in items]
-    if kind in (int, float) and isinstance(given, bool):
+    if kind in (int, float) and isinstance(raw, bool):
         raise ValueError("this must be a number")
-    if kind is int and isinstance(given, str) and "e" in given.lower():
-        return float(given)
-    return given
+    if kind is int and isinstance(raw, str) and "e" in raw.lower():
+        return float(raw)
+    return raw
 
 
 def _items(text: str, kind: Any) -> list[Any]:

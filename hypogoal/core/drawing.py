@@ -29,7 +29,7 @@ class DrawsFrom(TorchFunctionMode):
         args: Any = (),
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
-        given = dict(kwargs or {})
-        if given.get("generator") is None and ("generator" in given or func in DRAWING):
-            given["generator"] = self.generator
-        return func(*args, **given)
+        arguments = dict(kwargs or {})
+        if arguments.get("generator") is None and ("generator" in arguments or func in DRAWING):
+            arguments["generator"] = self.generator
+        return func(*args, **arguments)

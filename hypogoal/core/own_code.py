@@ -75,8 +75,8 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
         places |= {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     if name not in places:
         if ":" not in name:
-            known = ", ".join(sorted(places))
-            do = f"Choose one of {known}, or give module:object." if places else "Give module:object."
+            choices = ", ".join(sorted(places))
+            do = f"Choose one of {choices}, or give module:object." if places else "Give module:object."
             raise UserError(f"unknown {role}", name, do)
         require_trust(name, role)
         if os.getcwd() not in sys.path:

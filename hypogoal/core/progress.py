@@ -49,9 +49,9 @@ class Progress:
 
     def advance(self, n: int = 1, **numbers: float) -> None:
         """``n`` more units are done; ``numbers`` are shown beside them, except NaN (not known yet)."""
-        known = {name: value for name, value in numbers.items() if not math.isnan(value)}
-        if known:
-            self._bar.set_postfix(known, refresh=False)
+        shown = {name: value for name, value in numbers.items() if not math.isnan(value)}
+        if shown:
+            self._bar.set_postfix(shown, refresh=False)
         self.done += n
         self._bar.total = self.total
         self._bar.update(n)

@@ -41,11 +41,11 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors whose names begin with a prefix, by the rest of the name."""
-    found = {}
+    inner = {}
     for name, tensor in tensors.items():
         if name.startswith(prefix):
-            found[name.removeprefix(prefix)] = tensor
-    return found
+            inner[name.removeprefix(prefix)] = tensor
+    return inner
 
 
 def load_into(module: M, weights: Mapping[str, Tensor], where: str) -> M:

@@ -78,7 +78,7 @@ def _tells(frames: Sequence[Frame], members: int) -> bool:
 
 def _film(agent: Artefact, path: str, number: int, frames: Sequence[Frame]) -> Film:
     config = agent.config
-    about = {
+    facts = {
         "path": path,
         "number": number,
         "steps": frames[-1].step,
@@ -87,7 +87,7 @@ def _film(agent: Artefact, path: str, number: int, frames: Sequence[Frame]) -> F
         "members": config["members"],
     }
     gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
-    return Film(f"{path.replace('/', '-')}-episode-{number}.gif", gif, about)
+    return Film(f"{path.replace('/', '-')}-episode-{number}.gif", gif, facts)
 
 
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:

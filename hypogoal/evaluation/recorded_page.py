@@ -75,11 +75,11 @@ def findings_of(judges: Judges, dataset: Dataset, sub_goal: str) -> Findings:
     """What they say of a data file's states, and which to label next."""
     thresholds = judges.thresholds
     splits = dataset.labelled(sub_goal), dataset.heldout(sub_goal)
-    known = joined([States(split.observations, split.labels) for split in splits])
+    labelled = joined([States(split.observations, split.labels) for split in splits])
     unlabelled = dataset.unlabelled()
     if not len(unlabelled):
         raise UserError("there are no unlabelled states to audit on", dataset.path, "Import or collect some.")
-    known_scores, scores = judges.predict(known.observations), judges.predict(unlabelled)
+    known_scores, scores = judges.predict(labelled.observations), judges.predict(unlabelled)
 
     compared = spread_rows(len(unlabelled), COMPARED)
     sketches = sketches_of(unlabelled[compared])
@@ -90,19 +90,19 @@ def findings_of(judges: Judges, dataset: Dataset, sub_goal: str) -> Findings:
     titles = [f"state {row}, {measure} {disputed[place]:.2f}" for row, place in zip(rows, proposed, strict=True)]
     next_ones = rows[:CARDS]
     cards = {"To label next": _cards(titles, unlabelled[next_ones], scores[next_ones], thresholds)}
-    failures = np.flatnonzero(~known.labels)
+    failures = np.flatnonzero(~labelled.labels)
     for member, of_member in enumerate(known_scores[failures].T):
         drawn_to = failures[np.argsort(-of_member, kind="stable")][:FAILURES]
         heading = f"Member {member}: failures that a policy would be drawn to"
         titles = ["a failure"] * len(drawn_to)
-        cards[heading] = _cards(titles, known.observations[drawn_to], known_scores[drawn_to], thresholds)
+        cards[heading] = _cards(titles, labelled.observations[drawn_to], known_scores[drawn_to], thresholds)
 
-    members = member_table(known.labels, known_scores, scores, thresholds)
+    members = member_table(labelled.labels, known_scores, scores, thresholds)
     positive = scores[compared] > thresholds
     disagree = positive.any(axis=1) & ~positive.all(axis=1)
     numbers = {
         "sub_goal": sub_goal,
-        "known": len(known.labels),
+        "known": len(labelled.labels),
         "unlabelled": len(unlabelled),
         "disagreement": float(disagree.mean()),
         "members": members.to_dict("records"),

@@ -65,17 +65,17 @@ def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
     for sub_goal, facts in of_sub_goals.items():
         arrays = context["results"].within(f"saliency/{sub_goal}")
         suffix = f"-{sub_goal}" if len(of_sub_goals) > 1 else ""
-        about = {"sub_goal": sub_goal}
+        columns = {"sub_goal": sub_goal}
         if "features" in facts:
             bars = bars_of_features(arrays["attributions"], facts["features"])
-            yield Drawn(f"features{suffix}", "What members go by", bars, about)
+            yield Drawn(f"features{suffix}", "What members go by", bars, columns)
             continue
-        about |= {"kind": facts["kinds"][0], "place": facts["places"][0]}
+        columns |= {"kind": facts["kinds"][0], "place": facts["places"][0]}
         state = {name: values[0] for name, values in arrays.items()}
         figure2 = attributions_of_members(state, facts["colours"])
-        yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", figure2, about)
+        yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", figure2, columns)
         figure9 = attributions_of_channels(state, facts["colours"])
-        yield Drawn(f"figure9{suffix}", "Figure 9: attributions of every frame", figure9, about)
+        yield Drawn(f"figure9{suffix}", "Figure 9: attributions of every frame", figure9, columns)
 
 
 def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:

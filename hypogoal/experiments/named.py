@@ -48,7 +48,7 @@ def config_class_of(stage: str, domain: str = DOMAIN) -> Any:
         return model_of(stage)
     if stage != "run":
         raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}, run.")
-    models = {found.domain: found.model for found in map(find_experiment, reversed(EXPERIMENTS))}
+    models = {experiment.domain: experiment.model for experiment in map(find_experiment, reversed(EXPERIMENTS))}
     return models.get(domain, RunConfig)
 
 
@@ -78,8 +78,8 @@ class File(RunConfig):
             for values in product(*(axes[axis] for axis in row.axes)):
                 point = dict(zip(row.axes, values, strict=True))
                 others = [other for other in self.cells if point.keys() >= {*other.axes}]
-                known: dict[str, Value] = {other.name: f"@{other.at(point)}" for other in others}
-                command = row.command.format_map(known | point)
+                places: dict[str, Value] = {other.name: f"@{other.at(point)}" for other in others}
+                command = row.command.format_map(places | point)
                 for name in own_code.names_in(command):
                     own_code.require_trust(name, "setting")
                 yield Command(row.at(point), command, {"group": row.name, **point})
@@ -99,8 +99,8 @@ def read_toml(path: Path) -> Experiment:
     def commands(**axes: Any) -> list[Command]:
         return [*file.commands(axes)]
 
-    given = {"workers": file.workers, "evaluate": file.evaluate, **file.axes}
-    return Experiment(commands, [*fields], model, given=given)
+    defaults = {"workers": file.workers, "evaluate": file.evaluate, **file.axes}
+    return Experiment(commands, [*fields], model, given=defaults)
 
 
 @contextmanager

@@ -51,8 +51,8 @@ def plan(
     def settings(stage: str) -> Any:
         return settings_of(stage, domain or DOMAIN, preset, of_stage.get(stage, {}))
 
-    known = {**config.model_dump(), STAGE: settings}
-    commands = experiment.function(**{argument: known[argument] for argument in experiment.arguments})
+    values = {**config.model_dump(), STAGE: settings}
+    commands = experiment.function(**{argument: values[argument] for argument in experiment.arguments})
     cells = [*_cells_of(commands, run, partial(_with_shared, preset, device, of_stage))]
     stages = dict.fromkeys(cell.stage for cell in cells)
     for stage in of_stage.keys() - stages:

@@ -129,8 +129,8 @@ class Ensemble(nn.Module):
         if dtype == NUMBERS and observations.dtype == np.float64:
             observations = observations.astype(NUMBERS)
         if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
-            given = f"{observations.dtype} {observations.shape}"
-            raise UserError(NO_OBSERVATIONS, given, f"Give {expected}.")
+            kind = f"{observations.dtype} {observations.shape}"
+            raise UserError(NO_OBSERVATIONS, kind, f"Give {expected}.")
         return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
     def predictions(self, observations: Observations) -> Bools:
@@ -201,12 +201,12 @@ class Ensemble(nn.Module):
         fixed = copy.deepcopy(self).cpu().eval()
         parts = []
         for start in range(0, len(seen), deep_lift.AT_ONCE):
-            found = deep_lift.attributed(
+            explained = deep_lift.attributed(
                 fixed,
                 seen[start : start + deep_lift.AT_ONCE],
                 baseline,
             )
-            parts.append(found.values.astype(np.float32))
+            parts.append(explained.values.astype(np.float32))
         values = np.concatenate(parts)
         return deep_lift.by_key(values, self.view.dtype) if self.view.dtype.names else values
 

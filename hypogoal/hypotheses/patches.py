@@ -172,8 +172,8 @@ def _join(pieces: Sequence[Ids], bound: int) -> tuple[Ids, Ids]:
 def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
     """Values in 0..bound-1 -> (their ranks among the distinct values, the distinct values in order)."""
     if bound > LOOKUP_PER_VALUE * values.size:
-        found, inverse = np.unique(values, return_inverse=True)
-        return inverse.reshape(values.shape).astype(np.int32), found.astype(np.int64)
+        ordered, inverse = np.unique(values, return_inverse=True)
+        return inverse.reshape(values.shape).astype(np.int32), ordered.astype(np.int64)
     occurs = np.zeros(bound, dtype=np.bool_)
     occurs[values] = True
     ranks = np.cumsum(occurs, dtype=np.int32) - 1

@@ -31,8 +31,8 @@ def taught_by(
     """
     teacher = load_teacher(name)
     shape = (members, len(unlabelled))
-    given = teacher(observations, labels, unlabelled, members, seed)
-    scores = np.array(given, dtype=np.float32)
+    taught = teacher(observations, labels, unlabelled, members, seed)
+    scores = np.array(taught, dtype=np.float32)
     if scores.shape != shape or not np.isfinite(scores).all():
         raise UserError(
             f"the teacher gave scores {scores.shape}",

@@ -215,10 +215,10 @@ class PaperLearner(Learner):
         """One update of a member's policy; returns the loss, 0 where all steps drawn are forgotten."""
         indices, weights = member.replay.sample(self.config.option_batch, self.rng)
         steps = member.replay.data.at(indices)
-        known = self.engine.remembers(steps.path).all(axis=1)
-        if not known.any():
+        kept = self.engine.remembers(steps.path).all(axis=1)
+        if not kept.any():
             return 0.0
-        indices, weights, steps = indices[known], weights[known], steps.at(known)
+        indices, weights, steps = indices[kept], weights[kept], steps.at(kept)
 
         path, length = steps.path.astype(np.int64), steps.length
         most = self.config.recurrence
@@ -258,11 +258,11 @@ class PaperLearner(Learner):
         return loss
 
     def weights(self) -> dict[str, Tensor]:
-        found = {}
+        tensors = {}
         for option, member in enumerate(self.members):
             for name, value in member.online.state_dict().items():
-                found[f"{option}.{name}"] = value
-        return found
+                tensors[f"{option}.{name}"] = value
+        return tensors
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):

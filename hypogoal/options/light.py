@@ -95,12 +95,12 @@ class LightLearner(Learner):
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        one = np.ones(len(moved.ids), np.int64)
+        ones = np.ones(len(moved.ids), np.int64)
         steps = Lessons.cast(
             moved.ids,
             moved.actions,
             moved.next_ids,
-            one,
+            ones,
             moved.options,
             moved.terminated,
         )

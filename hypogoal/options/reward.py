@@ -186,8 +186,8 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         of_sub_goal = self.scale if holds else 0.0
         paid = of_sub_goal + float(reward) if self.add else of_sub_goal
         terminated = bool(terminated) or (holds and self.ends)
-        told = {"predicted": predicted, "paid": of_sub_goal}
-        return observation, paid, terminated, truncated, info | {"subgoal": told}
+        shown = {"predicted": predicted, "paid": of_sub_goal}
+        return observation, paid, terminated, truncated, info | {"subgoal": shown}
 
     def _log_odds(self, observation: Any) -> Floats:
         """Of each member, float32 (K,)."""

@@ -115,10 +115,10 @@ class Terminations(Part):
     def _all(self, ids: Ids) -> Floats:
         """Log-odds (n, O)."""
         self._grow(ids)
-        known = self.judged[ids]
-        unknown = np.isnan(known).any(axis=1)
+        judged = self.judged[ids]
+        unknown = np.isnan(judged).any(axis=1)
         if not unknown.any():
-            return known
+            return judged
         assert self.classify is not None
         fresh = np.unique(ids[unknown])
         before = self.judged[fresh]

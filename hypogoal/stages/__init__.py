@@ -145,8 +145,8 @@ def load_stage(name: str) -> "Stage":
     folder = "tools" if name == "audit" else "stages"
     word = name.replace("-", "_")
     function: Any = getattr(import_module(f"hypogoal.{folder}.{word}"), word)
-    made: Stage = function.stage
-    return made
+    loaded: Stage = function.stage
+    return loaded
 
 
 def stage(example: str, **more: Any) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:

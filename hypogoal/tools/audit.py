@@ -50,8 +50,8 @@ def audit(
     is_failed = fail_above is not None and any(share is None or share > fail_above for share in shares.values())
     if is_failed:
         lines.append(f"FAILED: more than {fail_above:.1%} are false positives")
-    told = {"out": str(call.out), "false_positives": shares, "fail_above": fail_above, "failed": is_failed}
-    return Done(lines, told=json.dumps(told) if as_json else "", code=FAILED if is_failed else 0)
+    summary = {"out": str(call.out), "false_positives": shares, "fail_above": fail_above, "failed": is_failed}
+    return Done(lines, told=json.dumps(summary) if as_json else "", code=FAILED if is_failed else 0)
 
 
 def _in_play(
@@ -97,8 +97,8 @@ def _in_play(
             (files / REPORT).write_text(as_json(report) + "\n", encoding="utf-8")
     except Complete as complete:  # what was found stands, and may still fail
         say(complete, err=True)
-    found = json.loads((call.out / REPORT).read_text(encoding="utf-8"))
-    return [*played.lines_of(found)], played.shares_of(found)
+    findings = json.loads((call.out / REPORT).read_text(encoding="utf-8"))
+    return [*played.lines_of(findings)], played.shares_of(findings)
 
 
 def _policies(config: Any, threshold: float) -> dict[str, float]:

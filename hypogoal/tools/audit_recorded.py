@@ -56,9 +56,9 @@ def audit_recorded(
     return lines_of(parts), {"failures": max(shares, default=None)}
 
 
-def _chosen(known: Sequence[str], sub_goal: str | None) -> list[str]:
+def _chosen(names: Sequence[str], sub_goal: str | None) -> list[str]:
     if sub_goal is None:
-        return [*known]
-    if sub_goal not in known:
-        raise UserError("unknown sub-goal", sub_goal, f"They are {', '.join(known)}.")
+        return [*names]
+    if sub_goal not in names:
+        raise UserError("unknown sub-goal", sub_goal, f"They are {', '.join(names)}.")
     return [sub_goal]

@@ -149,12 +149,12 @@ def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress:
         jpeg_encoding=False,
     )
     place = meta.config["layouts"] or meta.config["layout_seed"]
-    about = f"{meta.config['domain']}, layout seed {place}, seed {seed}"
+    origin = f"{meta.config['domain']}, layout seed {place}, seed {seed}"
     description = {
         "dataset_id": out.name,
         "minari_version": __version__,
         "algorithm_name": "hypogoal",
-        "description": f"Episodes of an agent that chooses among options ({about}).",
+        "description": f"Episodes of an agent that chooses among options ({origin}).",
     }
     storage.update_metadata(description)
     storage.update_episodes(_buffers(play_episodes(loop, progress.total), progress))

@@ -100,9 +100,9 @@ class DoorKeyGrid(MiniGridEnv):
         wrong_key: str = "harmless",
         render_mode: str | None = None,
     ):
-        for value, known in ((door_label, DOOR_LABELS), (wrong_key, WRONG_KEYS)):
-            if value not in known:
-                raise ValueError(f"{value!r} is none of {known}")
+        for value, allowed in ((door_label, DOOR_LABELS), (wrong_key, WRONG_KEYS)):
+            if value not in allowed:
+                raise ValueError(f"{value!r} is none of {allowed}")
         self.layout_seed = layout_seed
         self.door_label, self.wrong_key = door_label, wrong_key
         self.ring: list[Key] = []
