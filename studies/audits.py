@@ -154,11 +154,14 @@ def steps_to(states: States, begin: Ints, stops: Flags) -> Ints:
 def payable(states: States, positive: Flags, cap: int) -> int:
     """The fewest steps in which a policy is paid for a false positive; NEVER if there are none up to ``cap``.
 
-    A start inside is paid after a step that leads back to it, or to another false positive.
+    A start inside is paid when a policy comes back to it.
     """
     steps = steps_to(states, states.starts, positive)
-    back = states.following[states.starts]
-    steps[np.intersect1d(back, states.starts)] = 1
+    goes_on = (steps != NEVER) & ~states.final & ~positive
+    goes_on[states.starts] = True
+    for start in states.starts:
+        before = goes_on & (states.following == start).any(axis=1)
+        steps[start] = steps[before].min() + 1 if before.any() else NEVER
     paid = steps[positive & ~states.truth & (steps > 0) & (steps <= cap)]
     return int(paid.min()) if len(paid) else NEVER
 
