@@ -135,6 +135,7 @@ def test_versions_of_python_are_those_that_are_tested() -> None:
         (HELP, {"typer"}, HEAVY),
         ("import hypogoal.experiments.plan, hypogoal.experiments.run", set(), {"torch"}),
         ("import hypogoal.stages.train_ensemble, hypogoal.stages.train_meta", set(), {"scipy"}),
+        ("import hypogoal.hypotheses.sub_goals, hypogoal.meta.training", {"torch"}, {"scipy", "pandas", "matplotlib"}),
     ],
 )
 def test_imports_are_light(code: str, loaded: set[str], unloaded: set[str]) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from hypogoal.core.arrays import (
     Bools,
@@ -56,6 +55,8 @@ def ranking(
     Takes probabilities (N, K) and labels (N,). Returns float64 (K,): the share of pairs of a positive and a negative in
     which the positive has the higher probability, ties counted half; NaN without such pairs.
     """
+    from scipy.stats import rankdata  # takes longer to import than most stages need it
+
     positives = int(labels.sum())
     pairs = positives * (len(labels) - positives)
     if not pairs:
