@@ -41,7 +41,10 @@ def audit_recorded(
         Progress("audit", len(goals), quiet=call.quiet) as progress,
     ):
         for goal in goals:
-            judges = Judges.of_members(artefact, goal, device) if artefact else Judges.of_function(source)
+            if artefact:
+                judges = Judges.of_members(artefact, goal, device)
+            else:
+                judges = Judges.of_function(source)
             findings = findings_of(judges, dataset, goal)
             write_next(draft.files / "next" / goal, COLUMNS, findings)
             every.append(findings)
@@ -51,8 +54,9 @@ def audit_recorded(
         page = draw(Path(source).name, every)
         (draft.files / "index.html").write_text(page, encoding="utf-8")
     shares = []
-    for part in parts:
-        shares += [member["false_positives"] / member["negatives"] for member in part["members"] if member["negatives"]]
+    for findings in every:
+        with_failures = findings.members.query("negatives > 0")
+        shares += (with_failures["false_positives"] / with_failures["negatives"]).tolist()
     return lines_of(parts), {"failures": max(shares, default=None)}
 
 
