@@ -36,9 +36,12 @@ $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $(USER) $@
 
 # An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(ROOMS) and $(DEMO).
-demo: $(USER) ## where an ensemble is needed, in runs/rooms, then three-key DoorKey, in runs/demo: from nothing to a report
-	$(BIN)/hypogoal run rooms --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
-	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
+# The rooms take what DoorKey leaves of the cores. A shell has what it runs beside it ignore Ctrl-C: hence the trap.
+demo: $(USER) ## three-key DoorKey, in runs/demo, and where an ensemble is needed, in runs/rooms: from nothing to a report
+	@nice $(BIN)/hypogoal run rooms --preset demo --out $(ROOMS) --quiet $(if $(wildcard $(ROOMS)),--resume) & rooms=$$!; \
+	trap 'kill $$rooms 2>/dev/null; wait $$rooms' EXIT; trap 'exit 130' INT TERM; \
+	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume) && \
+	{ echo "waiting for $(ROOMS)"; wait $$rooms; }
 	@echo "open $(ROOMS)/report/index.html and $(DEMO)/report/index.html in a browser; for the command hypogoal type: source $(BIN)/activate"
 
 # A file's tests share what they made; files in the order that tests/conftest.py gives them, the longest first.

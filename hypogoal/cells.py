@@ -27,6 +27,7 @@ class Cell(BaseModel):
     name: str = Field(pattern=NAME)
     words: list[str]
     needs: list[str] = []  # places of the outputs that it reads
+    after: list[str] = []  # places of outputs that have this machine's cores before it
     columns: dict[str, Value] = {}  # of ``results.csv``
     run: Path = Field(Path(), exclude=True)  # not in the plan: the folder may be moved
 

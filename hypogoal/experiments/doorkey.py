@@ -52,7 +52,8 @@ def doorkey(
             commands[baseline] = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
         for agent, words in commands.items():
             columns: Columns = {"agent": agent, "seed": seed, "layout_seed": layout}
-            yield Command(f"{agent}{at}", f"{words} --seed {seed} --layout-seed {layout}", columns)
+            after = [ensembles[seed]] if agent in baselines else []  # the rest waits for an ensemble, which uses all cores
+            yield Command(f"{agent}{at}", f"{words} --seed {seed} --layout-seed {layout}", columns, after)
 
 
 figure6 = replace(doorkey, preset="figure6")  # at a laptop's size

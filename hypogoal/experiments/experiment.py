@@ -41,6 +41,7 @@ class Command(NamedTuple):
     name: str  # its place in the run's folder: ensemble/seed-0
     command: str  # as one would type it
     columns: Mapping[str, Value] = {}
+    after: Sequence[str] = ()  # names of commands that have this machine's cores before it
 
 
 class RunConfig(Config):

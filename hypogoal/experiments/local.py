@@ -62,7 +62,9 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
         try:
             while running or any(cell.is_makeable for cell in todo):
                 free = (workers or cores()) - len(running)
-                ready = [cell for cell in todo if cell.is_makeable and not cell.draft.is_locked]
+                makeable = [cell for cell in todo if cell.is_makeable and not cell.draft.is_locked]
+                at_work = {cell.place for cell in [*makeable, *running.values()]}
+                ready = [cell for cell in makeable if at_work.isdisjoint(cell.after)]
                 for cell in ready[:free]:
                     todo.remove(cell)
                     say(f"{cell.name} ...; {len(todo)} to come")

@@ -74,7 +74,7 @@ def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any])
     domains: dict[str, str] = {}  # by place
     for command in commands:
         try:
-            name, text, columns = Command(*command)
+            name, text, columns, after = Command(*command)
             words: list[str] = []
             needs: list[str] = []
             for word in shlex.split(text):
@@ -85,7 +85,8 @@ def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any])
                 words.append(word)
             domain = domains[needs[0]] if needs else DOMAIN
             words, domain = completed(words, domain)
-            cell = Cell(name=name, words=words, needs=needs, columns=dict(columns), run=run)
+            waits = [cells[other].place for other in after]
+            cell = Cell(name=name, words=words, needs=needs, after=waits, columns=dict(columns), run=run)
         except UserError as error:
             error.add_note(f"in the command {command[0]}")
             raise

@@ -19,7 +19,7 @@ import pytest
 from command_line import fails, refuses, run
 from toy import SMALL, write_toy
 
-from hypogoal.cells import read_plan, status_lines
+from hypogoal.cells import Cell, read_plan, status_lines
 from hypogoal.core.artefacts import Draft
 from hypogoal.experiments.local import PRELOADED, run_local
 from hypogoal.experiments.plan import plan
@@ -132,6 +132,22 @@ def test_sigterm_has_each_cell_save(whole: Path, tmp_path: Path) -> None:
     assert states(out) == {"data": "done"} | dict.fromkeys([cell.name for cell in read_plan(out)[1:]], "waiting")
     assert (out / "logs/ensemble/seed-0.code").read_text() == "143\n"
     assert "stopped; the last checkpoint is kept" in (out / "logs/ensemble/seed-0.log").read_text()
+
+
+def test_what_shares_its_work_among_the_cores_has_them_first(tmp_path: Path) -> None:
+    """``after`` holds a cell while the other is made, though it reads nothing of it, and no longer."""
+    words = ["collect", "rooms"]
+    data, needs = Cell(name="data", words=words, run=tmp_path), ["data.h5"]
+    wide = Cell(name="wide", words=words, needs=needs, run=tmp_path)
+    other = Cell(name="other", words=words, needs=needs, after=["wide.h5"], run=tmp_path)
+    said: list[str] = []
+    begin([data, other, wide], tmp_path)
+    run_local([data, other, wide], workers=3, say=said.append)
+    assert said.index("wide done") < said.index("other ...; 0 to come")
+    other.out.unlink()
+    wide.out.unlink()
+    run_local([other], workers=3, say=said.append)
+    assert other.is_done
 
 
 def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
