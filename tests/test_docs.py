@@ -95,6 +95,7 @@ def test_the_reference_is_that_of_the_code(site: Path) -> None:
             assert f"<code>{row['name']}</code>" in pages["settings"], (stage, row["name"])
 
 
+@pytest.mark.slow
 def test_the_tutorial_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every command of the tutorial, in its order, only shorter, and then the README's program on what they made."""
     monkeypatch.chdir(tmp_path)

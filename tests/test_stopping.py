@@ -24,26 +24,20 @@ def kills(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_killed_commands_end_with_the_same_bytes() -> None:
     """SIGKILL at random moments, a few of them; ``python -m tests.attacks.kills`` is the long version."""
-    done = kills("--kills", "3", "--commands", "run/ensemble", "run/ppo")
+    done = kills("--kills", "2", "--commands", "run/ensemble")
     assert done.returncode == 0, done.stdout + done.stderr
     for row in done.stdout.splitlines()[1:]:
-        assert [*map(int, row.split()[1:])][::3] == [3, 0], row
+        assert [*map(int, row.split()[1:])][::3] == [2, 0], row
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("output", "name"),
-    [
-        ("run/ensemble", "hypogoal.hypotheses.training:Training.optimiser"),
-        ("run/options", "hypogoal.learners.double_dqn:DoubleDQN.optimiser"),
-        ("run/meta", "hypogoal.meta.ppo:MetaPolicy.rng"),
-    ],
-)
-def test_a_name_that_is_dropped_from_a_snapshot_is_found(output: str, name: str) -> None:
+def test_a_name_that_is_dropped_from_a_snapshot_is_found() -> None:
     """Or the harness would find nothing."""
-    assert kills("--kills", "6", "--commands", output, "--drop", name).returncode == 1
+    dropped = "hypogoal.hypotheses.training:Training.optimiser"
+    assert kills("--kills", "6", "--commands", "run/ensemble", "--drop", dropped).returncode == 1
 
 
 def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str]) -> None:

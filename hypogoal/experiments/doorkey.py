@@ -52,7 +52,9 @@ def doorkey(
             commands[baseline] = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
         for agent, words in commands.items():
             columns: Columns = {"agent": agent, "seed": seed, "layout_seed": layout}
-            after = [ensembles[seed]] if agent in baselines else []  # the rest waits for an ensemble, which uses all cores
+            after = (
+                [ensembles[seed]] if agent in baselines else []
+            )  # the rest waits for an ensemble, which uses all cores
             yield Command(f"{agent}{at}", f"{words} --seed {seed} --layout-seed {layout}", columns, after)
 
 

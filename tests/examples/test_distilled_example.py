@@ -180,6 +180,7 @@ def test_deep_sees_all_cells_and_where_they_are() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:a masked option runs")
+@pytest.mark.slow
 def test_distilled_options_go_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From plans to play in other layouts, inside an engine and without it; an agent over them, which is drawn."""
     text = Path(distilled.__file__).read_text(encoding="utf-8").replace("\\\n", "")

@@ -43,6 +43,7 @@ def test_every_policy_reaches_its_sub_goal(seed: int) -> None:
     assert locked == 1
 
 
+@pytest.mark.slow
 def test_locked_room_is_collected_and_learned(tmp_path: Path) -> None:
     """Spec B6: the example's first commands, in small: every sub-goal has both classes in every set."""
     data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")

@@ -352,6 +352,7 @@ def test_data_that_do_not_say_enough_are_one_line() -> None:
 
 
 @pytest.mark.atari
+@pytest.mark.slow
 def test_bases_are_recognised_in_rooms_without_labels(tmp_path: Path) -> None:
     """The claim, in small: the agent is found there, and what is around it says more than the whole picture."""
     data = tmp_path / "data.h5"

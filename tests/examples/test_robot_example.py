@@ -28,6 +28,7 @@ def run(folder: Path, *words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_from_recorded_play_to_the_second_audit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec I6: a LeRobotDataset, an audit, its answers, and the data that they become; the truth judges members."""
     monkeypatch.chdir(tmp_path)

@@ -22,6 +22,7 @@ def shown_by(cell: str, space: dict[str, Any]) -> Any:
     return eval(compile(ast.Expression(last.value), NOTEBOOK.name, "eval"), space) if last else None
 
 
+@pytest.mark.slow
 def test_the_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The demo's story with pictures: states, verdicts, attributions, options; numbers of each stage; a comparison."""
     monkeypatch.chdir(tmp_path)

@@ -44,6 +44,7 @@ def test_doctests(in_demo: None, name: str) -> None:
     assert found.failed == 0 and found.attempted > 2
 
 
+@pytest.mark.slow
 def test_the_page_of_the_library(in_demo: None) -> None:
     """docs/library.md: its blocks one after the other, as one program."""
     space: dict[str, object] = {"__name__": "__main__"}

@@ -11,7 +11,7 @@ from loops import CASES, loop_of
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.options.loop import OptionLoop
 
-STEPS, BREAK = 40, 25
+STEPS, BREAK = 32, 20
 # A bias before BatchNorm has no gradient but rounding, which Adam follows as if it were one.
 ROUNDING = ("features.0.bias", "features.4.bias", "running_mean")
 
