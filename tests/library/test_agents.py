@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import shutil
 from pathlib import Path
@@ -30,7 +29,6 @@ from hypogoal.core import own_code
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.evaluation.run import find_artefacts
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.env import Options
@@ -39,7 +37,6 @@ from hypogoal.options.termination import Terminations
 
 TESTS = Path(__file__).parents[1]
 MEMBERS = 2
-DEMO = "HYPOGOAL_DEMO_RUN"  # names the folder of a finished demo run, to be taken instead of a fresh one
 
 
 @pytest.fixture(scope="module")
@@ -436,37 +433,3 @@ def test_stable_baselines3_learns_a_classifiers_reward(made: Path) -> None:
         observation, reward, terminated, _, _ = env.step(int(agent.predict(observation, deterministic=True)[0]))
         rewards.append(reward)
     assert rewards == [0.0, 1.0]
-
-
-@pytest.mark.slow
-def test_maskable_ppo_reaches_the_goal_with_the_options_of_the_demo(tmp_path: Path) -> None:
-    """Spec E1, done when: MaskablePPO on OptionEnv, with options of the demo's recipe, solves the demo's layout.
-
-    Takes the run that HYPOGOAL_DEMO_RUN names, or makes the options anew: four minutes in all.
-    """
-    given = os.environ.get(DEMO)
-    made = Path(given) if given else tmp_path / "demo"
-    if not given:
-        data = tmp_path / "data.h5"
-        run("collect", "doorkey", "--out", data, "--preset", "demo", "-q")
-        run("train-ensemble", data, "--out", made / "ensemble", "--preset", "demo", "-q")
-        learn = ["train-options", str(made / "ensemble"), "--out", str(made / "options"), "--preset", "demo", "-q"]
-        run(*learn, "--set", "steps=120000")
-    found = [*find_artefacts(made, "meta"), *find_artefacts(made, "options")]
-    wanted = {"layout_seed": 100, "termination": "learned"}
-    meta = next(one.path for one in found if wanted.items() <= one.config.items())
-    learned = hypogoal.load_options(meta)
-    env = hypogoal.OptionEnv(gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=100), learned, gamma=0.99)
-    agent = MaskablePPO("CnnPolicy", env, n_steps=256, batch_size=64, gamma=0.95, ent_coef=0.01, seed=0)
-    agent.learn(4_096)
-    lengths = []
-    for _ in range(20):
-        observation, _ = env.reset()
-        steps, over = 0, False
-        while not over:
-            action, _ = agent.predict(observation, action_masks=env.action_masks())
-            observation, _, terminated, truncated, info = env.step(int(action))
-            steps += info["duration"]
-            over = terminated or truncated
-        lengths.append(steps if terminated else 500)
-    assert np.mean([length < 500 for length in lengths]) >= 0.9, lengths
