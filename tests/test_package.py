@@ -1,0 +1,58 @@
+"""What is published installs into an empty environment elsewhere, and works there."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, f'build_{sys.argv[1]}')(sys.argv[2])"
+WHERE = "import hypogoal; print(hypogoal.__file__)"
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """The files that git knows, since building leaves others beside them."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("no checkout of git")
+    copy = tmp_path / "checkout"
+    for name in listed.stdout.strip("\0").split("\0"):
+        if (ROOT / name).is_file():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, copy / name)
+    return copy
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_it_installs_elsewhere_and_runs_the_demos_first_stage(kind: str, checkout: Path, tmp_path: Path) -> None:
+    """Dependencies are those of this environment; hypogoal is not in it but by a link, which a path does not carry."""
+    pytest.importorskip("setuptools")
+
+    def called(*words: object) -> str:
+        command = [str(word) for word in words]
+        surroundings = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        done = subprocess.run(command, cwd=tmp_path, env=surroundings, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    built = tmp_path / "dist"
+    subprocess.run([sys.executable, "-c", BUILD, kind, str(built)], cwd=checkout, capture_output=True, check=True)
+    (package,) = built.iterdir()
+    elsewhere = tmp_path / "environment"
+    venv.create(elsewhere)
+    (site,) = elsewhere.glob("lib/python*/site-packages")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    python = elsewhere / "bin" / "python"
+    offline = ("--no-deps", "--no-index", "--no-build-isolation", "--quiet")
+    called(sys.executable, "-m", "pip", "--python", python, "install", *offline, package)
+    assert Path(called(python, "-c", WHERE).strip()).is_relative_to(elsewhere)
+    data = tmp_path / "data.h5"
+    called(elsewhere / "bin" / "hypogoal", "collect", "doorkey", "--preset", "demo", "--out", data)
+    assert str(data) in called(elsewhere / "bin" / "hypogoal", "verify", data)
