@@ -4,8 +4,9 @@ The words of the loop:
 
 - A *member* h_i is one of the K networks in training. Its logits (negative, positive) of a state give
   p_i = softmax(logits)[positive], its probability that the sub-goal holds there.
-- A *batch* has B labelled states x with classes y, half of them positive, and B unlabelled states u, from anywhere.
-  Both halves pass the members together; BatchNorm takes each by its own mean and variance (``batches.plain_forward``).
+- A *batch*, the same for all members, has B labelled states x with classes y, half of them positive, and B unlabelled
+  states u. Positives, negatives and unlabelled states are drawn in shuffled passes through all of each. Both halves
+  pass the members together; BatchNorm takes each by its own mean and variance (``batches.plain_forward``).
 - The *labelled loss* of a member is CE_i = sum_b w[y_b] (-log p_i(y_b | x_b)) / sum_b w[y_b], with p_i(1 | x) = p_i
   and p_i(0 | x) = 1 - p_i. The class weights w are 0.5 and 0.5 on DoorKey (Table 3), where it is the plain mean; on
   Montezuma 0.8 for y = 0 and 0.2 for y = 1 (Table 1).
@@ -20,9 +21,10 @@ Eq. (1) as it is computed, summed over members, not averaged::
 
     loss = sum_i CE_i + alpha ( sum_i sum_{m != i} d(h_i, h_m) + sum_i sum_f d(f, h_i) )
 
-The double sum has each pair twice. i = m is left out: disagreement with itself would push a member to p = 1/2. An
-objective of the whole ensemble stands for the whole bracket. The bracket is 0 where alpha is 0, for the objective
-``none``, and for pairs of a single member. Beyond the paper, a *teacher* with scores s of unlabelled states adds
+The double sum has each pair twice; a pair's gradient reaches both of its members. i = m is left out: disagreement with
+itself would push a member to p = 1/2. An objective of the whole ensemble stands for the whole bracket. The bracket is 0
+where alpha is 0, for the objective ``none``, and for pairs of a single member. Beyond the paper, a *teacher* with
+scores s of unlabelled states adds
 sum_i mean_u min(|s_i(u)|, 1) (-log p_i(s_i(u) > 0 | u)), without a weight of its own.
 """
 

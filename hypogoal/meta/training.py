@@ -14,11 +14,13 @@ The words of the loop:
 Where an option's time runs out in mid-episode (``timed_out`` in :meth:`.OptionLoop.advance`), the episode goes on:
 
 - record: its execution has ended, after ``option_timeout`` steps, without having reached its sub-goal.
-- reward: its policy's reward is 0, as at every step that does not reach the sub-goal.
-- bootstrap: time is not part of a state, so its policy's target there is gamma max Q(s'), as if it went on. Only the
-  sub-goal and the end of the task are terminal.
+- reward: its policy's reward is 0, as at every step that does not reach the sub-goal; with ``experience=shared`` every
+  other member has its own, by its own prediction of s'.
+- bootstrap: time is not part of a state, so its policy's target there is the Double-DQN value of s', as if it went on.
+  Only the sub-goal and the end of the task are terminal.
 - SMDP return: R and gamma ** tau, as at any other end. The meta-policy's advantage (:mod:`.smdp`) takes
-  R + gamma ** tau V(s') - V(s), and its trace runs on into the next decision, which is made in the same state s'.
+  R + gamma ** tau V(s') - V(s), and its trace runs on into the next decision, which is made in the same state s'. It
+  sees s' and which options are offered there, no more: the same option may be chosen again.
 
 With ``restart_options`` the end of an execution is that of its episode too: there the trace ends, V(s') stays.
 """
