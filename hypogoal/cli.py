@@ -224,7 +224,7 @@ def show(
     details = look.describe(path)
     echo(details, as_json, [*look.outcome(details), *look.lines(details)])
     if pictures is not None:
-        from hypogoal.evaluation.sheets import write_sheets
+        from hypogoal.evaluation.pictures import write_sheets
 
         say(*write_sheets(path, pictures), err=as_json)
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.house import tidy_members
@@ -34,76 +34,80 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
         return
     place = work.place_of(judgement)
     looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})
-    group = work.arrays.create_group(f"saliency/{sub_goal}")
     dataset, ensemble = open_dataset(case.data), case.read(sub_goal)
     heldout, unlabelled = states_of(case.data)
     observations = heldout[sub_goal].observations
-    if dataset.observation_dtype == PICTURE:
+    are_pictures = dataset.observation_dtype == PICTURE
+    kinds: list[str] = []
+    states = explained = spread_rows(len(split.labels), AVERAGED)
+    if are_pictures:
         kinds, states = states_to_show(judgement)
         few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
         explained = states[: max(len(kinds), few // len(case.config["sub_goals"]))]
-    else:
-        kinds, explained = [], spread_rows(len(split.labels), AVERAGED)
     seen = ensemble.see(observations[explained])
     attributions = attributed(ensemble, seen, mean_state(ensemble.see(unlabelled)))
     error = attributions.completeness_error()
-    facts = {"kinds": kinds, "how": attributions.method, "completeness_error": float(error.max())}
-    looked_at["sub_goals"][sub_goal] = facts
-    if dataset.observation_dtype == PICTURE:
-        values: NDArray[np.floating] = attributions.values
+    facts = {"kinds": kinds, "how": attributions.method, "completeness_error": error.max()}
+    values: Any = attributions.values
+    arrays = {}
+    if are_pictures:
         default = 3 if dataset.observation_shape[-1] == 3 else 1
         facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
         facts["places"] = [place_of(split.origins, state) for state in states]
-        shown = {
+        arrays = {
             "observations": observations[states],
             "labels": split.labels[states],
             "probabilities": judgement.judged.probabilities[states],
             "predictions": judgement.judged.predictions[states],
             "seen": seen,
         }
-        for name, array in shown.items():
-            group[name] = array
     else:
-        values = of_features(attributions.values.reshape(*error.shape, -1), seen.dtype)
         facts["features"] = dataset.features()
+        values = of_features(values.reshape(*error.shape, -1), seen.dtype)
+    looked_at["sub_goals"][sub_goal] = facts
+    group = work.arrays.create_group(f"saliency/{sub_goal}")
+    for name, array in arrays.items():
+        group[name] = array
     group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
     for row, kind in enumerate(kinds):
         columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
         yield tidy_members(columns, **place, scope=f"state: {kind}")
 
 
-def states_to_show(judgement: Judgement) -> tuple[list[str], NDArray[np.int64]]:
+def states_to_show(judgement: Judgement) -> tuple[list[str], Ints]:
     """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
-    split, judged = judgement.split, judgement.judged
-    unseen = split.origins.get("seen", np.zeros(len(split.labels))) == 0
-    allowed = unseen if split.labels[unseen].any() else np.ones_like(unseen)
-    kinds = pick_to_explain(judged.probabilities, judged.predictions, split.labels, allowed)
-    places = {name: split.origins[name] for name in PLACES if name in split.origins}
+    labels, origins = judgement.split.labels, judgement.split.origins
+    predictions = judgement.judged.predictions
+    allowed = origins.get("seen", np.zeros(len(labels))) == 0
+    if not labels[allowed].any():
+        allowed[:] = True
+    kinds = pick_to_explain(judgement.judged.probabilities, predictions, labels, allowed)
+    places = {name: origins[name] for name in PLACES if name in origins}
     rng = rng_for(0, "browse", judgement.sub_goal)
-    browsed = pick_for_gallery(judged.predictions, split.labels, places, rng)
+    browsed = pick_for_gallery(predictions, labels, places, rng)
     states = pd.unique(np.array([*kinds.values(), *browsed]))
     return [*kinds], states[: GALLERY // len(judgement.case.config["sub_goals"])]
 
 
-def of_features(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[np.floating]:
+def of_features(values: Floats, dtype: Any) -> Floats:
     """Attributions (n, K, D) to each number; of mixed observations those to a picture are added up."""
     from hypogoal.hypotheses.deep_lift import by_key
 
     if not dtype.names:
         return values
-    of_keys = by_key(values, dtype)
     features = []
+    of_keys = by_key(values, dtype)
     for key, (kind, _) in fields_of((), dtype).items():
-        flat = of_keys[key].reshape(*values.shape[:2], -1)
-        features.append(flat.sum(axis=-1, keepdims=True) if kind == PICTURE else flat)
+        of_key = of_keys[key].reshape(*values.shape[:2], -1)
+        features.append(of_key.sum(axis=-1, keepdims=True) if kind == PICTURE else of_key)
     return np.concatenate(features, axis=-1)
 
 
 def pick_to_explain(
-    probabilities: NDArray[np.float32],
-    predictions: NDArray[np.bool_],
-    labels: NDArray[np.bool_],
-    allowed: NDArray[np.bool_],
+    probabilities: Floats,
+    predictions: Bools,
+    labels: Bools,
+    allowed: Bools,
 ) -> dict[str, int]:
     """Figures 2 and 9: the few of N states, by kind, whose attributions are drawn, no state twice.
 
@@ -112,11 +116,10 @@ def pick_to_explain(
     """
     positive = predictions.sum(axis=1)
     some = positive > 0
-    surest = -(positive + probabilities.mean(axis=1))
-    apart = probabilities.min(axis=1) - probabilities.max(axis=1)
+    surest = positive + probabilities.mean(axis=1)
     candidates = {
         "true positive": (labels & some, surest),
-        "disagree": (some & ~predictions.all(axis=1), apart),
+        "disagree": (some & ~predictions.all(axis=1), np.ptp(probabilities, axis=1)),
         "false positive": (~labels & some, surest),
     }
     free = allowed.copy()
@@ -124,23 +127,23 @@ def pick_to_explain(
     for kind, (of_kind, order) in candidates.items():
         among = of_kind & free
         if among.any():
-            picked[kind] = int(np.where(among, order, np.inf).argmin())
+            picked[kind] = int(np.where(among, order, -np.inf).argmax())
             free[picked[kind]] = False
     return picked
 
 
-def outcomes(predictions: NDArray[np.bool_], labels: NDArray[np.bool_]) -> NDArray[np.str_]:
+def outcomes(predictions: Bools, labels: Bools) -> Any:
     """Of predictions (n, K) of labels (n,): whether all members are right, all wrong, or they disagree."""
     errors = (predictions != labels[:, None]).sum(axis=1)
     return np.select([errors == 0, errors == predictions.shape[1]], ["all right", "all wrong"], "disagree")
 
 
 def pick_for_gallery(
-    predictions: NDArray[np.bool_],
-    labels: NDArray[np.bool_],
-    places: Mapping[str, NDArray[np.int64]],
+    predictions: Bools,
+    labels: Bools,
+    places: Mapping[str, Ints],
     rng: np.random.Generator,
-) -> NDArray[np.int64]:
+) -> Ints:
     """States by how interesting they are, int64 (N,): kinds of outcome take turns, and within each the places.
 
     Takes predictions (N, K), labels (N,), places (N,) each. States on which all members are right come last; ``rng``

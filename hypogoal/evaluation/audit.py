@@ -5,32 +5,34 @@ its positive predictions. So options are learned that end at these, and the trut
 up.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import compress
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.arrays import Bools, Floats, Ints
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.films import episode_gif
 from hypogoal.evaluation.selection import states_met
-from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
+from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
-from hypogoal.meta.episodes import Frame
+from hypogoal.meta import episodes
 from hypogoal.meta.setup import Setup
-from hypogoal.observations import PICTURE, Observations, Standard, standard_of
+from hypogoal.observations import PICTURE, Observations, standard_of
+from hypogoal.options import termination
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Execution
 from hypogoal.options.tables import Exploits
-from hypogoal.options.termination import Terminations, load_rule
 
 BEFORE, MENDED, SEARCH = POLICIES = ("before", "mended", "search")
 CHUNK = 256  # observations that own code is given at once
@@ -39,92 +41,82 @@ FILMS = 4  # kinds that are shown
 NEVER = -100.0  # log-odds
 RANDOM_STEPS = 4_000  # of random play
 DECIMALS = 6  # of a threshold, which float32 log-odds round
-Classifier = Callable[[Observations], NDArray[np.floating]]  # observations (n, *obs) -> log-odds (n,)
 
 
-@dataclass(frozen=True)
-class Target:
-    """A classifier to audit."""
+class OwnClassifier:
+    """Code of the user's own, ``module:function``, as an ensemble of one member; anything else is a ``UserError``."""
 
-    classify: Classifier
-    threshold: float  # the probability above which its prediction is positive
-    standard: Standard | None = None  # of observations that are no pictures; None: unknown
-    domain_config: Mapping[str, Any] = field(default_factory=dict)  # of the world that its data were collected in
-    inputs: Sequence[Path] = ()
+    thresholds = np.array([THRESHOLD])
 
+    def __init__(self, name: str):
+        self.name = name
+        self.function = load(name, "classifier", "hypogoal.classifiers", {})
+        if not callable(self.function):
+            do = "Give one from observations (N, *obs) to probabilities (N,)."
+            raise UserError("this is not a function", name, do)
 
-def target_of(name: str, sub_goal: str, member: int, domain: str, device: str) -> Target:
-    """A member of an ensemble artefact, or ``module:function``; anything else is a ``UserError``."""
-    if ":" in name and not Path(name).is_dir():
-        return Target(own_classifier(name), THRESHOLD)
-    source = open_artefact(Path(name), "ensemble")
-    ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
-    if member >= len(ensemble):
-        raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(ensemble) - 1}.")
-
-    def classify(observations: Observations) -> NDArray[np.floating]:
-        return ensemble.log_odds(observations)[:, member]
-
-    world = source.config["domain_config"] if source.config["domain"] == domain else {}
-    return Target(classify, float(ensemble.thresholds[member]), ensemble.view.standard, world, [source.path])
-
-
-def own_classifier(name: str) -> Classifier:
-    """Code of the user's own, from observations (n, *obs) to probabilities (n,); else a ``UserError``."""
-    function = load(name, "classifier", "hypogoal.classifiers", {})
-    if not callable(function):
-        raise UserError("this is not a function", name, "Give one from observations (N, *obs) to probabilities (N,).")
-
-    def classify(observations: Observations) -> NDArray[np.floating]:
+    def predict(self, observations: Observations) -> Any:
+        """Probabilities (n, 1) of observations (n, *obs)."""
         parts = []
         for some in np.split(observations, range(CHUNK, len(observations), CHUNK)):
-            probabilities = np.asarray(function(some), dtype=np.float64)
+            probabilities = np.asarray(self.function(some), dtype=np.float64)
             if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():
                 fault = f"the classifier gave {probabilities.shape} {probabilities.ravel()[:3]}"
-                raise UserError(fault, name, f"Give probabilities, 0 to 1, float ({len(some)},).")
+                raise UserError(fault, self.name, f"Give probabilities, 0 to 1, float ({len(some)},).")
             parts.append(probabilities)
-        return log_odds_of(np.concatenate(parts))
+        return np.concatenate(parts)[:, None]
 
-    return classify
+    def log_odds(self, observations: Observations) -> Any:
+        """Log-odds (n, 1) of observations (n, *obs)."""
+        return log_odds_of(self.predict(observations))
+
+
+Classifier = Ensemble | OwnClassifier
+
+
+def classifier_of(name: str, sub_goal: str, device: str) -> tuple[Classifier, Artefact | None]:
+    """The members of an ensemble artefact, and that, or code of the user's own; anything else is a ``UserError``."""
+    if ":" in name and not Path(name).is_dir():
+        return OwnClassifier(name), None
+    source = open_artefact(Path(name), "ensemble")
+    ensemble = read_ensemble(source.path, source.config, sub_goal)
+    return ensemble.to(device), source
 
 
 def terminations_of(
-    target: Target,
+    classifier: Classifier,
+    member: int,
     column: int,
     policies: Mapping[str, float],
-) -> Callable[[Setup, Engine], Terminations]:
-    """A function of an engine: options that end at a classifier's positives, one for each policy's threshold.
+    setup: Setup,
+    engine: Engine,
+) -> termination.Terminations:
+    """Options that end at a member's positives, one for each policy's threshold.
 
     That of the policy ``search`` ends at false positives alone, where sub-goal number ``column`` does not hold.
     """
-    edges = np.array([*policies.values()])
     names = [*policies]
 
-    def ends(setup: Setup, engine: Engine) -> Terminations:
-        def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-            of_states = target.classify(engine.images(ids)).astype(np.float32)
-            every = np.repeat(of_states[:, None], len(edges), axis=1)
-            if SEARCH in names:
-                every[engine.labels(ids)[:, column], names.index(SEARCH)] = NEVER
-            return every
+    def log_odds(ids: Ints) -> Floats:
+        of_members = classifier.log_odds(engine.images(ids))
+        every = of_members[:, [member] * len(names)].astype(np.float32)
+        if SEARCH in names:
+            every[engine.labels(ids)[:, column], names.index(SEARCH)] = NEVER
+        return every
 
-        if engine.observation_dtype != PICTURE:
-            engine.standard = target.standard or standard_of(engine.observation_shape)
-        rule = load_rule(setup.config.termination)
-        rule.refuse(setup.config, engine)
-        thresholds = log_odds_of(edges).astype(np.float32)
-        return rule(log_odds, len(edges), None, thresholds, engine.count)
-
-    return ends
-
-
-def report_of(loop: OptionLoop, policies: Iterable[str], sub_goals: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Each policy's findings, and its threshold at the end of learning; None for a policy that was not wanted."""
-    report: dict[str, Any] = dict.fromkeys(POLICIES)
-    for option, name in enumerate(policies):
-        threshold = float(expit(loop.terminations.thresholds[option].astype(np.float64)))
-        report[name] = {"threshold": round(threshold, DECIMALS), **findings(loop, option, name, sub_goals, folder)}
-    return report
+    if engine.observation_dtype != PICTURE:
+        standard = classifier.view.standard if isinstance(classifier, Ensemble) else None
+        engine.standard = standard or standard_of(engine.observation_shape)
+    rule = termination.load_rule(setup.config.termination)
+    rule.refuse(setup.config, engine)
+    edges = log_odds_of(np.array([*policies.values()]))
+    return rule(
+        log_odds,
+        len(names),
+        None,
+        edges.astype(np.float32),
+        engine.count,
+    )
 
 
 def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict[str, Any]:
@@ -135,9 +127,13 @@ def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict
     ids = ids[engine.remembers(ids)]
     truth = engine.labels(ids)[:, column]
     positive = loop.terminations.of(ids)[:, :1]
-    scores = {name: score.item() for name, score in member_scores(positive, truth).items()}
-    false_positives = float((positive[:, 0] & ~truth).mean())
-    return {"states": len(ids), "positives": int(truth.sum()), "false_positives": false_positives, **scores}
+    scores = member_scores(positive, truth)
+    return {
+        "states": len(ids),
+        "positives": truth.sum(),
+        "false_positives": (positive[:, 0] & ~truth).mean(),
+        **{name: score[0] for name, score in scores.items()},
+    }
 
 
 def shares_of(report: Mapping[str, Any]) -> dict[str, float | None]:
@@ -159,72 +155,63 @@ def findings(
 
     Of each of the most frequent kinds of false positives a film is put into ``folder``, of pictures.
     """
+    threshold = expit(loop.terminations.thresholds[option].astype(np.float64))
     table = Exploits.read(folder / Exploits.FILE)
-    executions = list(loop.recorder.executions[option])
-    of_policy = table.option == option
-    positive, near = table.reached[of_policy], table.near[of_policy]
-    fooled = [executions[row] for row in np.flatnonzero(positive & ~near)]
+    last = table.at(table.option == option)
+    executions = loop.recorder.executions[option]
+    fooled = [*compress(executions, last.reached & ~last.near)]
     kinds = []
     for number, alike in enumerate(kinds_of(loop.engine, fooled)):
         film = f"{name}-{number + 1}.gif"
-        shortest = min(alike, key=lambda row: row.duration)
-        drawn = number < FILMS and _write_film(folder / film, loop, name, shortest)
-        end = np.array(shortest.states[-1:])
-        holds = np.array(sub_goals)[loop.engine.labels(end)[0]].tolist()
-        at = loop.engine.positions(end)[0].tolist() if loop.engine.position_names else []
-        position = dict(zip(loop.engine.position_names, at, strict=True))
-        of_kind = {"executions": len(alike), "holds": holds, "position": position}
-        kinds.append(of_kind | {"film": film if drawn else None})
+        shortest = min(alike, key=attrgetter("duration"))
+        is_drawn = number < FILMS and _write_film(folder / film, loop, name, shortest)
+        labels, position = _end(loop.engine, shortest)
+        kinds.append(
+            {
+                "executions": len(alike),
+                "holds": [*compress(sub_goals, labels)],
+                "position": dict(zip(loop.engine.position_names, position, strict=True)),
+                "film": film if is_drawn else None,
+            }
+        )
     return {
+        "threshold": round(float(threshold), DECIMALS),
         **option_numbers(table, option),
-        "executions": int(of_policy.sum()),
+        "executions": len(last),
         "fooled": len(fooled),
-        "there": int((positive & near).sum()),
-        "positive_at_start": sum(row.inside_at_start for row in executions),
+        "there": (last.reached & last.near).sum(),
+        "positive_at_start": sum(run.inside_at_start for run in executions),
         "kinds": kinds,
     }
 
 
-def kinds_of(engine: Engine, fooled: Sequence[Execution]) -> list[list[Execution]]:
+def kinds_of(engine: Engine, fooled: Iterable[Any]) -> list[list[Any]]:
     """False positives of one kind, the most frequent first: the same sub-goals hold, the cell is the same, if known."""
-    if not fooled:
-        return []
-    ends = np.array([row.states[-1] for row in fooled])
-    marks = engine.labels(ends).astype(np.int64)
-    if engine.position_names:
-        marks = np.concatenate([marks, engine.positions(ends) // CELL], axis=1)
-    _, kind = np.unique(marks, axis=0, return_inverse=True)
-    kinds: list[list[Execution]] = [[] for _ in range(kind.max() + 1)]
-    for row, number in zip(fooled, kind.reshape(-1), strict=True):
-        kinds[number].append(row)
-    return sorted(kinds, key=len, reverse=True)
+    kinds = defaultdict(list)
+    for run in fooled:
+        labels, position = _end(engine, run)
+        kinds[*labels, *position // CELL].append(run)
+    by_mark = [kinds[mark] for mark in sorted(kinds)]
+    return sorted(by_mark, key=len, reverse=True)
 
 
-def _write_film(path: Path, loop: OptionLoop, name: str, execution: Execution) -> bool:
+def _end(engine: Engine, run: Any) -> tuple[Bools, Ints]:
+    """Which sub-goals hold where an execution ended, and where that was, empty if the engine does not know."""
+    ids = np.array(run.states[-1:])
+    positions = engine.positions(ids) if engine.position_names else np.empty((1, 0), np.int64)
+    return engine.labels(ids)[0], positions[0]
+
+
+def _write_film(path, loop, name, run):
     """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
-    ids = np.array([execution.began, *execution.states])
-    if loop.engine.observation_dtype != PICTURE or not loop.engine.remembers(ids).all():
+    ids = np.array([run.began, *run.states])
+    engine, timeout = loop.engine, loop.config.option_timeout
+    if engine.observation_dtype != PICTURE or not engine.remembers(ids).all():
         return False
-    timeout = loop.config.option_timeout
-    positive = loop.terminations.of(ids)[:, execution.option].tolist()
+    positive = loop.terminations.of(ids)[:, run.option].tolist()
     frames = []
-    for step, picture in enumerate(loop.engine.images(ids)):
-        frames.append(Frame(picture, step, 0, (positive[step],), timeout - step, ""))
+    for step, picture in enumerate(engine.images(ids)):
+        frames.append(episodes.Frame(picture, step, 0, (positive[step],), timeout - step, ""))
     frames[-1] = replace(frames[-1], ended="fooled")
     path.write_bytes(episode_gif(frames, [name], 1, timeout))
     return True
-
-
-def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
-    """What ``audit.json`` says, for a terminal of 80 columns."""
-    random_play = report["random_play"]
-    yield f"random play: right in {random_play['accuracy']:.1%} of {random_play['states']} states"
-    for name in POLICIES:
-        if row := report[name]:
-            ends = f"fooled in {row['fooled']} of {row['executions']} executions, there in {row['there']}"
-            yield f"{name}, positive above {row['threshold']:.4g}: {ends}"
-            if row["positive_at_start"]:
-                yield f"  {row['positive_at_start']} begin where it is positive already, so that doing nothing is paid"
-            for kind in row["kinds"][:FILMS]:
-                sub_goals = " and ".join(kind["holds"]) or "no sub-goal"
-                yield f"  {kind['film'] or '':12s} {kind['executions']:4d} x  while {sub_goals} holds"

@@ -48,7 +48,7 @@ def agent_to_film(run: Path) -> Artefact | None:
 def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
     """Spec E1: the first ``count`` episodes of an agent, whose ``path`` in the run names them.
 
-    None: one, the first that :func:`_tells` within ``MOST_FRAMES``, else the first of all. Without pictures a
+    None: one, the first that :func:`_telling` finds within ``MOST_FRAMES``, else the first of all. Without pictures a
     ``UserError``.
     """
     from hypogoal.meta.episodes import agent_of, play_episode
@@ -57,27 +57,30 @@ def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
     if loop.engine.observation_dtype != PICTURE:
         raise UserError("videos need an agent that sees pictures", agent.path, "Leave --videos out.")
     members = agent.config["members"]
-    if count is not None:
-        return [_film(agent, path, number, play_episode(loop, members)) for number in range(count)]
-    played: list[Sequence[Frame]] = []
+    if count is None:
+        return [_film(agent.config, path, *_telling(loop, members))]
+    return [_film(agent.config, path, number, play_episode(loop, members)) for number in range(count)]
+
+
+def _telling(loop, members):
+    """The number and frames of the first episode in which the agent took the right one of members that differ.
+
+    The last option's own member ended it, solved.
+    """
+    from hypogoal.meta.episodes import SOLVED, play_episode
+
+    played: list[list[Frame]] = []
     while sum(map(len, played)) < MOST_FRAMES:
-        played.append(play_episode(loop, members))
-        if _tells(played[-1], members):
-            return [_film(agent, path, len(played) - 1, played[-1])]
-    return [_film(agent, path, 0, played[0])]
+        frames = play_episode(loop, members)
+        last = frames[-1]
+        is_right = last.ended == SOLVED and last.predictions[last.option % members]
+        if is_right and any(len({*frame.predictions}) > 1 for frame in frames):
+            return len(played), frames
+        played.append(frames)
+    return 0, played[0]
 
 
-def _tells(frames: Sequence[Frame], members: int) -> bool:
-    """Whether the agent took the right one of members that differ: the last option's own ended a solved episode."""
-    from hypogoal.meta.episodes import SOLVED
-
-    last = frames[-1]
-    right = last.ended == SOLVED and last.predictions[last.option % members]
-    return right and any(len(set(frame.predictions)) > 1 for frame in frames)
-
-
-def _film(agent: Artefact, path: str, number: int, frames: Sequence[Frame]) -> Film:
-    config = agent.config
+def _film(config, path, number, frames):
     facts = {
         "path": path,
         "number": number,
@@ -92,14 +95,15 @@ def _film(agent: Artefact, path: str, number: int, frames: Sequence[Frame]) -> F
 
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
     """What is written below a frame: the option that runs, each member's prediction, and why the option ended."""
-    running = frame.option % members
-    lines = [f"option: {sub_goals[frame.option // members]}"]
+    goal, running = divmod(frame.option, members)
+    lines = [f"option: {sub_goals[goal]}"]
     for member, positive in enumerate(frame.predictions):
         name = f"member {member}" if members > 1 else "its classifier"
         mark = ">" if member == running else " "
-        lines.append(f"{mark} {name}: {'positive' if positive else 'negative'}")
-    lines.append(f"step {frame.step}" + (f", ends: {frame.ended}" if frame.ended else ""))
-    return lines
+        says = "positive" if positive else "negative"
+        lines.append(f"{mark} {name}: {says}")
+    end = f", ends: {frame.ended}" if frame.ended else ""
+    return [*lines, f"step {frame.step}{end}"]
 
 
 def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> Image.Image:
@@ -111,14 +115,16 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     state = ImageOps.scale(state, max(1, SIDE // max(state.size)), Image.Resampling.NEAREST)
     width, height = state.size
     lines = frame_lines(frame, sub_goals, members)
-    picture = ImageOps.expand(state, (0, 0, 0, BAR + 2 * MARGIN + LINE * len(lines)), INK)
+    below = BAR + 2 * MARGIN + LINE * len(lines)
+    picture = ImageOps.expand(state, (0, 0, 0, below), INK)
     draw = ImageDraw.Draw(picture)
     colour = PALETTE[frame.option // members % len(PALETTE)]
     draw.rectangle((0, height, width * frame.left / timeout, height + BAR), colour)
     font = ImageFont.load_default(FONT)
-    for number, line in enumerate(lines):
-        place = (MARGIN, height + BAR + MARGIN + number * LINE)
-        draw.text(place, line, GREY if line.endswith("negative") else "white", font)
+    top = height + BAR + MARGIN
+    for line in lines:
+        draw.text((MARGIN, top), line, GREY if line.endswith("negative") else "white", font)
+        top += LINE
     return picture
 
 
@@ -132,11 +138,19 @@ def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int,
     for frame in frames:
         picture = draw_frame(frame, sub_goals, members, timeout)
         pictures.append(picture.quantize(SHADES, dither=Image.Dither.NONE))
-        differ = len(set(frame.predictions)) > 1 and before != frame.predictions
-        times.append(END if frame.ended else PAUSE if differ else STEP)
+        differ = len({*frame.predictions}) > 1 and before != frame.predictions
+        time = PAUSE if differ else STEP
+        times.append(END if frame.ended else time)
         before = frame.predictions
     times[-1] = LAST
-    first, *rest = pictures
     buffer = io.BytesIO()
-    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=times, loop=0, optimize=False)
+    pictures[0].save(
+        buffer,
+        "GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=times,
+        loop=0,
+        optimize=False,
+    )
     return buffer.getvalue()

@@ -1,14 +1,20 @@
-"""States as pictures (Spec F2, F7): the frame that is shown, attributions over it, states laid over each other."""
+"""States as pictures (Spec A1, B5, F2, F7): single ones, attributions over them, many over or beside each other."""
 
 import io
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap
-from numpy.typing import NDArray
 from PIL import Image
 
+from hypogoal.core.arrays import Bytes, Doubles
+from hypogoal.core.errors import UserError
+from hypogoal.data import SPLITS, States, open_dataset
 from hypogoal.evaluation.plots import BLUE, VERMILLION
+from hypogoal.observations import PICTURE, fields_of, spread_rows, type_text
 
 MOST_SIDE = 128  # pixels of a picture on the page
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION], N=25)  # few: small files
@@ -16,21 +22,41 @@ STRONGEST = 0.995  # the quantile of absolute attributions that has full colour
 SHADE = 0.28  # how dark the brightest pixels of a state make the attributions over them
 STATES = "termination-states"  # in an evaluation's arrays: of how many states each option's overlay is
 FEW = 200  # states whose median is taken for what is usual
+MOST_STATES = 60  # on a sheet
+COLUMNS = 10
+GAP = 2  # pixels around each state
+PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
 
 
-def last_frame(values: NDArray[Any], colours: int | None = None) -> NDArray[Any]:
+def last_frame(values: Any, colours: int | None = None) -> Any:
     """Of pictures (..., C) the last frame's channels, so many ``colours``: by default 3 where C is 3, else 1."""
     default = 3 if values.shape[-1] == 3 else 1
     return values[..., -(colours or default) :]
 
 
-def coloured(observations: NDArray[np.uint8], colours: int | None = None) -> NDArray[np.uint8]:
+def coloured(observations: Bytes, colours: int | None = None) -> Bytes:
     """Observations (..., C) as they are shown, (..., 3): of the last frame."""
-    shown = last_frame(observations, colours)
+    shown: Bytes = last_frame(observations, colours)
     return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
 
 
-def encoded(image: NDArray[np.uint8]) -> bytes:
+def picture_of(state: Any) -> Bytes | None:
+    """A state's pictures side by side, uint8 (H, W, 3); None without any."""
+    parts = []
+    for key, (dtype, _) in fields_of(state.shape, state.dtype).items():
+        if dtype == PICTURE:
+            parts.append(coloured(state[key] if key else state))
+    if not parts:
+        return None
+    height = max(map(len, parts))
+    padded = []
+    for part in parts:
+        below = height - len(part)
+        padded.append(np.pad(part, ((0, below), (0, 0), (0, 0)), constant_values=255))
+    return np.concatenate(padded, axis=1)
+
+
+def encoded(image: Bytes) -> bytes:
     """An observation (H, W, C) for the page: a WebP file without loss, reduced to at most ``MOST_SIDE`` pixels."""
     picture = Image.fromarray(np.ascontiguousarray(coloured(image)))
     times = -(-max(picture.size) // MOST_SIDE)
@@ -39,11 +65,7 @@ def encoded(image: NDArray[np.uint8]) -> bytes:
     return buffer.getvalue()
 
 
-def attribution_image(
-    values: NDArray[np.floating],
-    state: NDArray[np.uint8],
-    colours: int | None = None,
-) -> NDArray[np.uint8]:
+def attribution_image(values: Doubles, state: Bytes, colours: int | None = None) -> Bytes:
     """Figures 2 and 9: attributions (H, W, C) to the last frame of a state (H, W, C), uint8 (H, W, 3).
 
     Orange where positive, blue where negative, white where none; the state shows through as a light shade.
@@ -53,17 +75,18 @@ def attribution_image(
     colour = SIGNED(0.5 + summed / (2 * size))[..., :3]
     brightness = last_frame(state, colours).mean(axis=-1, keepdims=True) / 255
     image = 255 * colour * (1 - SHADE * brightness)
-    return np.asarray(image.round().astype(np.uint8))
+    return image.round().astype(np.uint8)
 
 
-def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def overlay(states: Bytes) -> Bytes:
     """Figures 7 and 8: termination states uint8 (n, H, W, C), n at least 1, laid over each other.
 
     The state with the fewest unusual pixels is drawn whole. Over it, half transparent, is what the others show that is
     unusual: agents in other cells, say. A pixel is usual that is as in the median state.
     """
     few = states[:: max(1, len(states) // FEW)]
-    usual = np.partition(few, len(few) // 2, axis=0)[len(few) // 2]
+    middle = len(few) // 2
+    usual = np.partition(few, middle, axis=0)[middle]
     unusual = states != usual
     if states.shape[-1] == 3:  # a colour is one thing, a stack's frames are several
         unusual[:] = unusual.any(axis=-1, keepdims=True)
@@ -71,4 +94,51 @@ def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     shown = states[whole]
     others = np.ma.array(states, mask=~unusual).mean(axis=0).filled(shown)
     laid_over = np.where(unusual[whole], shown, (shown + others) / 2)
-    return np.asarray(laid_over.round().astype(np.uint8))
+    return laid_over.round().astype(np.uint8)
+
+
+def write_sheets(path: Path, folder: Path) -> list[Path]:
+    """Draw a data file's labelled and held-out states, a picture for each room and label, to check labels by eye.
+
+    The files are ``labelled/SUB_GOAL/room-01-positives.png`` and so on in ``folder``. A path that is no data file and
+    states that are not pictures are a ``UserError``.
+    """
+    if not path.is_file():
+        raise UserError("sheets of states need a data file", path, "Give the .h5 file of the states.")
+    dataset = open_dataset(path)
+    if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
+        actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
+        raise UserError("the states are not pictures", actual, "Read them with h5py, see docs/formats.md.")
+    written = []
+    for split in SPLITS:
+        for sub_goal in dataset.sub_goals:
+            place = folder / split / sub_goal
+            place.mkdir(parents=True, exist_ok=True)
+            for name, shown in sheets(getattr(dataset, split)(sub_goal)):
+                written.append(place / f"{name}.png")
+                Image.fromarray(shown).save(written[-1])
+    return written
+
+
+def sheets(split: States) -> Iterator[tuple[str, Bytes]]:
+    """A sheet of each room and label, with its name, such as ``room-01-positives``; states are spread over them."""
+    words = np.where(split.labels, "positives", "negatives")
+    table = pd.DataFrame({"name": words, "negative": ~split.labels, "place": 0})
+    for place in PLACES:
+        if place in split.origins:
+            table["place"] = split.origins[place]
+            table["name"] = table["place"].map((place.replace("_", "-") + "-{:02d}-").format) + words
+            break
+    for _, alike in table.groupby(["place", "negative"]):
+        few = alike.index[spread_rows(len(alike), MOST_STATES)]
+        yield alike["name"].iloc[0], sheet(split.observations[few])
+
+
+def sheet(observations: Bytes) -> Bytes:
+    """Observations uint8 (n, H, W, C) in rows of ``COLUMNS``, uint8 (height, width, 3); black where there is none."""
+    shown = coloured(observations)
+    missing = -len(shown) % COLUMNS
+    padded = np.pad(shown, ((0, missing), (GAP, GAP), (GAP, GAP), (0, 0)))
+    _, height, width, _ = padded.shape
+    rows = padded.reshape(-1, COLUMNS, height, width, 3)
+    return rows.swapaxes(1, 2).reshape(-1, COLUMNS * width, 3)

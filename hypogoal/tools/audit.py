@@ -1,12 +1,13 @@
 """Spec H5: how often policies fool a success classifier, where, and what a mend changes."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hypogoal.core.artefacts import TO_FILL_IN
+from hypogoal.core.artefacts import DATA, TO_FILL_IN, open_artefact
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.terminal import say
 from hypogoal.stages import Call, Done, stage
@@ -67,6 +68,7 @@ def _in_play(
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation import audit as played
     from hypogoal.evaluation.house import as_json
+    from hypogoal.evaluation.page import lines_of
     from hypogoal.learners.world import columns_of
     from hypogoal.meta.setup import Setup
     from hypogoal.meta.training import assemble
@@ -76,29 +78,38 @@ def _in_play(
     config = call.settings(domain)
     world = load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
-    target = played.target_of(classifier, sub_goal, member, domain, device)
-    policies = _policies(config, target.threshold)
+    audited, source = played.classifier_of(classifier, sub_goal, device)
+    thresholds = audited.thresholds.tolist()
+    if member >= len(thresholds):
+        raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(thresholds) - 1}.")
+    policies = _policies(config, thresholds[member])
     ensemble_config = {
         "sub_goals": [sub_goal],
         "members": len(policies),
         "domain": domain,
-        "domain_config": target.domain_config,
+        "domain_config": {},
     }
+    if source and source.config["domain"] == domain:
+        ensemble_config["domain_config"] = source.config["domain_config"]
     setup = Setup(world, ensemble_config, Path(), config, call.seed, device)
     settings = agents.description(setup, classifier=classifier, member=member)
+    inputs = [source.path] if source else []
     try:
-        with call.training("audit", settings, target.inputs, config.steps) as work:
-            loop = assemble(setup, played.terminations_of(target, column, policies))
+        with call.training("audit", settings, inputs, config.steps) as work:
+            ends = partial(played.terminations_of, audited, member, column, policies)
+            loop = assemble(setup, ends)
             agents.learn(work, setup, loop, config.steps)
             files = work.draft.files
+            report: dict[str, Any] = dict.fromkeys(played.POLICIES)
+            for option, name in enumerate(policies):
+                report[name] = played.findings(loop, option, name, world.sub_goals, files)
             rng = rng_for(call.seed, "random-play")
-            report = played.report_of(loop, policies, world.sub_goals, files)
             report["random_play"] = played.random_play(loop, column, rng)
             (files / REPORT).write_text(as_json(report) + "\n", encoding="utf-8")
     except Complete as complete:  # what was found stands, and may still fail
         say(complete, err=True)
     findings = json.loads((call.out / REPORT).read_text(encoding="utf-8"))
-    return [*played.lines_of(findings)], played.shares_of(findings)
+    return lines_of("played.txt", findings), played.shares_of(findings)
 
 
 def _policies(config: Any, threshold: float) -> dict[str, float]:
@@ -124,13 +135,58 @@ def _on_recorded_data(
     sub_goal: str | None,
     member: int | None,
 ) -> tuple[list[str], dict[str, float | None]]:
-    """An audit where there is no simulator, of a function or of all members of an ensemble: as :func:`_in_play`."""
-    from hypogoal.tools.audit_recorded import audit_recorded
+    """Spec I6: an audit without a simulator, of a function or of all members of an ensemble; else as :func:`_in_play`.
 
-    if member is not None or call.typed or call.preset or call.resume or not (data or Path(source).is_dir()):
+    ``out`` gets ``audit.json``, the page ``index.html`` and, for each sub-goal (or the named one), ``next/SUB_GOAL/``.
+    """
+    from hypogoal.core.processes import prepare
+    from hypogoal.core.progress import Progress
+    from hypogoal.data import open_dataset
+    from hypogoal.evaluation import page, recorded
+    from hypogoal.evaluation.audit import classifier_of
+    from hypogoal.evaluation.house import as_json
+    from hypogoal.evaluation.plots import slug
+    from hypogoal.importing.labels import COLUMNS
+
+    is_ensemble = Path(source).is_dir()
+    if member is not None or call.typed or call.preset or call.resume or not (data or is_ensemble):
         do = "Give --domain and --sub-goal; or, without settings, an ensemble's folder or --data FILE."
         raise UserError("an audit plays in a domain, or looks at recorded data", source, do)
-    lines, shares = audit_recorded(call, source, data, sub_goal)
+    device = prepare(call.device)
+    inputs = []
+    if is_ensemble:
+        artefact = open_artefact(Path(source), "ensemble")
+        inputs = [artefact.path]
+        data = data or artefact.input(DATA)
+    assert data is not None
+    dataset = open_dataset(data)
+    goals = artefact.config["sub_goals"] if is_ensemble else dataset.sub_goals
+    if sub_goal not in (None, *goals):
+        raise UserError("unknown sub-goal", sub_goal, f"They are {', '.join(goals)}.")
+    goals = [sub_goal] if sub_goal else [*goals]
+    parts, sections = [], []
+    with (
+        call.draft("recorded-audit", {"sub_goals": goals, "classifier": source}, [*inputs, data]) as draft,
+        Progress("audit", len(goals), quiet=call.quiet) as progress,
+    ):
+        for goal in goals:
+            classifier, _ = classifier_of(source, goal, device)
+            findings = recorded.findings_of(classifier, dataset, goal)
+            recorded.write_next(draft.files / "next" / goal, COLUMNS, findings)
+            parts.append(findings.numbers)
+            section = page.section("audited", vars(findings))
+            sections.append((slug(goal), goal, section, False))
+            progress.advance()
+        lines = page.lines_of("audited.txt", {"parts": parts})
+        title = f"hypogoal: audit of {Path(source).name}"
+        text = page.draw_page(title, sections, "audit.html", lines=lines)
+        (draft.files / "index.html").write_text(text, encoding="utf-8")
+        (draft.files / REPORT).write_text(as_json({"sub_goals": parts}) + "\n", encoding="utf-8")
+    shares = []
+    for part in parts:
+        for row in part["members"]:
+            if row["negatives"]:
+                shares.append(row["false_positives"] / row["negatives"])
     table = call.out / "next" / "SUB_GOAL" / TO_FILL_IN
     lines.append(f"then fill in the column 'label' of {table}: 1 or 0, for the pictures beside it; see docs/audit.md")
-    return lines, shares
+    return lines, {"failures": max(shares, default=None)}

@@ -18,13 +18,12 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation import attributing, judging
 from hypogoal.evaluation.distance import HIT, MISS, STOP
-from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.questions import summary
 from hypogoal.evaluation.run import find_artefacts, read_evaluation
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import report
+from hypogoal.stages.report import draw_figures, report
 
 QUIET = {"quiet": True}
 DBAT, NONE, ONE = "D-BAT, 2 members", "no diversity, 2 members", "one classifier"

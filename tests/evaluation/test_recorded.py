@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hypogoal.evaluation.page import lines_of
 from hypogoal.evaluation.recorded import density_of, disagreement, member_table, sketches_of, to_label
-from hypogoal.evaluation.recorded_page import lines_of
 from hypogoal.observations import packed
 
 
@@ -69,6 +69,6 @@ def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:
         for member, share in enumerate((1.0, 0.25, 0.0))
     ]
     part = {"sub_goal": "door", "unlabelled": 8, "disagreement": 1.0, "members": rows}
-    assert "100.0% of 8 unlabelled states (the same prediction for all of them: member 0, 2)" in lines_of([part])[0]
-    alone = lines_of([part | {"members": rows[1:2]}])[0]
+    several, alone = lines_of("audited.txt", {"parts": [part, part | {"members": rows[1:2]}]})
+    assert "100.0% of 8 unlabelled states (the same prediction for all of them: member 0, 2)" in several
     assert "the classifier predicts 25.0% of 8 unlabelled states positive" in alone and "disagree" not in alone

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hypogoal.cli import main
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.data import open_dataset
-from hypogoal.evaluation.recorded_page import picture_of
+from hypogoal.evaluation.pictures import picture_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
 from tests import mixed
