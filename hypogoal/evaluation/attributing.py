@@ -10,7 +10,12 @@ from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.house import tidy_members
-from hypogoal.evaluation.judging import Judgement, Work, place_of, states_of
+from hypogoal.evaluation.judging import (
+    Judgement,
+    Work,
+    place_of,
+    states_of,
+)
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 GALLERY = 40  # states of all sub-goals
@@ -27,7 +32,12 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
     numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
     """
-    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, mean_state, method_of
+    from hypogoal.hypotheses.deep_lift import (
+        DEEP_LIFT,
+        attributed,
+        mean_state,
+        method_of,
+    )
 
     case, sub_goal, split = judgement.case, judgement.sub_goal, judgement.split
     if judgement.number != work.browsed or not len(split.labels):
@@ -47,7 +57,11 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     seen = ensemble.see(observations[explained])
     attributions = attributed(ensemble, seen, mean_state(ensemble.see(unlabelled)))
     error = attributions.completeness_error()
-    facts = {"kinds": kinds, "how": attributions.method, "completeness_error": error.max()}
+    facts = {
+        "kinds": kinds,
+        "how": attributions.method,
+        "completeness_error": error.max(),
+    }
     values: Any = attributions.values
     arrays = {}
     if are_pictures:
@@ -81,10 +95,20 @@ def states_to_show(judgement: Judgement) -> tuple[list[str], Ints]:
     allowed = origins.get("seen", np.zeros(len(labels))) == 0
     if not labels[allowed].any():
         allowed[:] = True
-    kinds = pick_to_explain(judgement.judged.probabilities, predictions, labels, allowed)
+    kinds = pick_to_explain(
+        judgement.judged.probabilities,
+        predictions,
+        labels,
+        allowed,
+    )
     places = {name: origins[name] for name in PLACES if name in origins}
     rng = rng_for(0, "browse", judgement.sub_goal)
-    browsed = pick_for_gallery(predictions, labels, places, rng)
+    browsed = pick_for_gallery(
+        predictions,
+        labels,
+        places,
+        rng,
+    )
     states = pd.unique(np.array([*kinds.values(), *browsed]))
     return [*kinds], states[: GALLERY // len(judgement.case.config["sub_goals"])]
 

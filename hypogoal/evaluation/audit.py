@@ -7,7 +7,6 @@ up.
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import compress
 from operator import attrgetter
 from pathlib import Path
@@ -16,71 +15,28 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from hypogoal.core.arrays import Bools, Floats, Ints
-from hypogoal.core.artefacts import Artefact, open_artefact
-from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load
+from hypogoal.core.arrays import Floats, Ints
 from hypogoal.domains.base import Engine
+from hypogoal.evaluation.classifiers import Classifier
 from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.films import episode_gif
 from hypogoal.evaluation.selection import states_met
-from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
+from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
-from hypogoal.meta import episodes
+from hypogoal.meta.episodes import Frame
 from hypogoal.meta.setup import Setup
-from hypogoal.observations import PICTURE, Observations, standard_of
-from hypogoal.options import termination
+from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.tables import Exploits
+from hypogoal.options.termination import Terminations, load_rule
 
 BEFORE, MENDED, SEARCH = POLICIES = ("before", "mended", "search")
-CHUNK = 256  # observations that own code is given at once
 CELL = 8  # of positions that count as one place
 FILMS = 4  # kinds that are shown
 NEVER = -100.0  # log-odds
 RANDOM_STEPS = 4_000  # of random play
 DECIMALS = 6  # of a threshold, which float32 log-odds round
-
-
-class OwnClassifier:
-    """Code of the user's own, ``module:function``, as an ensemble of one member; anything else is a ``UserError``."""
-
-    thresholds = np.array([THRESHOLD])
-
-    def __init__(self, name: str):
-        self.name = name
-        self.function = load(name, "classifier", "hypogoal.classifiers", {})
-        if not callable(self.function):
-            do = "Give one from observations (N, *obs) to probabilities (N,)."
-            raise UserError("this is not a function", name, do)
-
-    def predict(self, observations: Observations) -> Any:
-        """Probabilities (n, 1) of observations (n, *obs)."""
-        parts = []
-        for some in np.split(observations, range(CHUNK, len(observations), CHUNK)):
-            probabilities = np.asarray(self.function(some), dtype=np.float64)
-            if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():
-                fault = f"the classifier gave {probabilities.shape} {probabilities.ravel()[:3]}"
-                raise UserError(fault, self.name, f"Give probabilities, 0 to 1, float ({len(some)},).")
-            parts.append(probabilities)
-        return np.concatenate(parts)[:, None]
-
-    def log_odds(self, observations: Observations) -> Any:
-        """Log-odds (n, 1) of observations (n, *obs)."""
-        return log_odds_of(self.predict(observations))
-
-
-Classifier = Ensemble | OwnClassifier
-
-
-def classifier_of(name: str, sub_goal: str, device: str) -> tuple[Classifier, Artefact | None]:
-    """The members of an ensemble artefact, and that, or code of the user's own; anything else is a ``UserError``."""
-    if ":" in name and not Path(name).is_dir():
-        return OwnClassifier(name), None
-    source = open_artefact(Path(name), "ensemble")
-    ensemble = read_ensemble(source.path, source.config, sub_goal)
-    return ensemble.to(device), source
 
 
 def terminations_of(
@@ -90,7 +46,7 @@ def terminations_of(
     policies: Mapping[str, float],
     setup: Setup,
     engine: Engine,
-) -> termination.Terminations:
+) -> Terminations:
     """Options that end at a member's positives, one for each policy's threshold.
 
     That of the policy ``search`` ends at false positives alone, where sub-goal number ``column`` does not hold.
@@ -107,7 +63,7 @@ def terminations_of(
     if engine.observation_dtype != PICTURE:
         standard = classifier.view.standard if isinstance(classifier, Ensemble) else None
         engine.standard = standard or standard_of(engine.observation_shape)
-    rule = termination.load_rule(setup.config.termination)
+    rule = load_rule(setup.config.termination)
     rule.refuse(setup.config, engine)
     edges = log_odds_of(np.array([*policies.values()]))
     return rule(
@@ -195,14 +151,19 @@ def kinds_of(engine: Engine, fooled: Iterable[Any]) -> list[list[Any]]:
     return sorted(by_mark, key=len, reverse=True)
 
 
-def _end(engine: Engine, run: Any) -> tuple[Bools, Ints]:
+def _end(engine, run):
     """Which sub-goals hold where an execution ended, and where that was, empty if the engine does not know."""
     ids = np.array(run.states[-1:])
     positions = engine.positions(ids) if engine.position_names else np.empty((1, 0), np.int64)
     return engine.labels(ids)[0], positions[0]
 
 
-def _write_film(path, loop, name, run):
+def _write_film(
+    path,
+    loop,
+    name,
+    run,
+):
     """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
     ids = np.array([run.began, *run.states])
     engine, timeout = loop.engine, loop.config.option_timeout
@@ -211,7 +172,7 @@ def _write_film(path, loop, name, run):
     positive = loop.terminations.of(ids)[:, run.option].tolist()
     frames = []
     for step, picture in enumerate(engine.images(ids)):
-        frames.append(episodes.Frame(picture, step, 0, (positive[step],), timeout - step, ""))
-    frames[-1] = replace(frames[-1], ended="fooled")
+        ended = "fooled" if step == len(run.states) else ""
+        frames.append(Frame(picture, step, 0, (positive[step],), timeout - step, ended))
     path.write_bytes(episode_gif(frames, [name], 1, timeout))
     return True

@@ -25,7 +25,7 @@ MOST_FRAMES = 200  # played for the page's film, till an episode has members tha
 SIDE = 336  # pixels that a moving state is enlarged to, or a little less
 LINE, MARGIN, BAR, FONT = 18, 8, 8, 13  # pixels below it
 STEP, PAUSE, END, LAST = 140, 500, 600, 1_500  # milliseconds: a step, members differ, an option's end, the last frame
-SHADES = 64  # colours of a film
+SHADES = 48  # colours of a film
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,12 @@ def _telling(loop, members):
     return 0, played[0]
 
 
-def _film(config, path, number, frames):
+def _film(
+    config,
+    path,
+    number,
+    frames,
+):
     facts = {
         "path": path,
         "number": number,
@@ -106,7 +111,12 @@ def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[st
     return [*lines, f"step {frame.step}{end}"]
 
 
-def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> Image.Image:
+def draw_frame(
+    frame: Frame,
+    sub_goals: Sequence[str],
+    members: int,
+    timeout: int,
+) -> Image.Image:
     """A frame enlarged; a bar is as long as the steps that are left to the option, of ``timeout``.
 
     Option g*K + k is member k of sub-goal g, whose colour the bar has; positive predictions are written in white.
@@ -128,7 +138,12 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     return picture
 
 
-def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int, timeout: int) -> bytes:
+def episode_gif(
+    frames: Sequence[Frame],
+    sub_goals: Sequence[str],
+    members: int,
+    timeout: int,
+) -> bytes:
     """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1.
 
     It pauses where an option ends, and where its member comes to differ from others of its sub-goal.

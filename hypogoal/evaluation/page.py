@@ -61,12 +61,8 @@ class Results:
 
     def within(self, folder: str) -> dict[str, Any]:
         """The arrays of a folder, by their names in it."""
-        inside = {}
-        for path, values in self.arrays.items():
-            place, _, name = path.rpartition("/")
-            if place == folder:
-                inside[name] = values
-        return inside
+        start = f"{folder}/"
+        return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
 
 def fixed(
@@ -84,7 +80,12 @@ def percent(value: Any) -> str:
     return DASH if pd.isna(value) else f"{100 * value:.0f} %"
 
 
-def between(low: Any, high: Any, digits: int, scale: float = 1.0) -> str:
+def between(
+    low: Any,
+    high: Any,
+    digits: int,
+    scale: float = 1.0,
+) -> str:
     """An interval; nothing where there is none."""
     return "" if pd.isna(low) else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
 
@@ -243,7 +244,11 @@ def draw_page(
 ) -> str:
     """Sections (id, title, part, folded) as one HTML file that needs nothing else; ``lead``: what stands above them."""
     version = versions().get("hypogoal", "unknown")
-    context = {"title": title, "sections": sections, "version": version}
+    context = {
+        "title": title,
+        "sections": sections,
+        "version": version,
+    }
     return templates().get_template(template).render(context | lead)
 
 

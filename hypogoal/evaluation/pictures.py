@@ -14,7 +14,7 @@ from hypogoal.core.arrays import Bytes, Doubles
 from hypogoal.core.errors import UserError
 from hypogoal.data import SPLITS, States, open_dataset
 from hypogoal.evaluation.plots import BLUE, VERMILLION
-from hypogoal.observations import PICTURE, fields_of, spread_rows, type_text
+from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 MOST_SIDE = 128  # pixels of a picture on the page
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION], N=25)  # few: small files
@@ -65,7 +65,11 @@ def encoded(image: Bytes) -> bytes:
     return buffer.getvalue()
 
 
-def attribution_image(values: Doubles, state: Bytes, colours: int | None = None) -> Bytes:
+def attribution_image(
+    values: Doubles,
+    state: Bytes,
+    colours: int | None = None,
+) -> Bytes:
     """Figures 2 and 9: attributions (H, W, C) to the last frame of a state (H, W, C), uint8 (H, W, 3).
 
     Orange where positive, blue where negative, white where none; the state shows through as a light shade.
@@ -106,9 +110,8 @@ def write_sheets(path: Path, folder: Path) -> list[Path]:
     if not path.is_file():
         raise UserError("sheets of states need a data file", path, "Give the .h5 file of the states.")
     dataset = open_dataset(path)
-    if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
-        actual = f"{type_text(dataset.observation_dtype)} {dataset.observation_shape}"
-        raise UserError("the states are not pictures", actual, "Read them with h5py, see docs/formats.md.")
+    if dataset.observation_dtype != PICTURE:
+        raise UserError("the states are not pictures", path, "Read them with h5py, see docs/formats.md.")
     written = []
     for split in SPLITS:
         for sub_goal in dataset.sub_goals:
@@ -123,7 +126,13 @@ def write_sheets(path: Path, folder: Path) -> list[Path]:
 def sheets(split: States) -> Iterator[tuple[str, Bytes]]:
     """A sheet of each room and label, with its name, such as ``room-01-positives``; states are spread over them."""
     words = np.where(split.labels, "positives", "negatives")
-    table = pd.DataFrame({"name": words, "negative": ~split.labels, "place": 0})
+    table = pd.DataFrame(
+        {
+            "name": words,
+            "negative": ~split.labels,
+            "place": 0,
+        }
+    )
     for place in PLACES:
         if place in split.origins:
             table["place"] = split.origins[place]
@@ -140,5 +149,11 @@ def sheet(observations: Bytes) -> Bytes:
     missing = -len(shown) % COLUMNS
     padded = np.pad(shown, ((0, missing), (GAP, GAP), (GAP, GAP), (0, 0)))
     _, height, width, _ = padded.shape
-    rows = padded.reshape(-1, COLUMNS, height, width, 3)
+    rows = padded.reshape(
+        -1,
+        COLUMNS,
+        height,
+        width,
+        3,
+    )
     return rows.swapaxes(1, 2).reshape(-1, COLUMNS * width, 3)

@@ -27,7 +27,11 @@ UNDATED = {
     "pdf": ("CreationDate", "Producer", "Creator"),
     "png": ("Software",),
 }
-DOTTED: dict[str, Any] = {"color": GREY, "linestyle": ":", "linewidth": 1.2}  # a line of what is no method
+DOTTED: dict[str, Any] = {
+    "color": GREY,
+    "linestyle": ":",
+    "linewidth": 1.2,
+}  # a line of what is no method
 
 
 def styled() -> AbstractContextManager[None]:
@@ -51,16 +55,35 @@ def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
 def banded(axes: Axes, middle: pd.Series, wide: pd.Series, **look: Any) -> None:
     """A line against its index with a band around it."""
     axes.plot(middle.index, middle, **look)
-    axes.fill_between(middle.index, middle - wide, middle + wide, color=look["color"], alpha=0.18, linewidth=0)
+    axes.fill_between(
+        middle.index,
+        middle - wide,
+        middle + wide,
+        color=look["color"],
+        alpha=0.18,
+        linewidth=0,
+    )
 
 
 def whiskers(axes: Axes, table: pd.DataFrame, **look: Any) -> None:
     """The means of a table of :func:`house.over` against its index, with their standard deviations."""
     wide = table["standard_deviation"].fillna(0)
-    axes.errorbar(table.index, table["mean"], yerr=wide, marker="o", markersize=4, alpha=0.8, **look)
+    axes.errorbar(
+        table.index,
+        table["mean"],
+        yerr=wide,
+        marker="o",
+        markersize=4,
+        alpha=0.8,
+        **look,
+    )
 
 
-def legend_below(figure: Figure, axes: Sequence[Axes], columns: int) -> None:
+def legend_below(
+    figure: Figure,
+    axes: Sequence[Axes],
+    columns: int,
+) -> None:
     """A legend under the plots, each label once; the figure becomes higher by its lines."""
     by_label: dict[str, Any] = {}
     for place in axes:
@@ -70,10 +93,19 @@ def legend_below(figure: Figure, axes: Sequence[Axes], columns: int) -> None:
         columns = 1
     lines = -(-len(by_label) // columns)
     figure.set_figheight(figure.get_figheight() + 0.2 * lines + 0.1)
-    figure.legend(by_label.values(), by_label.keys(), loc="outside lower left", ncols=columns)
+    figure.legend(
+        by_label.values(),
+        by_label.keys(),
+        loc="outside lower left",
+        ncols=columns,
+    )
 
 
-def pictures(rows: int, columns: int, titles: float = 0.34) -> tuple[Figure, list[Axes]]:
+def pictures(
+    rows: int,
+    columns: int,
+    titles: float = 0.34,
+) -> tuple[Figure, list[Axes]]:
     """Places for pictures without axes, row by row; ``titles``: inches above each."""
     side = WIDTH / max(columns, 3)
     figure = Figure(figsize=(side * columns, rows * (side + titles)))
@@ -83,7 +115,11 @@ def pictures(rows: int, columns: int, titles: float = 0.34) -> tuple[Figure, lis
     return figure, places
 
 
-def show_picture(place: Axes, image: Bytes, title: str) -> None:
+def show_picture(
+    place: Axes,
+    image: Bytes,
+    title: str,
+) -> None:
     """A picture; of a stack of grey frames the last."""
     shown = image if image.shape[2] == 3 else image[..., -1]
     place.imshow(shown, vmin=0, vmax=255)

@@ -20,7 +20,7 @@ from hypogoal.core.artefacts import TO_FILL_IN
 from hypogoal.core.errors import UserError
 from hypogoal.data import Dataset, joined
 from hypogoal.domains.observations import resized_picture
-from hypogoal.evaluation.audit import Classifier
+from hypogoal.evaluation.classifiers import Classifier
 from hypogoal.evaluation.pictures import picture_of
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.observations import (

@@ -33,12 +33,24 @@ def context(results: Results) -> dict[str, Any] | None:
         arrays = results.within(f"saliency/{name}")
         if "observations" in arrays:
             states += _gallery(arrays, name, facts)
-    return {"ensemble": looked_at["ensemble"], "explained": explained, "states": states}
+    return {
+        "ensemble": looked_at["ensemble"],
+        "explained": explained,
+        "states": states,
+    }
 
 
-def _gallery(arrays, sub_goal, facts):
+def _gallery(
+    arrays,
+    sub_goal,
+    facts,
+):
     """Each state with its arrays, those of attributions if it has any."""
-    shared = {"sub_goal": sub_goal, "colours": facts["colours"], "attributions": []}
+    shared = {
+        "sub_goal": sub_goal,
+        "colours": facts["colours"],
+        "attributions": [],
+    }
     outcome = outcomes(arrays["predictions"], arrays["labels"])
     for index, place in enumerate(facts["places"]):
         of_state = {name: values[index] for name, values in arrays.items() if index < len(values)}
@@ -53,14 +65,29 @@ def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
         if "features" in facts:
             attributions = context["results"].arrays[f"saliency/{sub_goal}/attributions"]
             bars = bars_of_features(attributions, facts["features"])
-            yield Drawn(f"features{suffix}", "What members go by", bars, about)
+            yield Drawn(
+                f"features{suffix}",
+                "What members go by",
+                bars,
+                about,
+            )
             continue
         state = next(state for state in context["states"] if state["sub_goal"] == sub_goal)
         about |= {"kind": facts["kinds"][0], "place": state["place"]}
         figure2 = attributions_of_members(state)
-        yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", figure2, about)
+        yield Drawn(
+            f"figure2{suffix}",
+            "Figure 2: attributions of each member",
+            figure2,
+            about,
+        )
         figure9 = attributions_of_channels(state)
-        yield Drawn(f"figure9{suffix}", "Figure 9: attributions of every frame", figure9, about)
+        yield Drawn(
+            f"figure9{suffix}",
+            "Figure 9: attributions of every frame",
+            figure9,
+            about,
+        )
 
 
 def attributions_of_members(state: Mapping[str, Any]) -> Figure:
@@ -108,7 +135,14 @@ def panels(shown: Sequence[tuple[Bytes, str]], columns: int) -> Figure:
         for place, (image, title) in zip(places, shown, strict=False):
             plots.show_picture(place, image, title)
         key = ScalarMappable(Normalize(-1, 1), SIGNED)
-        bar = figure.colorbar(key, ax=places, location="bottom", fraction=0.05, shrink=0.6, aspect=40)
+        bar = figure.colorbar(
+            key,
+            ax=places,
+            location="bottom",
+            fraction=0.05,
+            shrink=0.6,
+            aspect=40,
+        )
         bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
         bar.set_label("attribution in log-odds, each picture on its own scale")
     return figure

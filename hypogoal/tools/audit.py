@@ -67,6 +67,7 @@ def _in_play(
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation import audit as played
+    from hypogoal.evaluation.classifiers import classifier_of
     from hypogoal.evaluation.house import as_json
     from hypogoal.evaluation.page import lines_of
     from hypogoal.learners.world import columns_of
@@ -78,7 +79,7 @@ def _in_play(
     config = call.settings(domain)
     world = load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
-    audited, source = played.classifier_of(classifier, sub_goal, device)
+    audited, source = classifier_of(classifier, sub_goal, device)
     thresholds = audited.thresholds.tolist()
     if member >= len(thresholds):
         raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(thresholds) - 1}.")
@@ -143,7 +144,7 @@ def _on_recorded_data(
     from hypogoal.core.progress import Progress
     from hypogoal.data import open_dataset
     from hypogoal.evaluation import page, recorded
-    from hypogoal.evaluation.audit import classifier_of
+    from hypogoal.evaluation.classifiers import classifier_of
     from hypogoal.evaluation.house import as_json
     from hypogoal.evaluation.plots import slug
     from hypogoal.importing.labels import COLUMNS
