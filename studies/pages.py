@@ -13,10 +13,22 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 
-from studies import attention, choosing, distilled, figure6, hypotheses, ladder_options, ladder_stops, ladders, one_room
+from studies import (
+    attention,
+    audits,
+    choosing,
+    distilled,
+    figure6,
+    hypotheses,
+    ladder_options,
+    ladder_stops,
+    ladders,
+    one_room,
+)
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
+    "audit-planted": audits.tables,
     "choosing-doorkey": choosing.tables,
     "distilled": distilled.tables,
     "distilled-agents": distilled.tables_of_agents,
@@ -52,7 +64,7 @@ def drawn(page: str) -> str:
 
 def main() -> None:
     """Write the tables of every page that has marks."""
-    for path in sorted(RESULTS.glob("*.md")):
+    for path in [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "audit.md"]:
         page = path.read_text(encoding="utf-8")
         path.write_text(drawn(page), encoding="utf-8")
 
