@@ -27,6 +27,7 @@ from studies import (
 )
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+PAGES = [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "audit.md"]
 TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "audit-planted": audits.tables,
     "choosing-doorkey": choosing.tables,
@@ -64,7 +65,7 @@ def drawn(page: str) -> str:
 
 def main() -> None:
     """Write the tables of every page that has marks."""
-    for path in [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "audit.md"]:
+    for path in PAGES:
         page = path.read_text(encoding="utf-8")
         path.write_text(drawn(page), encoding="utf-8")
 
