@@ -40,7 +40,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     )
 
     case, sub_goal, split = judgement.case, judgement.sub_goal, judgement.split
-    if judgement.number != work.browsed or not len(split.labels):
+    if case.ensemble != work.browsed or not len(split.labels):
         return
     place = work.place_of(judgement)
     looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})

@@ -8,21 +8,17 @@ due is another matter. The control has the agent's own final options and picks o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from hypogoal.core.arrays import Bools, Doubles, Ints
+from hypogoal.core.arrays import Doubles, Ints
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import house
-from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.names import UNIFORM
-from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.run import takes
 
 if TYPE_CHECKING:
@@ -39,7 +35,11 @@ TITLE = "What choosing is worth"
 BY = ["method", "chooser"]
 
 
-def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
+def qualities(
+    loop: OptionLoop,
+    goals: Ints,
+    states: Ints,
+) -> Doubles:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
     Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
@@ -69,17 +69,27 @@ def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
         going = np.arange(len(ids))
         for age in range(timeout):
             options = np.full(len(going), option)
-            actions = loop.learner.act(ids[going], options, np.full(len(going), age), explore=False)
+            actions = loop.learner.act(
+                ids[going],
+                options,
+                np.full(len(going), age),
+                explore=False,
+            )
             ids[going] = plan.following[place[ids[going]], column[actions]]
-            ended = loop.terminations.of_running(ids[going], options) | plan.final[place[ids[going]]]
-            going = going[~ended]
+            ended = loop.terminations.of_running(ids[going], options)
+            final = plan.final[place[ids[going]]]
+            going = going[~ended & ~final]
             if not len(going):
                 break
         qualities[option] = np.average(good[place[ids], goal], weights=counts[begins])
     return qualities
 
 
-def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
+def judge(
+    choices: Choices,
+    quality: Doubles,
+    members: int,
+) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
     ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
@@ -96,7 +106,11 @@ def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     shares = among / counts[several][:, None]
     expected = shares.sum(axis=0).round(house.DIGITS)  # in any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
-    preference = np.where(house.at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
+    preference = np.where(
+        house.at_least(expected, LEAST),
+        chosen / np.maximum(expected, 1e-12),
+        np.nan,
+    )
     return {
         "preference": preference,
         "within_rho": _within_rho(quality, preference, goals),
@@ -105,7 +119,11 @@ def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     }
 
 
-def _within_rho(quality: Doubles, preference: Doubles, goals: Ints) -> float:
+def _within_rho(
+    quality,
+    preference,
+    goals,
+):
     both = pd.DataFrame({"quality": quality, "preference": preference}).dropna()
     rhos = []
     for _, alike in both.groupby(goals[both.index]):
@@ -115,31 +133,39 @@ def _within_rho(quality: Doubles, preference: Doubles, goals: Ints) -> float:
     return pd.Series(rhos, dtype=float).mean()
 
 
-def _better_of_two(quality: Doubles, taken: Ints, among: Bools, goals: Ints) -> float:
+def _better_of_two(
+    quality,
+    taken,
+    among,
+    goals,
+):
     better, both = 0, 0
     for pair in combinations(range(len(quality)), 2):
-        bad, good = sorted(pair, key=lambda option: quality[option])
-        if goals[bad] != goals[good] or not house.at_least(quality[good] - quality[bad], DIFFERENCE):
-            continue
-        of_both = taken[among[:, good] & among[:, bad]]
-        better += (of_both == good).sum()
-        both += np.isin(of_both, pair).sum()
+        bad, good = sorted(pair, key=quality.__getitem__)
+        if goals[bad] == goals[good] and house.at_least(quality[good] - quality[bad], DIFFERENCE):
+            of_both = taken[among[:, good] & among[:, bad]]
+            better += (of_both == good).sum()
+            both += np.isin(of_both, pair).sum()
     return better / both if both else math.nan
 
 
-def _score(quality: Doubles, taken: Ints, among: Bools) -> float:
-    judged = among & ~np.isnan(quality)
-    compared = (judged.sum(axis=1) > 1) & ~np.isnan(quality[taken])
+def _score(
+    quality,
+    taken,
+    among,
+):
+    known = np.where(among, quality, np.nan)
+    compared = (np.isfinite(known).sum(axis=1) > 1) & np.isfinite(quality[taken])
     if not compared.any():
         return math.nan
-    values = np.where(judged, quality, np.nan)[compared]
+    values = known[compared]
     average = np.nanmean(values, axis=1)
     gain = (np.nanmax(values, axis=1) - average).sum()
     gained = (quality[taken[compared]] - average).sum()
     return gained / gain if house.above(gain, 0.0) else math.nan
 
 
-def rows(work: Work) -> Iterator[pd.DataFrame]:
+def rows(work):
     """Every run of an agent that learned to choose among members' options, in a domain that knows what follows.
 
     The agent's numbers, those of uniform-random choice, and every member's.
@@ -151,8 +177,8 @@ def rows(work: Work) -> Iterator[pd.DataFrame]:
         place = {**work.place(artefact), "scope": FROZEN}
         agent, uniform, members = played
         yield house.tidy(agent, **place)
-        yield house.tidy(uniform, **(place | {"method": UNIFORM}))
-        yield members.melt(["sub_goal", "member"], var_name="quantity").assign(**place)
+        yield house.tidy(uniform, **place | {"method": UNIFORM})
+        yield house.of_options(members, artefact.config, **place)
 
 
 def is_playable(artefact: Artefact) -> bool:
@@ -163,42 +189,37 @@ def is_playable(artefact: Artefact) -> bool:
     # Of many layouts the states are too many to say what follows in each.
     if config["network"] not in MEMORYLESS or config.get("layouts"):
         return False
-    sub_goals = load_domain(config["domain"]).sub_goals
-    return set(config["sub_goals"]) <= set(sub_goals) and "options.safetensors" in artefact.manifest.files
+    return {*config["sub_goals"]} <= {*load_domain(config["domain"]).sub_goals}
 
 
-def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], pd.DataFrame] | None:
+def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], dict[str, Doubles]] | None:
     """A trained agent played on, frozen, and uniform-random choice among its own options.
 
-    Returns ``OF_PLAY`` and ``OF_CHOICE`` of both, and a row per member: sub_goal, member, quality and
-    conditional_preference. None where it is not playable, or the engine does not know what each action leads to.
+    Returns ``OF_PLAY`` and ``OF_CHOICE`` of both, and of each option (G*K,) its quality and conditional_preference.
+    None where it is not playable, or the engine does not know what each action leads to.
     """
-    from hypogoal.evaluation.frozen import ENVIRONMENTS, play  # with PyTorch, which a report does not need
+    from hypogoal.evaluation.frozen import ENVIRONMENTS, play_both  # with PyTorch, which a report does not need
     from hypogoal.meta.episodes import agent_of
-    from hypogoal.options.choosers import RandomChooser
 
     config, seed = artefact.config, artefact.seed
     # one game first, since many take long to begin
     if not is_playable(artefact) or agent_of(artefact, seed).engine.plan() is None:
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
-    sub_goals, members = config["sub_goals"], config["members"]
-    table = pd.MultiIndex.from_product([sub_goals, range(members)], names=["sub_goal", "member"]).to_frame(index=False)
-    in_domain = load_domain(config["domain"]).sub_goals
-    goals = table["sub_goal"].map(in_domain.index).to_numpy()
-    uniform = RandomChooser(rng_for(seed, "uniform-choice"))
-    of_both = [play(loop, chooser) for chooser in (loop.chooser, uniform)]
+    of_options = house.options_of(config).get_level_values("sub_goal")
+    goals = of_options.map(load_domain(config["domain"]).sub_goals.index).to_numpy()
+    of_both = play_both(loop, seed)
     quality = qualities(loop, goals, of_both[0].choices.states)  # where the agent itself decides
-    numbers = []
-    for episodes in of_both:
-        scores = episodes.scores(loop.engine.shortest_path()) | {"length": episodes.length}
-        means = {name: scores[name].mean() for name in OF_PLAY}
-        numbers.append(means | judge(episodes.choices, quality, members))
-    preference, _ = [of_one.pop("preference") for of_one in numbers]
-    return numbers[0], numbers[1], table.assign(quality=quality, conditional_preference=preference)
+    numbers, preferences = [], []
+    for played in of_both:
+        scores = played.scores(loop.engine.shortest_path())
+        judged = judge(played.choices, quality, config["members"])
+        preferences.append(judged.pop("preference"))
+        numbers.append({name: scores[name].mean() for name in OF_PLAY} | judged)
+    return numbers[0], numbers[1], {"quality": quality, "conditional_preference": preferences[0]}
 
 
-def runs(results: Results) -> pd.DataFrame:
+def runs(results):
     """Each agent (``chooser`` its own), and uniform-random choice among its own options."""
     return with_choosers(house.per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN))
 

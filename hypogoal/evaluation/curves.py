@@ -1,28 +1,40 @@
 """Figure 6: what agents achieve on layouts that no data came from, over training and at its end (Spec E6, E7, F5)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import Bools, Doubles, Ints
-from hypogoal.core.artefacts import Artefact
-from hypogoal.evaluation.house import ROUNDING, per_run, tidy
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.names import rank
+from hypogoal.core.arrays import (
+    Bools,
+    Doubles,
+    Ints,
+)
+from hypogoal.evaluation.house import (
+    at_least,
+    melted,
+    per_run,
+    tidy,
+)
 from hypogoal.evaluation.page import Drawn, Results
-from hypogoal.evaluation.plots import DOTTED, banded, legend_below, looks, plot, styled
-from hypogoal.evaluation.run import read_layout
+from hypogoal.evaluation.plots import (
+    DOTTED,
+    banded,
+    legend_below,
+    looks,
+    plot,
+    styled,
+)
+from hypogoal.evaluation.run import read_layout, takes
 from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Episodes
 
 TITLE = "Summary"
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
 SOLVED = 0.95  # share of the window's episodes
-NEAR = 1.5  # times the shortest path
-WITHIN = {"near": NEAR, "within_2": 2.0}  # times the shortest path
+WITHIN = {"near": 1.5, "within_2": 2.0}  # times the shortest path
 POINTS = 151  # of a curve
 BY = ["method"]
 QUANTITIES = (
@@ -42,19 +54,22 @@ FIGURES = {  # file, label, and what is dotted across
     "reward": ("figure6", "Undiscounted reward per episode", "random_success"),
     "solved_length": ("figure6-length", "Length of solved episodes", "shortest_path"),
 }
-NEEDED = {"figure6": "options, meta or baseline artefacts"}
 
 
-def scores(succeeded: Bools, steps: Ints, shortest: float | Doubles | None) -> dict[str, Doubles]:
+def scores(
+    succeeded: Bools,
+    steps: Ints,
+    shortest: float | Doubles | None,
+) -> dict[str, Doubles]:
     """``success``, and success within so many times the shortest path, ``WITHIN``: 1 or 0 of each episode (E, ...).
 
     ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
     """
     path = np.asarray(shortest, dtype=np.float64)
-    where_known = np.where(np.isnan(path), np.nan, 1.0)
     columns: dict[str, Any] = {"success": succeeded * 1.0}
     for name, factor in WITHIN.items():
-        columns[name] = where_known * (succeeded & (steps <= factor * path))
+        within = succeeded & (steps <= factor * path)
+        columns[name] = np.where(np.isnan(path), np.nan, within)
     return columns
 
 
@@ -72,7 +87,11 @@ def table_of(episodes: Episodes) -> pd.DataFrame:
     return pd.DataFrame(columns, dtype=float)
 
 
-def curves(episodes: Episodes, grid: Ints, window: int = LAST) -> pd.DataFrame:
+def curves(
+    episodes: Episodes,
+    grid: Ints,
+    window: int = LAST,
+) -> pd.DataFrame:
     """Figure 6: means of the last ``window`` episodes known by each step of ``grid`` (G,), its index.
 
     From ``FIRST`` on. Columns reward, success, length and solved_length; that is NaN where none is solved.
@@ -81,84 +100,66 @@ def curves(episodes: Episodes, grid: Ints, window: int = LAST) -> pd.DataFrame:
     means = values.rolling(window, min_periods=1).mean()
     count = np.searchsorted(episodes.step, grid, side="right")
     enough = count >= FIRST
-    return means.loc[count[enough] - 1].set_axis(grid[enough])
+    return means.loc[count[enough] - 1].set_axis(grid[enough]).rename_axis("step")
 
 
-def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = LAST) -> dict[str, float]:
+def run_numbers(
+    episodes: Episodes,
+    shortest_path: int | None,
+    window: int = LAST,
+) -> dict[Any, float]:
     """Spec F5: the numbers of one run, over its last ``window`` training episodes at most; NaN without episodes.
 
-    ``shortest_path``: primitive steps from the start to the goal at least; None or 0 where unknown. ``window`` in the
-    numbers: episodes actually averaged. ``steps_to_95``: the first step at which 95 % of the last ``window`` had
-    succeeded; NaN: never, or too few.
+    ``shortest_path``: primitive steps from the start to the goal at least; None or 0 where unknown. ``steps_to_95``:
+    the first step at which 95 % of the last ``window`` had succeeded; NaN: never, or too few.
     """
     last = episodes.last(window)
     shortest = shortest_path or np.nan
     near = scores(last.succeeded, last.length, shortest)["near"]
     means = table_of(last).assign(near=near).mean()
-    numbers = {str(name): mean for name, mean in means.items()}
     solved = pd.Series(episodes.succeeded).rolling(window).sum()
-    reached = solved >= SOLVED * window - ROUNDING
+    reached = at_least(solved, SOLVED * window)
     return {
-        **numbers,
+        **means.to_dict(),
         "episodes": len(episodes),
-        "window": len(last),
         "length_over_shortest": means["length"] / shortest,
         "solved_over_shortest": means["solved_length"] / shortest,
         "steps_to_95": pd.Series(episodes.step)[reached].min(),
     }
 
 
-def practice_of(config: Mapping[str, Any]) -> int:
-    """The steps of the options that an agent continues, which may have ended before their limit."""
-    return int(config.get("options_ended_at", config.get("options_steps", 0)))
-
-
 def budget_of(config: Mapping[str, Any]) -> int:
-    """An agent's environment steps, those of earlier stages included."""
-    return int(config.get("ended_at", config.get("steps", 0))) + practice_of(config)
+    """An agent's environment steps, those of the options that it continues included: some end before their limit."""
+    practice = config.get("options_ended_at", config.get("options_steps", 0))
+    return int(config.get("ended_at", config.get("steps", 0)) + practice)
 
 
-def rows(work: Work) -> Iterator[pd.DataFrame]:
+def rows(work):
     """Every agent's run at its end, and its curves; random play on each layout."""
-    agents = sorted(work.contents.agents, key=lambda artefact: rank(work.place(artefact)["method"]))
+    agents = work.ranked(work.contents.agents)
     most = max((budget_of(artefact.config) for artefact in agents), default=0)
     grid = np.linspace(0, most, POINTS).round().astype(np.int64)
-    random: dict[int | None, float | None] = {}
+    random = {}
     for artefact in agents:
+        place, steps = work.place(artefact), budget_of(artefact.config)
         layout = read_layout(artefact.path / "layout.json")
-        yield from _rows_of_agent(artefact, layout.shortest_path, grid, work.place(artefact))
-        random[None if layout.layouts else layout.layout_seed] = layout.random_success
+        episodes = Episodes.read(artefact.path / Episodes.FILE)
+        numbers = run_numbers(episodes, layout.shortest_path)
+        yield tidy({"steps": steps, "shortest_path": layout.shortest_path, **numbers}, **place)
+        yield melted(curves(episodes, grid[grid <= steps]), **place)
+        random[None if layout.layouts else place["layout"]] = layout.random_success
     for seed, success in random.items():
         yield tidy({"random_success": success}, layout=seed)
 
 
-def _rows_of_agent(
-    artefact: Artefact,
-    shortest: int | None,
-    grid: Ints,
-    place: Mapping[str, Any],
-) -> Iterator[pd.DataFrame]:
-    steps = budget_of(artefact.config)
-    episodes = Episodes.read(artefact.path / "episodes.csv")
-    facts: dict[str, Any] = {"steps": steps, "practice": practice_of(artefact.config), "shortest_path": shortest}
-    yield tidy(facts | run_numbers(episodes, shortest), **place)
-    drawn = curves(episodes, grid[grid <= steps]).rename_axis("step").reset_index()
-    yield drawn.melt("step", var_name="quantity").assign(**place)
-
-
-def facts(work: Work) -> dict[str, Any]:
-    """Of each agent, by its name, its ``members``, ``layouts``, and ``choice``: learned, random, or none of members."""
+def facts(work):
+    """Of each agent, by its name, its ``members``, and ``choice``: learned, random, or none of members."""
     agents = {}
     for artefact in work.contents.agents:
-        config = artefact.config
-        choice = ""
-        if artefact.kind == "meta" and config["termination"] != "oracle":
+        config, choice = artefact.config, ""
+        if artefact.kind == "meta" and takes(artefact):
             choice = "random" if config["chooser"] == "random" else "learned"
-        agents[work.place(artefact)["method"]] = {
-            "members": config.get("members"),
-            "layouts": config.get("layouts"),
-            "choice": choice,
-        }
+        agents[work.place(artefact)["method"]] = {"members": config.get("members"), "choice": choice}
     return {"agents": agents}
 
 
@@ -168,21 +169,17 @@ def chosen_by(results: Results, choice: str) -> dict[str, dict[str, Any]]:
     return {name: agent for name, agent in agents.items() if agent["choice"] == choice}
 
 
-def runs(results: Results) -> pd.DataFrame:
+def runs(results):
     """Every agent's numbers."""
-    return per_run(_of_agents(results), *QUANTITIES)
+    agents = [*results.facts["agents"]]
+    return per_run(results.of(method=agents), *QUANTITIES)
 
 
-def _of_agents(results: Results) -> pd.DataFrame:
-    return results.of(method=[*results.facts["agents"]])
-
-
-def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
+def figures(context):
     """Figure 6 and the same of the length of solved episodes, where it is not the same everywhere."""
     results = context["results"]
-    points = _of_agents(results).dropna(subset="step")
     for quantity, (name, label, reference) in FIGURES.items():
-        drawn = points[points["quantity"] == quantity]
+        drawn = results.of(quantity=quantity).dropna(subset="step")
         if drawn.empty or (quantity != "reward" and drawn["value"].nunique() < 2):
             continue
         references = results.of(quantity=reference).drop_duplicates("layout")["value"]
@@ -192,7 +189,11 @@ def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
         yield Drawn(name, label, figure, {"dotted": reference if len(references) else ""})
 
 
-def learning_curves(drawn: pd.DataFrame, label: str, reference: float = np.nan) -> Figure:
+def learning_curves(
+    drawn: pd.DataFrame,
+    label: str,
+    reference: float = np.nan,
+) -> Figure:
     """Figure 6: a quantity of episodes against environment steps, a line per method, a ``reference`` dotted across.
 
     ``drawn`` are rows of the table of numbers. The mean over layouts, or runs of one layout, and a band of one standard
@@ -210,11 +211,3 @@ def learning_curves(drawn: pd.DataFrame, label: str, reference: float = np.nan) 
         axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
         legend_below(figure, [axes], 2)
     return figure
-
-
-def missing(work: Work) -> list[str]:
-    """That there are no agents, of a run that is about them; controls that nobody asked for are not missed."""
-    contents = work.contents
-    groups = [place.get("N") for place in work.places.values()]
-    about_ladders = contents.ladders or any(groups)
-    return [] if contents.agents or about_ladders else ["no agents"]

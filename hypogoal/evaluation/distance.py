@@ -8,16 +8,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import Bytes, Doubles
-from hypogoal.core.artefacts import Artefact
-from hypogoal.domains.base import Domain, installed_domain
+from hypogoal.core.arrays import Bytes
+from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import of_options, per_run, tidy
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.names import ORACLE, rank
-from hypogoal.evaluation.page import Drawn, Results
-from hypogoal.evaluation.rooms import VALIDATED
-from hypogoal.evaluation.run import takes, thresholds_of
+from hypogoal.evaluation.house import (
+    melted,
+    options_of,
+    per_run,
+    tidy,
+)
+from hypogoal.evaluation.hypotheses import VALIDATED
+from hypogoal.evaluation.names import ORACLE
+from hypogoal.evaluation.page import Drawn
+from hypogoal.evaluation.run import takes
+from hypogoal.hypotheses.scores import most_and_least
 from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Executions
 
@@ -30,16 +34,12 @@ PICKED = {"best": BEST, "validated": VALIDATED, "mean": "mean", "worst": WORST}
 BY = ["N", "method", "sub_goal"]
 PAIRED = ("best", "validated", "mean")
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution, its ``fate``
-FATES: dict[int, dict[str, Any]] = {  # how Figure 5 marks it
-    HIT: {"label": "there", "marker": "o", "color": plots.SKY},
-    MISS: {"label": "elsewhere", "marker": "x", "color": plots.ORANGE},
-    BEGAN_INSIDE: {"label": "began inside", "marker": "s", "color": plots.PURPLE, "fillstyle": "none"},
+FATES = {  # how Figure 5 marks it
+    HIT: ("there", "o", plots.SKY),
+    MISS: ("elsewhere", "x", plots.ORANGE),
+    BEGAN_INSIDE: ("began inside", "s", plots.PURPLE),
 }
 STOP = ["room", "column", "row", "fate"]  # where an execution stopped, in the picture of the room
-NEEDED = {
-    "figure4": "options with executions.csv: train-options --set start=LADDER",
-    "figure5": "the same, of a domain that draws its rooms",
-}
 
 
 def last_executions(executions: Executions) -> pd.DataFrame:
@@ -75,20 +75,17 @@ def option_numbers(executions: Executions) -> pd.DataFrame:
     )
 
 
-def rows(work: Work) -> Iterator[pd.DataFrame]:
+def rows(work):
     """Spec F3: every member's option on every ladder; where the first seed's stop, for Figure 5, goes to the arrays."""
-    ladders = sorted(work.contents.ladders, key=lambda artefact: rank(work.place(artefact)["method"]))
+    ladders = work.ranked(work.contents.ladders)
     first = min((artefact.seed for artefact in ladders), default=0)
     for artefact in ladders:
-        executions = Executions.read(artefact.path / "executions.csv")
+        executions = Executions.read(artefact.path / Executions.FILE)
         source = artefact.input("ensemble").resolve() if takes(artefact) else None
-        goals = artefact.config["sub_goals"]
-        validated = {goal: work.validated.get((source, goal)) for goal in goals}
-        thresholds = thresholds_of(artefact)
-        yield from rows_of_ladder(executions, artefact.config, validated, thresholds, work.place(artefact))
-        domain = installed_domain(artefact.config["domain"])
-        if artefact.seed == first and domain is not None and domain.pictures:
-            _write_stops(work, artefact, domain, executions)
+        validated = work.validated.get(source, {})
+        yield from rows_of_ladder(executions, artefact.config, validated, work.place(artefact))
+        if artefact.seed == first:
+            _write_stops(work, artefact, executions)
         work.progress.advance()
 
 
@@ -96,93 +93,108 @@ def rows_of_ladder(
     executions: Executions,
     config: Mapping[str, Any],
     validated: Mapping[str, float | None],
-    thresholds: Doubles,
     place: Mapping[str, Any],
 ) -> Iterator[pd.DataFrame]:
     """Spec F3: one options artefact, trained from one start (a ladder) on G sub-goals with K members each.
 
-    Per sub-goal each member's numbers, with its threshold (of (G*K,)); the best member (the least mean distance), the
-    worst, and the validated one. Where ``mask_reached``, options that would begin inside were not offered (Spec D6):
-    they count 300.
+    Per sub-goal each member's numbers; the best member (the least mean distance), the worst, and the validated one.
+    Where ``mask_reached``, options that would begin inside were not offered (Spec D6): they count 300.
     """
-    every = option_numbers(executions).reindex(range(len(thresholds)))
-    every["threshold"] = thresholds
+    options = options_of(config)
+    every = option_numbers(executions).reindex(range(len(options))).set_axis(options)
     every["executions"] = every["executions"].fillna(0)
     if config["mask_reached"] and len(executions):
         every.loc[every["executions"] == 0, "distance"] = INSIDE
-    yield of_options(every, config, **place)
-    for index, sub_goal in enumerate(config["sub_goals"]):
-        first = index * config["members"]
-        distances = every["distance"][first : first + config["members"]].dropna()
-        picked = {VALIDATED: validated.get(sub_goal)}
-        if len(distances):
-            picked |= {BEST: distances.idxmin() - first, WORST: distances.idxmax() - first}
+    yield melted(every, **place)
+    for sub_goal, distances in every["distance"].groupby("sub_goal", sort=False):
+        worst, best = most_and_least(distances.to_numpy(float))
+        picked = {VALIDATED: validated.get(str(sub_goal)), BEST: best, WORST: worst}
         yield tidy(picked, **place, sub_goal=sub_goal)
 
 
-def _write_stops(work: Work, artefact: Artefact, domain: Domain, executions: Executions) -> None:
+def _write_stops(
+    work,
+    artefact,
+    executions,
+):
     """Figure 5: ``STOP`` of each execution of each sub-goal's best option, and pictures of the rooms."""
-    last, members = last_executions(executions), artefact.config["members"]
-    distances = last.groupby("option")["counted"].mean()
-    best = distances.groupby(distances.index // members).idxmin()
+    domain = installed_domain(artefact.config["domain"])
+    if domain is None or not domain.pictures:
+        return
+    distances = option_numbers(executions)["distance"]
+    best = distances.groupby(distances.index // artefact.config["members"]).idxmin()
+    last = last_executions(executions)
     stops = last[last["option"].isin(best)]
     pixels = np.asarray(domain.pixel(stops[["room", "x", "y"]].to_numpy())).reshape(-1, 2)
     shown = stops.assign(column=pixels[:, 0], row=pixels[:, 1])
     work.arrays[f"stops/{work.contents.name(artefact)}"] = shown[STOP].to_numpy(float)
     for room in stops["room"].unique():
         if f"pictures/{room}" not in work.arrays:
-            work.arrays.create_dataset(f"pictures/{room}", data=domain.picture(room), compression="gzip")
+            work.arrays.create_dataset(
+                f"pictures/{room}",
+                data=domain.picture(room),
+                compression="gzip",
+            )
 
 
-def facts(work: Work) -> dict[str, Any]:
-    """The ladders."""
-    return {"ladders": sorted({artefact.config["start"] for artefact in work.contents.ladders})}
-
-
-def runs(results: Results) -> pd.DataFrame:
+def runs(results):
     """Spec F3, Figure 4: each seed's mean over the run's ladders of the best, validated, mean and worst member.
 
-    And the best member's shares. A seed that lacks a ladder is left out: unlike ladders are not averaged. Artefacts
-    with one seed and ladder all count.
+    And the best member's shares. A seed that lacks a ladder is left out: unlike ladders are not averaged.
     """
     ladders = of_ladders(results)
-    cell = [*BY, "quantity", "of", "seed"]
-    copies = ladders.groupby([*cell, "ladder"], dropna=False).cumcount()
-    seeds = ladders.assign(copy=copies).groupby([*cell, "copy"], dropna=False, sort=False)
+    seeds = ladders.groupby([*BY, "quantity", "of", "seed"], dropna=False, sort=False)
     means = seeds.agg(value=("value", "mean"), ladders=("ladder", "nunique")).reset_index()
-    whole = means[means["ladders"] == len(results.facts["ladders"])]
+    whole = means[means["ladders"] == ladders["ladder"].nunique()]
     return whole.assign(layout=None).sort_values("N", kind="stable")
 
 
-def of_ladders(results: Results) -> pd.DataFrame:
+def of_ladders(results):
     """The numbers of each run on each ladder."""
     numbers = results.numbers[results.numbers["ladder"] != ""]
-    values = [per_run(numbers, "distance", member=member, name=which) for which, member in PICKED.items()]
+    values = [
+        per_run(
+            numbers,
+            "distance",
+            member=member,
+            name=which,
+        )
+        for which, member in PICKED.items()
+    ]
     values.append(per_run(numbers, "executions_deviation", *SHARES, member=BEST))
     return pd.concat(values)
 
 
-def compared(results: Results) -> pd.DataFrame:
+def compared(results):
     """Each ladder's numbers; oracle terminations have no members to choose among."""
     values = of_ladders(results)
     return values[~values["method"].str.startswith(ORACLE)]
 
 
-def figures(context: Mapping[str, Any]) -> Iterator[Drawn]:
+def figures(context):
     """Figures 4 and 5."""
     table, results = context["table"], context["results"]
-    yield Drawn("figure4", "Figure 4: distance to the true sub-goal", distance_bars(table[table["quantity"] == "best"]))
+    yield Drawn(
+        "figure4",
+        "Figure 4: distance to the true sub-goal",
+        distance_bars(table[table["quantity"] == "best"]),
+    )
     options = results.of(quantity=BEST).drop_duplicates("artefact")
-    for ladder in results.facts["ladders"]:
+    for ladder, of_ladder in options.groupby("ladder"):
         shown = {}
-        for _, option in options[options["ladder"] == ladder].iterrows():
+        for _, option in of_ladder.iterrows():
             stops = results.arrays.get(f"stops/{option['artefact']}")
             if stops is not None:
                 groups = "" if pd.isna(option["N"]) else f", N={option['N']}"
                 shown[option["method"] + groups] = pd.DataFrame(stops, columns=STOP)
         if shown:
             figure = stops_over_rooms(results.within("pictures"), shown)
-            yield Drawn(f"figure5-{ladder}", "Figure 5: where executions stopped", figure, {"ladder": ladder})
+            yield Drawn(
+                f"figure5-{ladder}",
+                "Figure 5: where executions stopped",
+                figure,
+                {"ladder": ladder},
+            )
 
 
 def distance_bars(best: pd.DataFrame) -> Figure:
@@ -193,10 +205,8 @@ def distance_bars(best: pd.DataFrame) -> Figure:
     cells = best.assign(place=groups).set_index(["place", "method"])
     wide = cells[["mean", "standard_deviation"]].unstack(sort=False)
     with plots.styled():
-        figure, axes = plots.plot(3.1)
-        wide["mean"].plot.bar(ax=axes, yerr=wide["standard_deviation"], capsize=3, alpha=0.8, rot=0, legend=False)
+        figure, axes = plots.bars("bar", wide["mean"], 3.1, yerr=wide["standard_deviation"])
         axes.set(xlabel="", ylabel="distance to the true sub-goal\n(units of position)")
-        plots.legend_below(figure, [axes], 2)
     return figure
 
 
@@ -210,10 +220,21 @@ def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, pd.DataFr
     shown = every.value_counts().index[:2]
     with plots.styled():
         figure, places = plots.pictures(len(options), len(shown))
-        for place, ((method, stops), room) in zip(places, product(options.items(), shown), strict=True):
+        for place, ((method, stops), room) in zip(
+            places,
+            product(options.items(), shown),
+            strict=True,
+        ):
             plots.show_picture(place, rooms[str(room)], f"{method}\nroom {room}")
-            for fate, mark in FATES.items():
+            for fate, (label, marker, colour) in FATES.items():
                 inside = stops[(stops["room"] == room) & (stops["fate"] == fate)]
-                place.plot(inside["column"], inside["row"], linestyle="none", alpha=0.75, **mark)
+                place.scatter(
+                    inside["column"],
+                    inside["row"],
+                    marker=marker,
+                    color=colour,
+                    label=label,
+                    alpha=0.75,
+                )
         plots.legend_below(figure, places, 3)
     return figure

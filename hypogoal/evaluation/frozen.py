@@ -7,10 +7,21 @@ many are short, so every environment plays the same number of episodes, however 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import (
+    Bools,
+    Columns,
+    Doubles,
+    Ints,
+)
+from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.curves import scores
-from hypogoal.options.choosers import Chooser, Offered, Outcome
+from hypogoal.options.choosers import (
+    Chooser,
+    Offered,
+    Outcome,
+    RandomChooser,
+)
 from hypogoal.options.loop import NONE, OptionLoop
 from hypogoal.options.parts import Ids
 from hypogoal.options.recording import Recorder
@@ -20,25 +31,25 @@ STEPS = 1_000  # or more, where so many steps of an environment hold more of the
 
 
 @dataclass(frozen=True)
-class Choices:
+class Choices(Columns):
     """D decisions: the states int64 (D,), the options chosen int64 (D,), and those offered, bool (D, O)."""
 
-    states: NDArray[np.int64]
-    options: NDArray[np.int64]
-    offered: NDArray[np.bool_]
+    states: Ints
+    options: Ints
+    offered: Bools
 
 
 @dataclass(frozen=True)
 class Play:
     """The first n episodes of each of E environments: their steps int64 (E, n) and success bool (E, n), and choices."""
 
-    length: NDArray[np.int64]
-    succeeded: NDArray[np.bool_]
+    length: Ints
+    succeeded: Bools
     choices: Choices
 
-    def scores(self, shortest: float | NDArray[np.float64] | None) -> dict[str, NDArray[np.float64]]:
-        """See :func:`scores`."""
-        return scores(self.succeeded, self.length, shortest)
+    def scores(self, shortest: float | Doubles | None) -> dict[str, Doubles]:
+        """See :func:`scores`; and the ``length``."""
+        return scores(self.succeeded, self.length, shortest) | {"length": self.length.astype(float)}
 
 
 class _Listener(Chooser):
@@ -46,11 +57,11 @@ class _Listener(Chooser):
 
     def __init__(self, chooser: Chooser):
         self.chooser = chooser
-        self.decisions: list[tuple[Ids, Ids, Ids, Offered]] = []
+        self.decisions: list[tuple[Ids, Choices]] = []
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         chosen = self.chooser.choose(environments, ids, offered)
-        self.decisions.append((environments.copy(), ids.copy(), chosen.copy(), offered.copy()))
+        self.decisions.append((environments.copy(), Choices(ids.copy(), chosen.copy(), offered.copy())))
         return chosen
 
     def record(self, outcome: Outcome) -> None:
@@ -70,7 +81,21 @@ class Always(Chooser):
         return np.full(len(ids), self.option)
 
 
-def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
+def play_both(
+    loop: OptionLoop,
+    seed: int,
+    episodes: int = 0,
+) -> tuple[Play, Play]:
+    """The agent itself, and uniform-random choice among its options, see :func:`play`."""
+    own = play(loop, loop.chooser, episodes)
+    return own, play(loop, RandomChooser(rng_for(seed, "uniform-choice")), episodes)
+
+
+def play(
+    loop: OptionLoop,
+    chooser: Chooser,
+    episodes: int = 0,
+) -> Play:
     """So many episodes in each environment, begun anew; options are greedy and choices are drawn as in training.
 
     By default as many as the cap alone decides: what comes of them must not.
@@ -84,16 +109,19 @@ def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
         loop.chooser = chooser
 
 
-def _first_episodes(loop: OptionLoop, listener: _Listener, episodes: int) -> Play:
+def _first_episodes(
+    loop,
+    listener,
+    episodes,
+):
     environments = loop.engine.count
     ended = np.zeros(environments, dtype=np.int64)
     length, succeeded = np.zeros((2, environments, episodes), dtype=np.int64)
-    decisions: list[tuple[Ids, Ids, Offered]] = []
+    decisions = []
     while ended.min() < episodes:
         loop.advance(learning=False)
-        for places, states, options, offered in listener.decisions:
-            counts = ended[places] < episodes
-            decisions.append((states[counts], options[counts], offered[counts]))
+        for places, choices in listener.decisions:
+            decisions.append(choices.at(ended[places] < episodes))
         listener.decisions.clear()
         over = np.flatnonzero(loop.engine.elapsed == 0)
         for place, (_, steps, _, _, success) in zip(over, loop.recorder.episodes, strict=True):
@@ -101,8 +129,7 @@ def _first_episodes(loop: OptionLoop, listener: _Listener, episodes: int) -> Pla
                 length[place, ended[place]], succeeded[place, ended[place]] = steps, success
                 ended[place] += 1
         loop.recorder.episodes.clear()
-    choices = Choices(*(np.concatenate(column) for column in zip(*decisions, strict=True)))
-    return Play(length, succeeded > 0, choices)
+    return Play(length, succeeded > 0, Choices.joined(decisions))
 
 
 def begin_anew(loop: OptionLoop, chooser: Chooser) -> None:

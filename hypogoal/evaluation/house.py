@@ -4,49 +4,49 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Iterable, Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from pydantic_core import to_json
-from scipy.special import stdtrit
-from scipy.stats import binomtest, bootstrap, trim_mean
+from scipy.special import bdtr, stdtrit
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.files import reading
 
 EVALUATE_AGAIN = "Evaluate the run again, with --force."
-WHOLE: Final = "Int64"  # missing where it does not apply
-TYPES = {  # of the table's columns; a text is empty where it does not apply
+TYPES = {  # of the table's columns; a text is empty, an Int64 missing where it does not apply
     "quantity": "str",
     "value": "float",
     "method": "str",
     "sub_goal": "str",
-    "member": WHOLE,
+    "member": "Int64",
     "scope": "str",
-    "N": WHOLE,
+    "N": "Int64",
     "ladder": "str",
-    "layout": WHOLE,
-    "seed": WHOLE,
-    "step": WHOLE,
+    "layout": "Int64",
+    "seed": "Int64",
+    "step": "Int64",
     "artefact": "str",
 }
 TEXTS = [name for name, kind in TYPES.items() if kind == "str"]
 NUMBERS = [name for name, kind in TYPES.items() if kind != "str"]
 SHARED = ["layout", "ladder", "sub_goal", "seed"]  # of two runs that are a pair
 RUN = ["method", "artefact", "N", *SHARED]  # tells one run's numbers from another's
-MEMBERS = {"best": "max", "mean": "mean", "worst": "min"}  # how the values of members become one
+MEMBERS = {
+    "best": "max",
+    "mean": "mean",
+    "worst": "min",
+}  # how the values of members become one
 LOWER_IS_BETTER = ("length", "solved_length", "distance")
 DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
 ROUNDING = 10.0**-DIGITS
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
 BOOTSTRAP_FROM = 8  # values: of 2 a bootstrap would hold in 49 % of cases, of 5 in 85 %
-# Spec F5: the mean of the middle half: a quarter of the values, rounded down, is cut off at either end.
-interquartile_mean = partial(trim_mean, proportiontocut=0.25)
 
 
 @cache
@@ -57,24 +57,37 @@ def is_share(quantity: str) -> bool:
     return unit == "fraction"
 
 
-def tidy(numbers: Mapping[str, float | None], **place: Any) -> pd.DataFrame:
-    """A row for each number, all of one place (columns of the table)."""
+def tidy(numbers: Any, **place: Any) -> pd.DataFrame:
+    """A row for each number by its name, all of one place (columns of the table)."""
     rows = pd.DataFrame(numbers.items(), columns=["quantity", "value"])
     return rows.assign(**place)
 
 
 def tidy_members(columns: Any, **place: Any) -> pd.DataFrame:
     """A row for each of K members' value of each column, (K,)."""
-    members = pd.DataFrame(columns).rename_axis("member").reset_index()
-    return members.melt("member", var_name="quantity").assign(**place)
+    return melted(pd.DataFrame(columns).rename_axis("member"), **place)
 
 
-def of_options(columns: Any, config: Mapping[str, Any], **place: Any) -> pd.DataFrame:
+def of_options(
+    columns: Any,
+    config: Any,
+    **place: Any,
+) -> pd.DataFrame:
     """A row for each option's value of each column, (G*K,), by its sub-goal and member, of an artefact's ``config``."""
+    options = options_of(config)
+    return melted(pd.DataFrame(columns).set_axis(options), **place)
+
+
+def options_of(config: Any) -> pd.MultiIndex:
+    """The sub-goal and the member of each option of an artefact's ``config``, in order."""
     goals, members = config["sub_goals"], range(config["members"])
-    options = pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])
-    table = pd.DataFrame(columns).set_axis(options).reset_index()
-    return table.melt(["sub_goal", "member"], var_name="quantity").assign(**place)
+    return pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])
+
+
+def melted(columns: pd.DataFrame, **place: Any) -> pd.DataFrame:
+    """A row for each value of each column, by its index."""
+    rows = columns.reset_index().melt(columns.index.names, var_name="quantity")
+    return rows.assign(**place)
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
@@ -93,13 +106,9 @@ def typed(rows: pd.DataFrame) -> pd.DataFrame:
 def read_numbers(path: Path) -> pd.DataFrame:
     """``numbers.csv`` of this version, or of one with other columns; a ``UserError`` where it is missing or damaged."""
     nothing = dict.fromkeys(NUMBERS, "")
-    try:
+    with reading(path, EVALUATE_AGAIN, "the table of numbers"):
         rows = pd.read_csv(path, keep_default_na=False, na_values=nothing)
         return typed(rows.dropna(subset=["quantity", "value"]))
-    except OSError as error:
-        raise UserError(f"the table of numbers cannot be read ({error.strerror})", path, EVALUATE_AGAIN) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"the table of numbers is damaged ({error})", path, EVALUATE_AGAIN) from None
 
 
 def per_run(
@@ -118,7 +127,7 @@ def per_run(
     rows = final[final["quantity"].isin(quantities) & (final["scope"] == scope)]
     if member not in MEMBERS:
         picked = final[final["quantity"] == member].drop_duplicates(RUN)
-        picked = picked[RUN].assign(member=picked["value"].astype(WHOLE))
+        picked = picked[RUN].assign(member=picked["value"].astype("Int64"))
         rows = rows.merge(picked, on=[*RUN, "member"])
     values = rows.groupby([*RUN, "quantity"], dropna=False, sort=False)["value"]
     runs = values.agg(MEMBERS.get(member, "mean")).reset_index()
@@ -142,6 +151,8 @@ def interval(values: Any) -> tuple[float, float]:
     """
     if len(values) < BOOTSTRAP_FROM:
         return student_interval(values)
+    from scipy.stats import bootstrap  # takes longer to import than all else here
+
     drawn = bootstrap(
         [values],
         interquartile_mean,
@@ -152,6 +163,13 @@ def interval(values: Any) -> tuple[float, float]:
     )
     low, high = drawn.confidence_interval
     return float(low), float(high)
+
+
+def interquartile_mean(values: Any, axis: int = 0) -> Any:
+    """Spec F5: the mean of the middle half: a quarter of the values, rounded down, is cut off at either end."""
+    count = values.shape[axis]
+    middle = range(count // 4, count - count // 4)
+    return np.sort(values, axis).take(middle, axis).mean(axis)
 
 
 def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
@@ -172,7 +190,14 @@ def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 def statistics(runs: pd.DataFrame) -> dict[str, float]:
     """See :func:`over`: of runs that are alike."""
     several = runs["layout"].nunique() > 1
-    values = runs.groupby("layout", sort=False)["value"].mean() if several else runs["value"]
+    values = (
+        runs.groupby(
+            "layout",
+            sort=False,
+        )["value"].mean()
+        if several
+        else runs["value"]
+    )
     low, high = interval(values.to_numpy())
     if is_share(runs["of"].iloc[0]):
         low, high = np.clip([low, high], 0, 1)
@@ -191,23 +216,29 @@ def statistics(runs: pd.DataFrame) -> dict[str, float]:
 def pairs(runs: pd.DataFrame) -> pd.DataFrame:
     """Spec F5: the first method against each other by each quantity, at each N, over runs that share ``SHARED``.
 
-    Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Runs alike in
-    all of ``SHARED`` are paired in order. Columns: N, quantity, first, second, and those of :func:`compare`.
+    Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Columns: N,
+    quantity, first, second, and those of :func:`compare`.
     """
-    alike = runs.groupby(["method", "quantity", "N", *SHARED], dropna=False)
-    numbered = runs.assign(copy=alike.cumcount())
     rows = []
-    for (groups, quantity), cell in numbered.groupby(["N", "quantity"], dropna=False, sort=False):
+    for (groups, quantity), cell in runs.groupby(
+        ["N", "quantity"],
+        dropna=False,
+        sort=False,
+    ):
         place = {"N": groups, "quantity": quantity}
         (_, first), *others = cell.groupby("method", sort=False)
         for _, second in others:
-            both = paired(first, second, [*SHARED, "copy"])
+            both = paired(first, second, SHARED)
             if len(both):
                 rows.append(place | compare(both))
     return pd.DataFrame(rows)
 
 
-def paired(first: pd.DataFrame, second: pd.DataFrame, on: Sequence[str]) -> pd.DataFrame:
+def paired(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    on: Sequence[str],
+) -> pd.DataFrame:
     """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
     return first.merge(second, on=list(on), suffixes=("", "_second"))
 
@@ -219,44 +250,51 @@ def compare(both: pd.DataFrame, unit: str = "layout") -> dict[str, Any]:
     the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.
 
     Returns:
-        first and second, their names and mean_first and mean_second; n, units (how many), wins, ties, probability (of
-        improvement) with probability_low and _high, difference (mean of first - second) with difference_low and _high
-        (Student's 95 %, of shares cut at -1 and 1), sign_test (two-sided p, ties left out), and higher, whether that is
-        better. Intervals are NaN for one unit.
+        first and second, their names and mean_first and mean_second; n, units (how many), unit (of what), wins, ties,
+        probability (of improvement) with probability_low and _high, difference (mean of first - second) with
+        difference_low and _high (Student's 95 %, of shares cut at -1 and 1), sign_test (two-sided p, ties left out),
+        and higher, whether that is better. Intervals are NaN for one unit.
     """
-    units = [unit] if both[unit].nunique() > 1 else ["seed", "copy"]
+    unit = unit if both[unit].nunique() > 1 else "seed"
     quantity = both["of"].iloc[0]
     higher = quantity not in LOWER_IS_BETTER
     difference = both["value"] - both["value_second"]
     better = np.sign(difference.round(DIGITS)) * (1 if higher else -1)
-    scored = both.assign(difference=difference, score=(1 + better) / 2)
-    names = ["value", "value_second", "difference", "score"]
-    by_unit = scored.groupby(units, sort=False)[names].mean()
-    means = by_unit.mean()
-    won = int((by_unit["score"] > 0.5).sum())
-    decided = won + int((by_unit["score"] < 0.5).sum())
-    low, high = np.clip(student_interval(by_unit["score"]), 0, 1)
-    difference_low, difference_high = student_interval(by_unit["difference"])
-    if is_share(quantity):
-        difference_low, difference_high = np.clip([difference_low, difference_high], -1, 1)
-    return {
+    columns: dict[str, Any] = {
+        "mean_first": both["value"],
+        "mean_second": both["value_second"],
+        "probability": (1 + better) / 2,
+        "difference": difference,
+    }
+    by_unit = both[[unit]].assign(**columns).groupby(unit, sort=False).mean()
+    won = int((by_unit["probability"] > 0.5).sum())
+    lost = int((by_unit["probability"] < 0.5).sum())
+    result = {
         "first": both["method"].iloc[0],
         "second": both["method_second"].iloc[0],
-        "mean_first": means["value"],
-        "mean_second": means["value_second"],
         "n": len(both),
         "units": len(by_unit),
+        "unit": unit,
         "wins": int((better > 0).sum()),
         "ties": int((better == 0).sum()),
-        "probability": means["score"],
-        "probability_low": low,
-        "probability_high": high,
-        "difference": means["difference"],
-        "difference_low": difference_low,
-        "difference_high": difference_high,
-        "sign_test": binomtest(won, decided).pvalue if decided else math.nan,
+        "sign_test": sign_test(won, lost),
         "higher": higher,
+        **by_unit.mean(),
     }
+    widest = 1 if is_share(quantity) else math.inf
+    for name, least, most in (("probability", 0, 1), ("difference", -widest, widest)):
+        result[f"{name}_low"], result[f"{name}_high"] = np.clip(
+            student_interval(by_unit[name]),
+            least,
+            most,
+        )
+    return result
+
+
+def sign_test(won: int, lost: int) -> float:
+    """The two-sided p of so uneven a count where neither is better; NaN without any."""
+    decided = won + lost
+    return min(1.0, 2 * bdtr(min(won, lost), decided, 0.5)) if decided else math.nan
 
 
 def at_least(values: Any, bound: Any) -> Any:

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import (
+    Callable,
+    Iterator,
+    Mapping,
+)
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    NamedTuple,
+)
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import (
+    Bools,
+    Floats,
+    Ints,
+)
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.processes import in_processes, prepare
+from hypogoal.core.processes import (
+    cores,
+    in_processes,
+    prepare,
+)
 from hypogoal.core.progress import Progress
 from hypogoal.data import States, open_dataset
-from hypogoal.evaluation.names import places_of
-from hypogoal.evaluation.run import Contents, most_used
+from hypogoal.evaluation.names import places_of, rank
+from hypogoal.evaluation.run import Contents, takes
 from hypogoal.observations import Observations
 
 if TYPE_CHECKING:
@@ -43,24 +60,23 @@ class Case(NamedTuple):
 class Judged(NamedTuple):
     """What K members say of N held-out and M unlabelled states."""
 
-    probabilities: NDArray[np.float32]  # (N, K), that the sub-goal is reached
-    predictions: NDArray[np.bool_]  # (N, K), each at its member's own threshold
-    unlabelled: NDArray[np.bool_]  # (M, K), the predictions on unlabelled states
-    thresholds: NDArray[np.float32]  # (K,), each member's own, of the probability
+    probabilities: Floats  # (N, K), that the sub-goal is reached
+    predictions: Bools  # (N, K), each at its member's own threshold
+    unlabelled: Bools  # (M, K), the predictions on unlabelled states
+    thresholds: Floats  # (K,), each member's own, of the probability
 
 
 @dataclass(frozen=True)
 class Judgement:
     """What the members of one sub-goal say."""
 
-    number: int  # the ensemble artefact's, among those of the run
     case: Case
     sub_goal: str
     split: States  # the held-out states' labels and origins, without the states
     judged: Judged
 
 
-def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:
+def place_of(origins: Mapping[str, Ints], state: int) -> str:
     """Where a state is from, in words; nothing where no origin says it."""
     if "layout_seed" in origins:
         return f"layout {origins['layout_seed'][state]}"
@@ -79,8 +95,7 @@ class Work:
     progress: Progress  # is told of each sub-goal judged and looked at, each run, and each layout that one plays
     layouts: tuple[int, ...] = ()  # on which trained agents are to play
     facts: dict[str, Any] = field(default_factory=dict)  # what is not a number, for ``run.json``
-    # The member that labelled rooms pick, by the ensemble's path and the sub-goal.
-    validated: dict[tuple[Path | None, str], float | None] = field(default_factory=dict)
+    validated: dict[Path, Any] = field(default_factory=dict)  # the member that labelled rooms pick for each sub-goal
 
     def __post_init__(self) -> None:
         self.places = places_of(self.contents)
@@ -88,22 +103,33 @@ class Work:
 
     def place(self, artefact: Artefact) -> dict[str, Any]:
         """Where the numbers of an artefact of the run stand in the table: its method, N, ladder, layout, seed, path."""
-        return self.places[self.contents.name(artefact)]
+        return self.places[artefact.path]
 
     def place_of(self, judgement: Judgement) -> dict[str, Any]:
         """Where the numbers of a sub-goal's members stand."""
-        return {**self.place(self.contents.ensembles[judgement.number]), "sub_goal": judgement.sub_goal}
+        return {**self.places[judgement.case.ensemble], "sub_goal": judgement.sub_goal}
+
+    def ranked(self, artefacts: list[Artefact]) -> list[Artefact]:
+        """Some of the run's, the paper's method first."""
+        return sorted(artefacts, key=lambda artefact: rank(self.place(artefact)["method"]))
+
+    def cases(self) -> list[Case]:
+        """Every ensemble, the paper's method first."""
+        ensembles = self.ranked(self.contents.ensembles)
+        return [Case(artefact.input("data"), artefact.path, artefact.config) for artefact in ensembles]
 
 
-def cases_of(ensembles: Sequence[Artefact]) -> list[tuple[int, Case]]:
-    """Every ensemble with its number, those on the same states one after another."""
-    cases = []
-    for number, artefact in enumerate(ensembles):
-        cases.append((number, Case(artefact.input("data"), artefact.path, artefact.config)))
-    return sorted(cases, key=lambda numbered: numbered[1].data)
+def most_used(contents: Contents) -> Path | None:
+    """Which of the ensembles with the most members the most artefacts were learned from; the first of several."""
+    learned = filter(takes, [*contents.agents, *contents.ladders])
+    users = Counter(artefact.input("ensemble").resolve() for artefact in learned)
+    ranks = {}
+    for artefact in contents.ensembles:
+        ranks[artefact.path] = artefact.config["members"], users[artefact.path.resolve()]
+    return max(ranks, key=ranks.__getitem__, default=None)
 
 
-def processes_for(cases: Sequence[Case], cores: int) -> int:
+def processes_for(cases: list[Case]) -> int:
     """How many processes are worth it: one where their start would take longer than it saves."""
     work = 0.0
     for case in cases:
@@ -112,28 +138,26 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
         for sub_goal in case.config["sub_goals"]:
             states = counts["heldout"][sub_goal]["states"] + counts["unlabelled"]
             work += case.config["members"] * states * dataset.observation_bytes
-    return min(cores, len(cases)) if work >= SPREAD_FROM else 1
+    return cores() if work >= SPREAD_FROM else 1
 
 
-def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[], None]) -> Iterator[Judgement]:
-    """Every sub-goal of every case judged, ``workers`` processes at once: the same for any number.
+def judgements(cases: list[Case], done: Callable[[], None]) -> Iterator[Judgement]:
+    """Every sub-goal of every case judged, in any number of processes; ``done`` is called after each case.
 
-    Cases, each with its ensemble's number, come with those on the same states one after another, since each process
-    keeps the last ones that it read. ``done`` is called as soon as one of them is judged.
+    Those on the same states are judged one after another, since each process keeps the last ones that it read.
     """
-    judged: dict[int, dict[str, tuple[States, Judged]]] = {}
+    judged = {}
+    order = sorted(cases, key=lambda case: case.data)
 
-    def keep(index: int, result: dict[str, tuple[States, Judged]]) -> None:
-        judged[index] = result
+    def keep(index, result):
+        judged[order[index].ensemble] = result
         done()
 
-    if workers > 1:
-        in_processes([partial(judge, case) for _, case in cases], workers, keep, forked=True)
-    for index, (number, case) in enumerate(cases):
-        if workers == 1:
-            keep(index, judge(case))
-        for sub_goal, (split, of_goal) in judged.pop(index).items():
-            yield Judgement(number, case, sub_goal, split, of_goal)
+    tasks = [partial(judge, case) for case in order]
+    in_processes(tasks, processes_for(cases), keep, forked=True)
+    for case in cases:
+        for sub_goal, (split, of_goal) in judged.pop(case.ensemble).items():
+            yield Judgement(case, sub_goal, split, of_goal)
     states_of.cache_clear()
 
 
@@ -145,19 +169,20 @@ def judge(case: Case) -> dict[str, tuple[States, Judged]]:
     heldout, unlabelled = states_of(case.data)
     sub_goals = case.config["sub_goals"]
     ensembles = [case.read(sub_goal) for sub_goal in sub_goals]
-    observations = [heldout[sub_goal].observations for sub_goal in sub_goals]
     every = together(ensembles)
-    if every is not None and all(each is observations[0] for each in observations):
-        on_heldout = np.split(every.predict(observations[0]), len(ensembles), axis=1)
-        on_unlabelled = np.split(every.predict(unlabelled), len(ensembles), axis=1)
-    else:
-        on_heldout = [ensemble.predict(each) for ensemble, each in zip(ensembles, observations, strict=True)]
-        on_unlabelled = [ensemble.predict(unlabelled) for ensemble in ensembles]
+
+    def predicted(observations):
+        if every is not None and all(each is observations[0] for each in observations):
+            return np.split(every.predict(observations[0]), len(ensembles), axis=1)
+        return [ensemble.predict(each) for ensemble, each in zip(ensembles, observations, strict=True)]
+
+    on_heldout = predicted([heldout[sub_goal].observations for sub_goal in sub_goals])
+    on_unlabelled = predicted([unlabelled] * len(sub_goals))
     judged = {}
     for sub_goal, ensemble, probabilities, others in zip(sub_goals, ensembles, on_heldout, on_unlabelled, strict=True):
         states = heldout[sub_goal]
-        split = States(states.observations[:0].copy(), states.labels, states.origins)
         above = ensemble.thresholds.numpy()
+        split = States(states.observations[:0].copy(), states.labels, states.origins)
         judged[sub_goal] = split, Judged(probabilities, probabilities > above, others > above, above)
     return judged
 

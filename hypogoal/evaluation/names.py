@@ -5,7 +5,10 @@ Runs that were not made alike are never averaged: they have different names.
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.evaluation.run import Contents, takes
@@ -18,8 +21,11 @@ NOT_A_VARIANT = frozenset(
         *("ended_at", "until_reached", "options_ended_at", "options_steps"),  # which came out
     }
 )
-ON_LADDERS = frozenset({"start", "domain_config", "termination"})  # of options, said in other columns
-IDLE = ("diversity", "diversity_weight", "schedule")  # settings without effect where there is one member
+ON_LADDERS = dict.fromkeys(
+    ("start", "domain_config", "termination"),
+    "",
+)  # of options, said in other columns
+IDLE = {"diversity", "diversity_weight", "schedule"}  # settings without effect where there is one member
 OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "none": "no diversity"}
 ONE = "one classifier"
 ORACLE = "oracle termination"
@@ -70,30 +76,36 @@ def names_apart(
     ``domain_config`` inside the settings is looked into. Of several ``groups`` (N) only things of the same are named
     apart. An ensemble stands without the setting's name, and in place of ``LEARNED``.
     """
-    settings = [_texts(config) for config in configs]
-    kinds = list(zip(titles, groups or titles, strict=True))
-    names = []
-    for kind, settings_of_it in zip(kinds, settings, strict=True):
-        alike = [other for other, others_kind in zip(settings, kinds, strict=True) if others_kind == kind]
-        name = kind[0]
-        for key, text in settings_of_it.items():
-            texts = [other[key] for other in alike if key in other]
-            if 2 * texts.count(text) <= len(texts):
-                name += f", {text}" if key == "ensemble" else f", {key}={text}"
-        rest = name.removeprefix(f"{LEARNED}, ")
-        names.append(rest if rest.startswith(METHODS) else name)
-    return names
+    names = pd.Series(titles, dtype=str)
+    settings = pd.DataFrame([_texts(config) for config in configs])
+    kinds = [pd.Series(titles, dtype=str), pd.Series(groups or titles)]
+    for _, alike in settings.groupby(kinds, dropna=False):
+        for key in sorted(alike, key=lambda key: (key != "ensemble", key)):
+            texts = alike[key].dropna()
+            often = 2 * texts.map(texts.value_counts()) > len(texts)
+            told = texts[~often]
+            label = "" if key == "ensemble" else f"{key}="
+            names[told.index] += f", {label}" + told
+    rest = names.str.removeprefix(f"{LEARNED}, ")
+    return names.mask(rest.str.startswith(METHODS), rest).tolist()
 
 
-def _texts(config: Mapping[str, Any]) -> dict[str, str]:
-    """The settings that tell runs apart, the ensemble first."""
+def _texts(config):
+    """The settings that tell runs apart."""
     flat = {**(config.get("domain_config") or {}), **config}
-    texts = {}
-    for key in sorted(flat, key=lambda key: (key != "ensemble", key)):
-        value = "unset" if flat[key] is None else flat[key]
-        if key not in NOT_A_VARIANT:
-            texts[key] = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-    return texts
+    unsaid = NOT_A_VARIANT
+    if config.get("members") == 1:
+        unsaid |= IDLE
+    if config.get("diversity") == "none":
+        unsaid |= {"diversity_weight"}
+    return {key: as_text(flat[key]) for key in flat.keys() - unsaid}
+
+
+def as_text(value: Any) -> str:
+    """A setting's value."""
+    if value is None:
+        return "unset"
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
 def groups_of(config: Mapping[str, Any]) -> int | None:
@@ -102,18 +114,22 @@ def groups_of(config: Mapping[str, Any]) -> int | None:
     return groups if isinstance(groups, int) else None
 
 
-def places_of(contents: Contents) -> dict[str, dict[str, Any]]:
+def places_of(contents: Contents) -> dict[Path, dict[str, Any]]:
     """Of each of a run's artefacts, by path, what stands in the table of numbers: method, N, ladder, layout, seed."""
-    titles = [ensemble_title(artefact.config) for artefact in contents.ensembles]
-    names = names_apart(titles, [_effective(artefact.config) for artefact in contents.ensembles])
-    named = {artefact.path.resolve(): name for artefact, name in zip(contents.ensembles, names, strict=True)}
-    places = [{"N": groups_of(artefact.config)} for artefact in contents.ensembles]
+    configs: list[Mapping[str, Any]] = [ensemble.config for ensemble in contents.ensembles]
+    names = names_apart([*map(ensemble_title, configs)], configs)
+    places: list[dict[str, Any]] = [{"N": number} for number in map(groups_of, configs)]
+    paths = [ensemble.path.resolve() for ensemble in contents.ensembles]
+    named = dict(zip(paths, names, strict=True))
     titles, configs = [], []
     for artefact in (*contents.agents, *contents.ladders):
         config, source, number = artefact.config, "", None
         if artefact.kind != "baseline":
             ensemble = Artefact(artefact.input("ensemble"))
-            source = named.get(ensemble.path.resolve(), ensemble_title(ensemble.config))
+            source = named.get(
+                ensemble.path.resolve(),
+                ensemble_title(ensemble.config),
+            )
             number = groups_of(ensemble.config)
         if artefact in contents.agents:
             titles.append(agent_title(artefact.kind, config))
@@ -122,19 +138,21 @@ def places_of(contents: Contents) -> dict[str, dict[str, Any]]:
         else:
             learned = takes(artefact)
             titles.append(source if learned else ORACLE)
-            configs.append({**config, **dict.fromkeys(ON_LADDERS, "")})
-            places.append({"N": number if learned else None, "ladder": config["start"]})
+            configs.append({**config, **ON_LADDERS})
+            places.append(
+                {
+                    "N": number if learned else None,
+                    "ladder": config["start"],
+                }
+            )
     groups = [place.get("N") for place in places[len(names) :]]
     names += names_apart(titles, configs, groups)
     by_path = {}
     for artefact, name, place in zip(contents.everything(), names, places, strict=True):
-        path = contents.name(artefact)
-        by_path[path] = {"method": name, **place, "seed": artefact.seed, "artefact": path}
+        by_path[artefact.path] = {
+            "method": name,
+            **place,
+            "seed": artefact.seed,
+            "artefact": contents.name(artefact),
+        }
     return by_path
-
-
-def _effective(config: Mapping[str, Any]) -> dict[str, Any]:
-    idle: tuple[str, ...] = IDLE if config["members"] == 1 else ()
-    if config["diversity"] == "none":
-        idle = (*idle, "diversity_weight")
-    return {key: value for key, value in config.items() if key not in idle}

@@ -3,16 +3,16 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.learners.world import columns_of
 from hypogoal.meta.setup import Setup
 from hypogoal.options.termination import ORACLE
 
-Near = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]]
-Distances = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
+Near = Callable[[Ints, Ints], Bools]
+Distances = Callable[[Ints, Ints], Ints]
 
 
 def nearness(setup: Setup, engine: Engine) -> Near | None:
@@ -35,7 +35,7 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     columns = np.repeat(columns_of(domain, sub_goals), setup.members)
     away = distances_of(domain, sub_goals, setup.members)
 
-    def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def near(ids: Ints, options: Ints) -> Bools:
         holds = engine.labels(ids)[np.arange(len(ids)), columns[options]]
         if not (domain.measures and engine.position_names):
             return holds
@@ -44,10 +44,14 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     return near
 
 
-def distances_of(domain: Domain, sub_goals: Sequence[str], members: int) -> Distances:
+def distances_of(
+    domain: Domain,
+    sub_goals: Sequence[str],
+    members: int,
+) -> Distances:
     """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
 
-    def away(positions: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.int64]:
+    def away(positions: Ints, options: Ints) -> Ints:
         distances = np.zeros(len(options), np.int64)
         for number, sub_goal in enumerate(sub_goals):
             of_goal = options // members == number

@@ -20,7 +20,6 @@ MOST_SIDE = 128  # pixels of a picture on the page
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION], N=25)  # few: small files
 STRONGEST = 0.995  # the quantile of absolute attributions that has full colour
 SHADE = 0.28  # how dark the brightest pixels of a state make the attributions over them
-STATES = "termination-states"  # in an evaluation's arrays: of how many states each option's overlay is
 FEW = 200  # states whose median is taken for what is usual
 MOST_STATES = 60  # on a sheet
 COLUMNS = 10

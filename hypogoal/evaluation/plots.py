@@ -65,6 +65,14 @@ def banded(axes: Axes, middle: pd.Series, wide: pd.Series, **look: Any) -> None:
     )
 
 
+def bars(kind: Any, means: Any, height: float, **errors: Any) -> tuple[Figure, Axes]:
+    """Bars of each method (a column) side by side at each place (a row), ``bar`` or ``barh``, with their errors."""
+    figure, axes = plot(height)
+    means.plot(kind=kind, ax=axes, capsize=3, alpha=0.8, rot=0, legend=False, **errors)
+    legend_below(figure, [axes], 2)
+    return figure, axes
+
+
 def whiskers(axes: Axes, table: pd.DataFrame, **look: Any) -> None:
     """The means of a table of :func:`house.over` against its index, with their standard deviations."""
     wide = table["standard_deviation"].fillna(0)

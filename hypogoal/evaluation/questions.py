@@ -2,26 +2,27 @@
 
 A question is a module with ``TITLE`` and any of:
 
-- ``look(work, judgement)`` and ``rows(work)``: its numbers, rows of the table; ``facts(work)``: what else it needs to
-  know; ``missing(work)``: lines about what the run has no artefacts for.
-- ``runs(results)``: each run's numbers, of :func:`house.per_run`. Its table is over these by the columns ``BY``, and
-  quantities that are ``PAIRED`` are compared, of ``compared(results)`` where these are other runs.
-- ``context(results)``: what else its template needs; None where the run has nothing of it.
-- ``figures(context)``, of what the template is given, and what they need, ``NEEDED``.
+- ``look(work, judgement)`` and ``rows(work)``: its numbers, rows of the table (DataFrames); ``facts(work)``: what else
+  it needs to know, by name; ``missing(work)``: lines about what the run has no artefacts for. :class:`judging.Work`
+  and :class:`judging.Judgement` say what these are.
+- ``runs(results)``, of :class:`page.Results`: each run's numbers, of :func:`house.per_run`. Its table is over these by
+  the columns ``BY``, and quantities that are ``PAIRED`` are compared, of ``compared(results)`` where these are other
+  runs.
+- ``context(results)``: what else its template needs, by name; None where the run has nothing of it.
+- ``figures(context)``, of what the template is given: :class:`page.Drawn` ones.
 
 Its template gets ``results``, ``table``, ``pairs`` and ``figures``, and sets ``shown``, what a terminal prints.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 from rich.console import Group
 from rich.table import Table
 
-from hypogoal.core.processes import cores
 from hypogoal.evaluation import (
     choosing,
     curves,
@@ -38,10 +39,10 @@ from hypogoal.evaluation import (
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.names import rank
 from hypogoal.evaluation.page import Drawn, Results
 from hypogoal.evaluation.run import FORMAT
 
+Context = dict[str, Any]  # what a question's template is given
 QUESTIONS: list[ModuleType] = [  # in the order of the page
     curves,
     rooms,
@@ -56,19 +57,7 @@ QUESTIONS: list[ModuleType] = [  # in the order of the page
 FOLDED = (exploits, saliency, selection, provenance)  # until asked for
 
 
-class Answer(NamedTuple):
-    """What a run says about a question."""
-
-    question: ModuleType
-    name: str  # of its template, its table and its section
-    context: dict[str, Any]  # for the template
-
-    def words(self) -> Any:
-        """What the template sets and says."""
-        return page.module(self.name, self.context)
-
-
-def answers(results: Results, *, drawn: bool = False) -> list[Answer]:
+def answers(results: Results, *, drawn: bool = False) -> list[Context]:
     """Of every question that the run has something of, in the order of the page; with its figures if ``drawn``."""
     every = []
     for question in (*QUESTIONS, provenance):
@@ -77,24 +66,32 @@ def answers(results: Results, *, drawn: bool = False) -> list[Answer]:
             continue
         if drawn and hasattr(question, "figures"):
             context["figures"] = list(question.figures(context))
-        every.append(Answer(question, name_of(question), context))
+        every.append(context)
     return every
 
 
-def context_of(question: ModuleType, results: Results) -> dict[str, Any] | None:
+def context_of(question: ModuleType, results: Results) -> Context | None:
     """A question's numbers, without its figures; None where the run has nothing of it."""
-    table, compared = pd.DataFrame(), pd.DataFrame()
+    context = {
+        "name": name_of(question),
+        "title": question.TITLE,
+        "folded": question in FOLDED,
+        "results": results,
+        "table": pd.DataFrame(),
+        "pairs": pd.DataFrame(),
+        "figures": [],
+    }
     if hasattr(question, "runs"):
         runs = question.runs(results)
         if runs.empty:
             return None
-        table = house.over(runs, question.BY)
+        context["table"] = house.over(runs, question.BY)
     if hasattr(question, "PAIRED"):
-        compared = house.pairs(paired_runs(question, results))
-    more = question.context(results) if hasattr(question, "context") else {}
-    if more is None:
-        return None
-    return {"results": results, "table": table, "pairs": compared, "figures": []} | more
+        context["pairs"] = house.pairs(paired_runs(question, results))
+    if not hasattr(question, "context"):
+        return context
+    more = question.context(results)
+    return None if more is None else context | more
 
 
 def paired_runs(question: ModuleType, results: Results) -> pd.DataFrame:
@@ -115,43 +112,27 @@ def asked(name: str) -> Iterator[Any]:
             yield getattr(question, name)
 
 
-def answer(
-    work: judging.Work,
-    cases: Sequence[tuple[int, judging.Case]],
-    settings: Mapping[str, Any],
-    data: Sequence[Path],
-) -> Results:
+def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
     """Every number of a run, and what else its page needs: ensembles are judged, then all questions asked."""
-    parts = _judge(work, cases)
+    parts: list[pd.DataFrame] = []
+    for judgement in judging.judgements(work.cases(), work.progress.advance):
+        for look in asked("look"):
+            parts += look(work, judgement)
+        work.progress.advance()
     for rows in asked("rows"):
         parts += rows(work)
-    facts: dict[str, Any] = {
+    facts = {
         "format": FORMAT,
         "run": work.contents.run.resolve().name,
         "settings": settings,
-        "provenance": provenance.provenance(work.contents, data),
+        "provenance": provenance.provenance(work.contents),
+        "missing": [] if work.contents.ensembles else ["no ensemble"],
     }
     for facts_of in asked("facts"):
         facts |= facts_of(work)
-    lines = [] if work.contents.ensembles else ["no ensemble"]
-    for artefact in work.contents.silent:
-        lines.append(f"no executions.csv in {work.contents.name(artefact)}: its domain tells no distance")
     for missing in asked("missing"):
-        lines += missing(work)
-    return Results(house.joined(parts), facts | work.facts | {"missing": lines})
-
-
-def _judge(work: judging.Work, cases: Sequence[tuple[int, judging.Case]]) -> list[pd.DataFrame]:
-    """What the questions say of every ensemble's members, the paper's method first."""
-    parts: list[tuple[int, int, pd.DataFrame]] = []
-    workers = judging.processes_for([case for _, case in cases], cores())
-    for judgement in judging.judgements(cases, workers, work.progress.advance):
-        method = work.place_of(judgement)["method"]
-        for look in asked("look"):
-            parts += [(rank(method), judgement.number, rows) for rows in look(work, judgement)]
-        work.progress.advance()
-    parts.sort(key=lambda part: part[:2])
-    return [rows for *_, rows in parts]
+        facts["missing"] += missing(work)
+    return Results(house.joined(parts), facts | work.facts)
 
 
 def write(folder: Path, results: Results) -> None:
@@ -159,9 +140,9 @@ def write(folder: Path, results: Results) -> None:
     results.numbers.to_csv(folder / "numbers.csv", index=False)
     (folder / "run.json").write_text(house.as_json(results.facts) + "\n", encoding="utf-8")
     tables = {"verdict": pd.DataFrame(verdict.findings(results))}
-    for each in answers(results):
-        tables[each.name] = each.context["table"]
-        tables[f"{each.name}-pairs"] = each.context["pairs"]
+    for context in answers(results):
+        tables[context["name"]] = context["table"]
+        tables[f"{context['name']}-pairs"] = context["pairs"]
     (folder / "tables").mkdir()
     for name, table in tables.items():
         if not table.empty:
@@ -171,10 +152,11 @@ def write(folder: Path, results: Results) -> None:
 def summary(results: Results) -> Group:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
     tables: list[Any] = []
-    for each in answers(results):
-        shown = getattr(each.words(), "shown", None)
-        if shown is not None and not shown.empty:
-            tables.append(page.terminal(each.question.TITLE, shown))
+    for context in answers(results):
+        words = page.module(context["name"], context)
+        shown = getattr(words, "shown", pd.DataFrame())
+        if not shown.empty:
+            tables.append(page.terminal(context["title"], shown))
     lines = Table.grid()
     lines.width = page.WIDTH
     if results.facts["missing"]:
@@ -186,39 +168,36 @@ def summary(results: Results) -> Group:
 
 def sentences(results: Results) -> list[str]:
     """The verdict, a sentence a line."""
-    text = page.templates().get_template("verdict.txt").render(verdict.context(results))
+    return lines_of("verdict.txt", verdict.context(results))
+
+
+def lines_of(template: str, context: Context) -> list[str]:
+    """What a template of lines says."""
+    text = page.templates().get_template(template).render(context)
     return [line for line in text.splitlines() if line]
 
 
-def render(results: Results, every: Sequence[Answer], films: Iterable[Mapping[str, str]]) -> str:
+def render(results: Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
     """Spec F7: the page of a run, self-contained, with the figures of drawn :func:`answers`."""
     sections = []
-    for each in sorted(every, key=lambda each: each.question in FOLDED):  # what is open comes first
-        part = page.section(each.name, each.context)
-        sections.append((each.name, each.question.TITLE, part, each.question in FOLDED))
-    lead = verdict.context(results) | {
-        "sentences": sentences(results),
-        "films": films,
-        "domains": provenance.domains_of(results.facts),
-    }
+    for context in sorted(every, key=lambda context: context["folded"]):  # what is open comes first
+        part = page.section(context["name"], context)
+        sections.append((context["name"], context["title"], part, context["folded"]))
+    lead = verdict.context(results)
+    lead |= {"sentences": sentences(results), "films": films, "domains": provenance.domains_of(results)}
     return page.draw_page(f"hypogoal: {results.facts['run']}", sections, "run.html", **lead)
 
 
-def captions(every: Iterable[Answer]) -> dict[str, tuple[Drawn, str]]:
+def captions(every: Iterable[Context]) -> dict[str, tuple[Drawn, str]]:
     """Figures and their captions, by their names."""
     by_name = {}
-    for each in every:
-        words = page.module(each.name, each.context | {"figures": []})
-        for figure in each.context["figures"]:
+    for context in every:
+        words = page.module(context["name"], context | {"figures": []})
+        for figure in context["figures"]:
             by_name[figure.name] = figure, page.caption(words, figure)
     return by_name
 
 
 def not_drawn(names: Iterable[str]) -> list[str]:
     """A line for each of the paper's Figures 2 to 9 that is not among a run's figures."""
-    kinds = [name.partition("-")[0] for name in names]
-    needed: dict[str, str] = {}
-    for of_question in asked("NEEDED"):
-        needed |= of_question
-    absent = sorted(set(needed).difference(kinds))
-    return [f"{name.replace('figure', 'Figure ')}: not drawn. It needs {needed[name]}." for name in absent]
+    return lines_of("needed.txt", {"drawn": [name.partition("-")[0] for name in names]})

@@ -4,23 +4,21 @@ A damaged file is refused in one line (Spec G2).
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
-from hypogoal.core.artefacts import AGAIN, MANIFEST, Artefact, open_artefact, sha256_of
-from hypogoal.core.errors import UserError, reason
-from hypogoal.core.files import read_json, visible
+from hypogoal.core.artefacts import MANIFEST, Artefact, open_artefact, sha256_of
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import reading, visible
 from hypogoal.core.own_code import command
 from hypogoal.data import opened
 from hypogoal.evaluation.house import EVALUATE_AGAIN, read_numbers
 from hypogoal.evaluation.page import Results
-from hypogoal.options.tables import MAX_INTEGER
+from hypogoal.options.tables import Executions
 
 FORMAT = 5  # of ``run.json``
 DEPTH = 3  # levels of folders below a run that are searched for artefacts
@@ -34,12 +32,15 @@ class Contents:
     ensembles: list[Artefact]  # every one
     agents: list[Artefact]  # what plays a layout: metas, options that no meta continues, baselines
     ladders: list[Artefact]  # options learned from a named start each, with a table of where they stopped
-    silent: list[Artefact]  # options learned from a named start without that table; they are not evaluated
     continued: list[Artefact]  # options that a meta artefact continues, and so is judged by
 
     def everything(self) -> list[Artefact]:
         """All of them."""
         return [*self.ensembles, *self.agents, *self.ladders]
+
+    def data(self) -> list[Path]:
+        """The data files that ensembles were trained on."""
+        return sorted({artefact.input("data") for artefact in self.ensembles})
 
     def name(self, artefact: Artefact) -> str:
         """Its path within the run."""
@@ -60,31 +61,22 @@ def find(run: Path) -> Contents:
 
     None, or a damaged one, is a ``UserError``.
     """
-    metas, learned = find_artefacts(run, "meta"), find_artefacts(run, "options")
-    inputs: list[Path] = []
+    metas = find_artefacts(run, "meta")
+    inputs: set[Path] = set()
     for artefact in metas:
-        inputs += map(artefact.place_of, artefact.manifest.inputs)
-    continued = [artefact for artefact in learned if artefact.path.resolve() in inputs]
-    ladders: list[Artefact] = []
-    silent: list[Artefact] = []
-    others: list[Artefact] = []
-    for artefact in learned:
-        if artefact not in continued:
-            has_table = "executions.csv" in artefact.manifest.files
-            (ladders if has_table else silent if artefact.config.get("start") else others).append(artefact)
-    agents = [*metas, *others, *find_artefacts(run, "baseline")]
-    contents = Contents(run, find_artefacts(run, "ensemble"), agents, ladders, silent, continued)
+        inputs.update(map(artefact.place_of, artefact.manifest.inputs))
+    contents = Contents(run, find_artefacts(run, "ensemble"), metas, [], [])
+    for artefact in find_artefacts(run, "options"):
+        if artefact.path.resolve() in inputs:
+            contents.continued.append(artefact)
+        elif Executions.FILE in artefact.manifest.files:
+            contents.ladders.append(artefact)
+        else:
+            contents.agents.append(artefact)
+    contents.agents.extend(find_artefacts(run, "baseline"))
     if not contents.everything():
         raise UserError("nothing to evaluate", run, "Train something into it first: hypogoal run --help")
     return contents
-
-
-def most_used(contents: Contents) -> int | None:
-    """Which of the ensembles with the most members the most artefacts were learned from; the first of several."""
-    learned = [artefact for artefact in (*contents.agents, *contents.ladders) if takes(artefact)]
-    users = [artefact.input("ensemble").resolve() for artefact in learned]
-    rank = [(artefact.config["members"], users.count(artefact.path.resolve())) for artefact in contents.ensembles]
-    return max(range(len(rank)), key=lambda index: rank[index], default=None)
 
 
 def takes(artefact: Artefact) -> bool:
@@ -92,25 +84,10 @@ def takes(artefact: Artefact) -> bool:
     return artefact.kind != "baseline" and artefact.config["termination"] != "oracle"
 
 
-def thresholds_of(artefact: Artefact) -> NDArray[np.float64]:
-    """The probabilities (G*K,) above which an artefact's options end; they may have fallen while it learned.
-
-    NaN where options end at true sub-goals.
-    """
-    from hypogoal.core.tensors import load_tensors  # with PyTorch, which a report needs not
-    from hypogoal.options.termination import thresholds_in
-
-    options = len(artefact.config["sub_goals"]) * artefact.config["members"]
-    if not takes(artefact):
-        return np.full(options, np.nan)
-    saved = load_tensors(artefact.path / "options.safetensors")
-    return 1 / (1 + np.exp(-thresholds_in(saved, options).astype(np.float64)))
-
-
 class Layout(BaseModel, strict=True):
     """``layout.json``: what is known of the layout that an agent was trained on."""
 
-    layout_seed: Annotated[int, Field(ge=0, lt=MAX_INTEGER)]
+    layout_seed: int
     shortest_path: int | None  # steps
     random_success: float | None  # share of random play's episodes
     layouts: str | None = None  # where there were many
@@ -118,10 +95,8 @@ class Layout(BaseModel, strict=True):
 
 def read_layout(path: Path) -> Layout:
     """``layout.json``; a ``UserError`` where it is missing or damaged."""
-    try:
+    with reading(path, subject="the layout's file"):
         return Layout.model_validate_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise UserError(f"the layout's file cannot be read ({reason(error)})", path, AGAIN) from None
 
 
 @contextlib.contextmanager
@@ -147,7 +122,8 @@ def read_evaluation(run: Path) -> Results:
     A run that was not evaluated, or a damaged evaluation, is a ``UserError``.
     """
     source = evaluation_of(run)
-    results = with_missing(read_results(source), _since(run, source))
+    results = read_results(source)
+    results.facts["missing"].extend(_since(run, source))
     with opened(source.path / "arrays.h5", EVALUATE_AGAIN, "the evaluation's arrays") as file:
         names: list[str] = []
         file.visit(names.append)
@@ -155,22 +131,14 @@ def read_evaluation(run: Path) -> Results:
     return replace(results, arrays=arrays)
 
 
-def with_missing(results: Results, lines: Sequence[str]) -> Results:
-    """The same, with more lines about what is missing."""
-    return replace(results, facts={**results.facts, "missing": [*results.facts["missing"], *lines]})
-
-
 def read_results(source: Artefact) -> Results:
     """The numbers and facts of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
     path = open_artefact(source.path).path / "run.json"
-    if not path.exists():
-        raise UserError("a version of hypogoal before 1.0 evaluated this", source.path, EVALUATE_AGAIN)
-    facts = read_json(path, "the evaluation is", EVALUATE_AGAIN)
-    if not isinstance(facts, dict) or not isinstance(facts.get("missing"), list):
-        raise UserError("the evaluation is damaged", path, EVALUATE_AGAIN)
-    if facts.get("format") != FORMAT:
-        problem = f"another version of hypogoal evaluated this (format {facts.get('format')}, needed: {FORMAT})"
-        raise UserError(problem, path, EVALUATE_AGAIN)
+    with reading(path, EVALUATE_AGAIN, "the evaluation"):
+        facts = json.loads(path.read_bytes())
+        if facts["format"] != FORMAT:
+            problem = f"another version of hypogoal evaluated this (format {facts['format']}, needed: {FORMAT})"
+            raise UserError(problem, path, EVALUATE_AGAIN)
     return Results(read_numbers(source.path / "numbers.csv"), facts)
 
 

@@ -18,7 +18,6 @@ from hypogoal.evaluation.pictures import SIGNED, attribution_image, coloured
 
 TITLE = "What members look at"
 MOST_BARS = 15  # features
-NEEDED = dict.fromkeys(("figure2", "figure9"), "an ensemble on pictures that has positive predictions")
 
 
 def context(results: Results) -> dict[str, Any] | None:

@@ -1,24 +1,25 @@
 """Figures 7 and 8: which members the meta-policy prefers, and where their options stop (Spec F6)."""
 
-from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
-from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import Bytes, Doubles, Ints
+from hypogoal.core.arrays import (
+    Bytes,
+    Doubles,
+    Ints,
+)
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import base
 from hypogoal.evaluation import page, plots
 from hypogoal.evaluation.curves import chosen_by
 from hypogoal.evaluation.house import of_options
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.pictures import STATES, overlay
-from hypogoal.evaluation.run import takes, thresholds_of
+from hypogoal.evaluation.pictures import (
+    overlay,
+)
+from hypogoal.evaluation.run import takes
 from hypogoal.hypotheses import scores
 from hypogoal.meta.config import layout_seeds
 from hypogoal.observations import PICTURE
@@ -26,32 +27,29 @@ from hypogoal.options.tables import Choices
 
 TITLE = "Which hypotheses are chosen, and where they stop"
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
-NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
+NUMBERED = {
+    "open-red-door": "figure7",
+    "go-to-goal": "figure8",
+}  # the sub-goals that the paper shows
 SCOPE = "layout"  # of choices, and of the match with the truth, on a run's layout
 COUNTS = ("offered", "chosen", "reached", "expected")
-NUMBERS = (*COUNTS, "duration", "preference", "match", "threshold")  # of an option
-NEEDED = {
-    "figure7": "a meta artefact with the sub-goal open-red-door: train-meta",
-    "figure8": "a meta artefact with the sub-goal go-to-goal: train-meta",
-}
+NUMBERS = (*COUNTS, "duration", "preference", "match")  # of an option
 
 
-def rows(work: Work) -> Iterator[pd.DataFrame]:
+def rows(work):
     """Spec F6: the choices of every run of each agent whose options are members, and how well these match the truth."""
     judged = cache(on_layout)
     for artefact in work.contents.agents:
         work.progress.advance()
         if not takes(artefact):
             continue
-        config, path = artefact.config, work.contents.name(artefact)
+        config, name = artefact.config, work.contents.name(artefact)
         seeds = layout_seeds(config.get("layouts") or "", config["layout_seed"])[:LOOKED_AT]
-        members = judged(artefact.input("ensemble"), tuple(seeds))
-        for option, overlaid in members.sets.items():
-            work.arrays[f"terminations/{path}/{option}"] = overlaid
-        work.arrays[f"{STATES}/{path}/counts"] = members.counts
-        choices = Choices.read(artefact.path / "choices.csv")
-        columns = numbers_of_choices(choices, len(members.match))
-        columns |= {"match": members.match, "threshold": thresholds_of(artefact)}
+        match, overlaid = judged(artefact.input("ensemble"), tuple(seeds))
+        for option, picture in overlaid.items():
+            work.arrays[f"terminations/{name}/{option}"] = picture
+        columns = numbers_of_choices(Choices.read(artefact.path / Choices.FILE), len(match))
+        columns["match"] = match
         yield of_options(columns, config, **work.place(artefact), scope=SCOPE)
 
 
@@ -68,26 +66,18 @@ def numbers_of_choices(choices: Choices, options: int) -> dict[str, Doubles]:
     return columns
 
 
-class OnLayout(NamedTuple):
-    """The members of an ensemble, as options, on the states of layouts.
+def on_layout(path: Path, layouts: tuple[int, ...]) -> tuple[Doubles, dict[int, Bytes]]:
+    """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met.
 
-    ``match``, float (G*K,), is their balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal but
-    the user's own labels do: its truth is unknown there. ``counts``, int (G*K,), are of the states in which they are
-    positive. ``sets``, of pictures only, has for options that are positive anywhere an :func:`overlay` of these.
+    Returns of each option (G*K,) its balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal but
+    the user's own labels do: its truth is unknown there; and of options that are positive anywhere, where states are
+    pictures, an :func:`overlay` of these.
     """
-
-    match: Doubles
-    counts: Ints
-    sets: dict[int, Bytes]
-
-
-def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
-    """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met."""
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
-    source = Artefact(path)
-    domain = base.load_domain(source.config["domain"])
-    world = domain.world(source.config["domain_config"])
+    config = Artefact(path).config
+    domain = base.load_domain(config["domain"])
+    world = domain.world(config["domain_config"])
     if len(layouts) > 1:
         world["layouts"] = base.Layouts(layouts)
     engine = domain.make_engine(layouts[0], len(layouts), 500, **world)
@@ -96,9 +86,8 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
         ids = states_met(engine, 2_000, rng_for(0, "states-of-layout"))
     images, labels = engine.images(ids), engine.labels(ids)
     matches, verdicts = [], []
-    for sub_goal in source.config["sub_goals"]:
-        ensemble = read_ensemble(source.path, source.config, sub_goal)
-        predictions = ensemble.predictions(images)
+    for sub_goal in config["sub_goals"]:
+        predictions = read_ensemble(path, config, sub_goal).predictions(images)
         match = np.full(predictions.shape[1], np.nan)
         if sub_goal in domain.sub_goals:
             truth = labels[:, domain.sub_goals.index(sub_goal)]
@@ -107,13 +96,17 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
         verdicts.append(predictions)
     positive = np.concatenate(verdicts, axis=1)
     sets = {}
-    for option, states in enumerate(positive.T):
-        if states.any() and images.dtype == PICTURE:
-            sets[option] = overlay(images[states])
-    return OnLayout(np.concatenate(matches), positive.sum(axis=0), sets)
+    if images.dtype == PICTURE:
+        for option in np.flatnonzero(positive.any(axis=0)):
+            sets[int(option)] = overlay(images[positive[:, option]])
+    return np.concatenate(matches), sets
 
 
-def states_met(engine: base.Engine, steps: int, rng: np.random.Generator) -> Ints:
+def states_met(
+    engine: base.Engine,
+    steps: int,
+    rng: np.random.Generator,
+) -> Ints:
     """The states that random play of an engine meets in so many steps, each once."""
     met = [engine.ids]
     for _ in range(steps // engine.count):
@@ -121,62 +114,57 @@ def states_met(engine: base.Engine, steps: int, rng: np.random.Generator) -> Int
     return np.unique(np.concatenate(met))
 
 
-def missing(work: Work) -> list[str]:
-    """Sub-goals of which the domain does not know where they are reached, and where to say it."""
+def missing(work):
+    """Sub-goals of which the domain does not know where they are reached."""
     lines = {}
     for artefact in filter(takes, work.contents.agents):
-        name = artefact.config["domain"]
-        domain = base.load_domain(name)
-        for sub_goal in artefact.config["sub_goals"]:
-            if sub_goal in domain.sub_goals:
-                continue
-            do = f"add {sub_goal} to the domain's sub_goals"
-            if name in base.BUILT_IN:
-                do = "import them under one of these names, if it is one of them"
-            has = f"{name} has {page.listed(domain.sub_goals)}"
-            lines[f"no truth of {sub_goal} to match members with: {has}; {do}, then evaluate again"] = True
-    return [*lines]
+        domain = base.load_domain(artefact.config["domain"])
+        for sub_goal in set(artefact.config["sub_goals"]).difference(domain.sub_goals):
+            has = f"{artefact.config['domain']} has {page.listed(domain.sub_goals)}"
+            lines[f"no truth of {sub_goal} to match members with: {has}"] = True
+    return sorted(lines)
 
 
-def context(results: page.Results) -> dict[str, Any] | None:
+def context(results):
     """A row of ``table`` for each run's member; ``members``: those of the first run that learned to choose, if any."""
     numbers = results.of(scope=SCOPE)
     if numbers.empty:
         return None
     place = ["artefact", "method", "layout", "seed", "sub_goal", "member"]
-    wide = numbers.pivot_table(index=place, columns="quantity", values="value", sort=False).reset_index()
+    wide = numbers.pivot_table(
+        index=place,
+        columns="quantity",
+        values="value",
+        sort=False,
+    ).reset_index()
     table = wide.reindex(columns=[*place, *NUMBERS])
-    learned = table[table["method"].isin([*chosen_by(results, "learned")])]
-    shown = table if learned.empty else learned
+    learned = table["method"].isin([*chosen_by(results, "learned")])
+    shown = table[learned] if learned.any() else table
     members = shown[shown["artefact"] == shown["artefact"].min()]
     return {"table": table, "members": members.reset_index(drop=True)}
 
 
-def figures(context: Mapping[str, Any]) -> Iterator[page.Drawn]:
-    """Figures 7 and 8 and the other sub-goals', of the run that is shown; none of numbers."""
+def figures(context):
+    """Figures 7 and 8 and the other sub-goals': termination states of the most and of the least preferred member."""
     members, arrays = context["members"], context["results"].arrays
     path = members["artefact"].min()
-    for sub_goal, of_goal in members.groupby("sub_goal", sort=False):
-        preference = of_goal["preference"].dropna()
-        sides = []
-        for word, option in (("most", preference.idxmax()), ("least", preference.idxmin())) if len(preference) else ():
+    for sub_goal, of_goal in members.dropna(subset="preference").groupby("sub_goal", sort=False):
+        preference = of_goal["preference"]
+        sides = {}
+        for word, option in (("most", preference.idxmax()), ("least", preference.idxmin())):
             states = arrays.get(f"terminations/{path}/{option}")
             if states is not None:
-                count = arrays[f"{STATES}/{path}/counts"][option]
-                sides.append((f"{word} preferred: member {members['member'][option]}\n{count:,} states", states))
-        if sides:
-            name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
-            label = f"Termination states of {sub_goal}"
-            yield page.Drawn(name, label, termination_states(sides), {"sub_goal": sub_goal})
-
-
-def termination_states(sides: Sequence[tuple[str, Bytes]]) -> Figure:
-    """Figures 7 and 8: overlaid termination states of some members, the most preferred first.
-
-    A side is a title and an overlay uint8 (H, W, C).
-    """
-    with plots.styled():
-        figure, places = plots.pictures(1, 2, titles=0.6)
-        for place, (title, image) in zip(places, sides, strict=False):
-            plots.show_picture(place, image, title)
-    return figure
+                sides[f"{word} preferred\nmember {members['member'][option]}"] = states
+        if not sides:
+            continue
+        with plots.styled():
+            figure, places = plots.pictures(1, 2, titles=0.6)
+            for place, (title, image) in zip(places, sides.items(), strict=False):
+                plots.show_picture(place, image, title)
+        name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
+        yield page.Drawn(
+            name,
+            f"Termination states of {sub_goal}",
+            figure,
+            {"sub_goal": sub_goal},
+        )

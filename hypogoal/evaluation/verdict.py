@@ -6,7 +6,6 @@ options that validation picks.
 """
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import pandas as pd
@@ -14,11 +13,18 @@ import pandas as pd
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN
 from hypogoal.evaluation.curves import chosen_by
-from hypogoal.evaluation.house import compare, paired, per_run
-from hypogoal.evaluation.judging import Work
-from hypogoal.evaluation.names import ONE, ORACLE, UNIFORM
+from hypogoal.evaluation.house import (
+    compare,
+    paired,
+    per_run,
+)
+from hypogoal.evaluation.hypotheses import VALIDATED
+from hypogoal.evaluation.names import (
+    ONE,
+    ORACLE,
+    UNIFORM,
+)
 from hypogoal.evaluation.page import Results
-from hypogoal.evaluation.rooms import VALIDATED
 from hypogoal.evaluation.zero_shot import SCOPE as OTHER_LAYOUTS
 
 MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
@@ -26,21 +32,25 @@ BETTER, WORSE, ALIKE, UNDECIDED = "better", "worse", "alike", "undecided"
 CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a finding is about
 
 
-def facts(work: Work) -> dict[str, Any]:
+def facts(work):
     """The tasks of a run, in their domains' words, each agent's, and the cap of episodes, times the shortest path."""
-    tasks, task_of = {}, {}
+    task_of, caps = {}, []
     for artefact in (*work.contents.agents, *work.contents.ladders):
         config = artefact.config
         domain = installed_domain(config["domain"])
         if domain is not None:
-            task = domain.task(domain.world(config.get("domain_config") or {}))
-            tasks[task] = config.get("cap")
-            task_of[work.place(artefact)["method"]] = task
-    cap = max(filter(None, tasks.values()), default=None)
-    return {"tasks": [*filter(None, tasks)], "task_of": task_of, "cap": cap}
+            world = domain.world(config.get("domain_config") or {})
+            task_of[work.place(artefact)["method"]] = domain.task(world)
+            caps.append(config.get("cap") or 0)
+    tasks = dict.fromkeys(filter(None, task_of.values()))
+    return {"tasks": [*tasks], "task_of": task_of, "cap": max(caps, default=0)}
 
 
-def outcome_of(difference: float, low: float, high: float) -> str:
+def outcome_of(
+    difference: float,
+    low: float,
+    high: float,
+) -> str:
     """What a difference of shares says; of one unit, whose bounds are NaN, the difference alone.
 
     An interval within ``MARGIN`` of 0 is no difference, one above or below 0 is a difference, any other undecided.
@@ -67,62 +77,65 @@ def finding(
     both = paired(first, second.drop_duplicates(on), on)
     if both.empty:
         return []
-    unit = "ladder" if subject == OPTIONS else "layout"
-    result = compare(both.assign(of="success", copy=0), unit)
-    several = both[unit].nunique() > 1 or result["units"] == 1
-    outcome = outcome_of(result["difference"], result["difference_low"], result["difference_high"])
-    last = {"unit": unit if several else "seed", "outcome": outcome}
-    return [{"subject": subject} | result | last]
+    result = compare(both.assign(of="success"), "ladder" if subject == OPTIONS else "layout")
+    outcome = outcome_of(
+        result["difference"],
+        result["difference_low"],
+        result["difference_high"],
+    )
+    return [{"subject": subject, **result, "outcome": outcome}]
 
 
 def findings(results: Results) -> list[dict[str, Any]]:
     """Of every agent that chooses among several members, and of options on ladders, what the comparisons say."""
     success = results.of(quantity="success", sub_goal="")
-    played = success[success["scope"] == FROZEN]
+    trained, played = per_run(success, "success"), success[success["scope"] == FROZEN]
     if played.empty:
         played = success[success["scope"] == OTHER_LAYOUTS]
-    trained = success[(success["scope"] == "") & success["step"].isna()]
-    uniform = played[played["method"] == UNIFORM]
     random = trained[trained["method"].isin([*chosen_by(results, "random")])]
     learned = chosen_by(results, "learned")
-    single = [name for name in learned if learned[name]["members"] == 1]
     task_of = results.facts.get("task_of", {})
     result: list[dict[str, Any]] = []
     for name in learned:
-        if name in single:
+        if learned[name]["members"] == 1:
             continue
-        frozen, trained_runs = played[played["method"] == name], trained[trained["method"] == name]
-        of_choosing = finding(CHOOSING, frozen, uniform, ["artefact", "layout"])
+        training, frozen = _of(name, trained), _of(name, played)
+        of_choosing = finding(CHOOSING, frozen, _of(UNIFORM, played), ["artefact", "layout"])
         # random choice while learning has other options
-        result += of_choosing or finding(CHOOSING, trained_runs, random, ["layout", "seed"])
-        for other in single:
-            if task_of.get(name) != task_of.get(other):
+        result += of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
+        for other in learned:
+            if learned[other]["members"] != 1 or task_of.get(name) != task_of.get(other):
                 continue
-            theirs = played[played["method"] == other]
-            if frozen.empty or theirs.empty:
-                frozen, theirs = trained_runs, trained[trained["method"] == other]
-            result += finding(HYPOTHESES, frozen, theirs, ["layout", "seed"])
+            both = frozen, _of(other, played)
+            if min(map(len, both)) == 0:
+                both = training, _of(other, trained)
+            result += finding(HYPOTHESES, *both, ["layout", "seed"])
     return [*result, *_of_ladders(results)]
 
 
-def _of_ladders(results: Results) -> Iterator[dict[str, Any]]:
+def _of(method, numbers):
+    return numbers[numbers["method"] == method]
+
+
+def _of_ladders(results):
     """How often options stop at the base: the one of the member that validation picks, else the first."""
     numbers = results.numbers[results.numbers["ladder"] != ""]
     picked = per_run(numbers, "reached_base", member=VALIDATED)
     first = per_run(numbers[numbers["member"] == 0], "reached_base")
     rows = pd.concat([picked, first]).drop_duplicates(["artefact", "sub_goal"])
-    single = rows[rows["method"] == ONE]
-    for method in rows["method"].unique():
-        if method != ONE and not method.startswith(ORACLE):
-            yield from finding(OPTIONS, rows[rows["method"] == method], single, ["ladder", "seed", "N"])
+    for method, own in rows.groupby("method", sort=False):
+        if method != ONE and not str(method).startswith(ORACLE):
+            yield from finding(OPTIONS, own, _of(ONE, rows), ["ladder", "seed", "N"])
 
 
-def context(results: Results) -> dict[str, Any]:
+def context(results):
     """For the template: findings, and what agents solved."""
-    final = per_run(results.of(method=[*results.facts["agents"]]), "success")
+    agents = results.facts["agents"]
+    final = per_run(results.of(method=[*agents]), "success")
     return {
         "results": results,
         "findings": findings(results),
-        "agents": results.facts["agents"],
+        "agents": agents,
+        "ladders": (results.numbers["ladder"] != "").any(),
         "solved": final.groupby("method", sort=False)["value"].mean().to_dict(),
     }

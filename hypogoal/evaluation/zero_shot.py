@@ -6,7 +6,6 @@ What limits an agent, its options tell: they stop at a false positive of their m
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,14 +13,11 @@ import pandas as pd
 
 from hypogoal.core.arrays import Doubles
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation.choosing import with_choosers
 from hypogoal.evaluation.curves import scores
-from hypogoal.evaluation.house import per_run
-from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.house import options_of, per_run
 from hypogoal.evaluation.names import UNIFORM
-from hypogoal.evaluation.page import Results
 
 if TYPE_CHECKING:
     from hypogoal.options.loop import OptionLoop
@@ -38,7 +34,8 @@ Played = dict[str, Doubles]  # a number of each layout (L,)
 
 def shortest_ways(engine: Engine) -> Doubles:
     """Steps from each environment's state to each true sub-goal and, last, to success: (E, G + 1); NaN if not known."""
-    from hypogoal.options.planned import FAR, distances, places_of  # with PyTorch, which a report needs not
+    # with PyTorch, which a report needs not
+    from hypogoal.options.planned import FAR, distances, places_of
 
     plan, labels = engine.plan(), engine.labels(engine.ids)
     if plan is None:
@@ -49,7 +46,12 @@ def shortest_ways(engine: Engine) -> Doubles:
     return np.where(steps < FAR, steps, np.nan)
 
 
-def alone(loop: OptionLoop, option: int, goal: int, shortest: Doubles) -> Played:
+def alone(
+    loop: OptionLoop,
+    option: int,
+    goal: int,
+    shortest: Doubles,
+) -> Played:
     """Numbers of an option, begun where episodes begin and anew at each timeout until its member is positive.
 
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
@@ -78,9 +80,8 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: Doubles) -> Played
 
 def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[str, Any], Played]]:
     """What an agent does, random choice among its options, and each option alone; each with the fields of its rows."""
-    from hypogoal.evaluation.frozen import play
+    from hypogoal.evaluation.frozen import play_both
     from hypogoal.meta.episodes import agent_of
-    from hypogoal.options.choosers import RandomChooser
 
     config = artefact.config
     in_domain = load_domain(config["domain"]).sub_goals
@@ -88,34 +89,32 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[
     loop.config = loop.config.model_copy(update={"restart_options": False})
     ways = shortest_ways(loop.engine)
     if artefact.kind == "meta":
-        random = RandomChooser(rng_for(artefact.seed, "uniform-choice"))
-        for fields, chooser in (({}, loop.chooser), ({"method": UNIFORM}, random)):
-            episodes = play(loop, chooser, EPISODES)
-            numbers = episodes.scores(ways[:, -1:]) | {"length": episodes.length}
-            yield fields, {quantity: values.mean(axis=1) for quantity, values in numbers.items()}
+        of_both = play_both(loop, artefact.seed, EPISODES)
+        for fields, play in zip(({}, {"method": UNIFORM}), of_both, strict=True):
+            numbers = play.scores(ways[:, -1:])
+            yield fields, {name: values.mean(axis=1) for name, values in numbers.items()}
     loop.config = loop.config.model_copy(update={"mask_reached": False})
-    for option, (sub_goal, member) in enumerate(product(config["sub_goals"], range(config["members"]))):
+    for option, (sub_goal, member) in enumerate(options_of(config)):
         if sub_goal in in_domain:  # else the user's own labels said it: its truth here is not known
             goal = in_domain.index(sub_goal)
             yield {"sub_goal": sub_goal, "member": member}, alone(loop, option, goal, ways[:, goal])
 
 
-def rows(work: Work) -> Iterator[pd.DataFrame]:
+def rows(work):
     """Every agent, uniform-random choice among its options, and each option on every layout; none without layouts."""
-    for artefact in work.contents.agents if work.layouts else ():
-        if "options.safetensors" not in artefact.manifest.files:
-            work.progress.advance(len(work.layouts))
-            continue
+    for artefact in work.contents.agents:
         for first in range(0, len(work.layouts), AT_ONCE):
             layouts = work.layouts[first : first + AT_ONCE]
-            for fields, numbers in played(artefact, layouts):
-                place = work.place(artefact) | fields | {"layout": layouts}
-                wide = pd.DataFrame(numbers | place)
-                yield wide.melt([*place], var_name="quantity").assign(scope=SCOPE)
             work.progress.advance(len(layouts))
+            if artefact.kind == "baseline":
+                continue
+            for fields, numbers in played(artefact, layouts):
+                place = {**work.place(artefact), **fields, "layout": layouts, "scope": SCOPE}
+                table = pd.DataFrame({**place, **numbers})
+                yield table.melt([*place], var_name="quantity")
 
 
-def runs(results: Results) -> pd.DataFrame:
+def runs(results):
     """Agents, uniform-random choice among their options, each option alone, and the mean member."""
     numbers = results.of(scope=SCOPE)
     values = [per_run(numbers, *QUANTITIES, scope=SCOPE)]

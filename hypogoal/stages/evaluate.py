@@ -35,8 +35,8 @@ def evaluate(
     from hypogoal.core.processes import prepare
     from hypogoal.data import create_hdf5
     from hypogoal.evaluation import questions
-    from hypogoal.evaluation.judging import Work, cases_of
-    from hypogoal.evaluation.run import find, with_missing
+    from hypogoal.evaluation.judging import Work
+    from hypogoal.evaluation.run import find
     from hypogoal.meta.config import layout_seeds
 
     prepare()
@@ -47,24 +47,22 @@ def evaluate(
         played = tuple(layout_seeds(layouts))
     contents = find(run)
     trained = [artefact.path for artefact in contents.everything()]
-    data = sorted({artefact.input("data") for artefact in contents.ensembles})
-    cases = cases_of(contents.ensembles)
-    with call.draft("evaluation", settings, [*data, *trained]) as draft:
+    with call.draft("evaluation", settings, [*contents.data(), *trained]) as draft:
         for path in trained:
             open_artefact(path)  # refuses changed files
         times = 1 + len(played)
         parts = len(contents.ladders) + times * len(contents.agents)
-        for _, case in cases:
-            parts += 1 + len(case.config["sub_goals"])
+        for ensemble in contents.ensembles:
+            parts += 1 + len(ensemble.config["sub_goals"])
         with (
             create_hdf5(draft.files / "arrays.h5") as arrays,
             Progress("evaluate", total=parts, quiet=call.quiet) as progress,
         ):
             work = Work(contents, arrays, progress, played)
-            results = questions.answer(work, cases, settings, data)
+            results = questions.answer(work, settings)
         if left := cells.unmade(run):
             line = f"{len(left)} of the run's cells are not done; the first is {left[0]}"
-            results = with_missing(results, [line])
+            results.facts["missing"].append(line)
         questions.write(draft.files, results)
         cells.write_results(run, draft.files)
     table = drawn(questions.summary(results), WIDTH).splitlines()

@@ -38,7 +38,7 @@ def report(
     from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
     from hypogoal.evaluation.page import source
     from hypogoal.evaluation.questions import answers, render
-    from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation, with_missing
+    from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
 
     evaluation = evaluation_of(run)
     agent = None if videos == 0 else agent_to_film(run)
@@ -53,7 +53,7 @@ def report(
         except UserError as error:
             if videos:
                 raise
-            results = with_missing(results, [f"no film of an episode: {error}"])
+            results.facts["missing"].append(f"no film of an episode: {error}")
         with fitting(evaluation.path):
             every = answers(results, drawn=True)
             small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
@@ -64,7 +64,7 @@ def report(
         pictures = draft.files / "figures"
         pictures.mkdir()
         for each in every:
-            for drawn in each.context["figures"]:
+            for drawn in each["figures"]:
                 path = pictures / f"{drawn.name}.svg"
                 path.write_bytes(drawn.svg)
         moving = draft.files / "videos"

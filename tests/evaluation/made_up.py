@@ -10,8 +10,8 @@ from hypogoal.evaluation.house import joined
 from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.questions import context_of
 
-NOTHING: dict[str, Any] = {"agents": {}, "ladders": [], "tasks": [], "cap": None, "missing": []}
-LEARNED = {"members": 3, "choice": "learned", "layouts": ""}
+NOTHING: dict[str, Any] = {"agents": {}, "tasks": [], "cap": None, "missing": []}
+LEARNED = {"members": 3, "choice": "learned"}
 
 
 def numbers_of(*rows: dict[str, Any]) -> pd.DataFrame:

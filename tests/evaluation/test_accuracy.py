@@ -5,16 +5,8 @@ import pytest
 
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.selection import numbers_of_choices
-from hypogoal.hypotheses.scores import (
-    best_mean_worst,
-    best_threshold,
-    cross_fitted,
-    halves,
-    mean_disagreement,
-    member_scores,
-    most_and_least,
-    ranking,
-)
+from hypogoal.hypotheses import scores
+from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, mean_disagreement, member_scores, ranking
 from hypogoal.options.tables import Choices
 
 YES, NO = True, False
@@ -34,13 +26,13 @@ VERDICTS = np.array(
 
 def test_scores_by_hand():
     """Spec F1: four members on six states; always-yes has the better F1 of one that sees something."""
-    scores = member_scores(VERDICTS, LABELS)
-    assert set(scores) == {"balanced_accuracy", "precision", "recall", "accuracy", "f1"}
-    np.testing.assert_allclose(scores["recall"], [1, 3 / 4, 1, 0])
-    np.testing.assert_allclose(scores["balanced_accuracy"], [1, (3 / 4 + 1 / 2) / 2, 1 / 2, 1 / 2])
-    np.testing.assert_allclose(scores["precision"], [1, 3 / 4, 4 / 6, np.nan])
-    np.testing.assert_allclose(scores["accuracy"], [1, 4 / 6, 4 / 6, 2 / 6])
-    np.testing.assert_allclose(scores["f1"], [1, 6 / 8, 8 / 10, 0])
+    found = member_scores(VERDICTS, LABELS)
+    assert set(found) == {"balanced_accuracy", "precision", "recall", "accuracy", "f1"}
+    np.testing.assert_allclose(found["recall"], [1, 3 / 4, 1, 0])
+    np.testing.assert_allclose(found["balanced_accuracy"], [1, (3 / 4 + 1 / 2) / 2, 1 / 2, 1 / 2])
+    np.testing.assert_allclose(found["precision"], [1, 3 / 4, 4 / 6, np.nan])
+    np.testing.assert_allclose(found["accuracy"], [1, 4 / 6, 4 / 6, 2 / 6])
+    np.testing.assert_allclose(found["f1"], [1, 6 / 8, 8 / 10, 0])
 
 
 def test_scores_without_a_class_are_not_numbers():
@@ -65,8 +57,10 @@ def test_member_order_does_not_matter():
 
 def test_best_mean_and_worst_member():
     """Spec F1: the paper shows only the best; members without a score are left out."""
-    assert best_mean_worst(np.array([0.5, np.nan, 0.9, 0.7])) == pytest.approx({"best": 0.9, "mean": 0.7, "worst": 0.5})
-    assert np.isnan(best_mean_worst(np.array([np.nan]))["best"])
+    assert scores.best_mean_worst(np.array([0.5, np.nan, 0.9, 0.7])) == pytest.approx(
+        {"best": 0.9, "mean": 0.7, "worst": 0.5}
+    )
+    assert np.isnan(scores.best_mean_worst(np.array([np.nan]))["best"])
 
 
 def test_disagreement_by_hand():
@@ -104,9 +98,9 @@ def test_choices_by_hand():
 
 def test_the_most_and_the_least_preferred_member():
     """Spec F6: of those that were offered; nobody where none was."""
-    assert most_and_least(np.array([1.0, 2.0])) == (1, 0)
-    assert most_and_least(np.array([np.nan, 3.0])) == (1, 1)
-    assert most_and_least(np.array([np.nan])) == (None, None)
+    assert scores.most_and_least(np.array([1.0, 2.0])) == (1, 0)
+    assert scores.most_and_least(np.array([np.nan, 3.0])) == (1, 1)
+    assert scores.most_and_least(np.array([np.nan])) == (None, None)
 
 
 def test_overlay_keeps_what_is_shared():

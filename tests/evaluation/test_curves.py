@@ -56,7 +56,6 @@ def test_numbers_of_a_run():
     assert numbers["success"] == 0.99
     assert numbers["length_over_shortest"] == 1.25
     assert numbers["episodes"] == 200
-    assert numbers["window"] == 100
     assert numbers["steps_to_95"] == 195 * 20
     nothing = run_numbers(episodes([]), None)
     assert nothing["episodes"] == 0

@@ -1,6 +1,5 @@
 """What members know of held-out states, wherever their thresholds lie, and which features they have found (F1, H1)."""
 
-import math
 from itertools import product
 
 import numpy as np
@@ -22,11 +21,10 @@ JUDGED = Judged(PROBABILITIES, PROBABILITIES > 0.5, PROBABILITIES[:0] > 0.5, np.
 
 
 def test_members_numbers_are_their_scores() -> None:
-    """Ranking, the best threshold, and what the own one loses."""
+    """The best threshold, and what the own one loses."""
     found, _ = knowledge(JUDGED, EVERY, LABELS, CONTEXTS)
     accuracy = member_scores(JUDGED.predictions, LABELS)["balanced_accuracy"]
     best = best_threshold(PROBABILITIES, LABELS)[1]
-    assert found["ranking"].tolist() == ranking(PROBABILITIES, LABELS).tolist()
     assert found["at_best_threshold"].tolist() == best.tolist()
     assert found["calibration_gap"].tolist() == (best - accuracy).tolist()
     assert min(found["calibration_gap"]) >= 0
@@ -40,7 +38,7 @@ def test_the_best_is_picked_where_it_is_not_scored() -> None:
     _, found = knowledge(JUDGED, EVERY, LABELS, CONTEXTS)
     assert found["cross_fitted_ranking"] == pytest.approx(expected)
     for contexts in (None, CONTEXTS * 0):
-        assert math.isnan(knowledge(JUDGED, EVERY, LABELS, contexts)[1]["cross_fitted_ranking"])
+        assert knowledge(JUDGED, EVERY, LABELS, contexts)[1] == {}
 
 
 CROSSED = np.array(list(product((0, 1), repeat=4)) * 20)  # (320, 4)
@@ -70,14 +68,9 @@ def accuracies(method: str, seed: int, **by_goal: list[float]) -> list[dict]:
     """Rows of an ensemble's members."""
     rows = []
     for sub_goal, values in by_goal.items():
-        place = {
-            "method": method,
-            "seed": seed,
-            "artefact": f"{method}-{seed}",
-            "sub_goal": sub_goal,
-            "scope": "heldout",
-        }
-        rows += [row("balanced_accuracy", value, member=member, **place) for member, value in enumerate(values)]
+        place = {"method": method, "seed": seed, "artefact": f"{method}-{seed}", "sub_goal": sub_goal}
+        for member, value in enumerate(values):
+            rows.append(row("balanced_accuracy", value, member=member, scope="heldout", **place))
     return rows
 
 

@@ -25,7 +25,7 @@ def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
     assert last_executions(own)["reached_base"].tolist() == [False, True, False, True, False]
     config = {"sub_goals": domain.usual_sub_goals, "members": 1, "mask_reached": False, "start": "2-6"}
     place = {"method": "one classifier", "N": 2, "ladder": "2-6", "seed": 0, "artefact": "options"}
-    rows = joined(rows_of_ladder(own, config, {}, np.full(1, 0.5), place))
+    rows = joined(rows_of_ladder(own, config, {}, place))
     assert rows[rows["quantity"] == "distance"]["value"].tolist() == pytest.approx([away.mean()])
     pictures = [domain.picture(room) for room in (2, 6)]
     pixels = np.asarray(domain.pixel(own.positions()))

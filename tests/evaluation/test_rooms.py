@@ -6,9 +6,9 @@ import pytest
 from made_up import figures, results_of, row, shown
 
 from hypogoal.evaluation import rooms
+from hypogoal.evaluation.hypotheses import VALIDATED, choose, rows_of
 from hypogoal.evaluation.judging import Judged
 from hypogoal.evaluation.questions import context_of
-from hypogoal.evaluation.rooms import VALIDATED, choose, rows_by_room
 
 YES, NO = True, False
 # Rooms 1 (labelled), 9 (unlabelled), 6 (unseen): two positives and two negatives each; 20 (unseen): two negatives.
@@ -29,7 +29,7 @@ VERDICTS = np.array(
 def judged() -> pd.DataFrame:
     """The rows of these members."""
     sure = Judged(VERDICTS.astype(np.float32), VERDICTS, VERDICTS[:0], np.full(3, 0.5, np.float32))
-    return pd.concat(rows_by_room(sure, LABELS, {"room": ROOMS, "seen": SEEN}, {"method": "D-BAT"}))
+    return pd.concat(rows_of(sure, LABELS, {"room": ROOMS, "seen": SEEN}))
 
 
 @pytest.mark.parametrize(
@@ -83,10 +83,8 @@ def test_a_row_for_each_method_and_n_over_seeds() -> None:
     results = results_of(*rows)
     context = context_of(rooms, results)
     table = context["table"].set_index(["method", "N", "quantity"])["mean"]
-    means = [
-        table["D-BAT, 2 members", 1, f"balanced_accuracy, unseen, {which}"]
-        for which in ("best", "validated", "mean", "worst")
-    ]
+    own = ("D-BAT, 2 members", 1)
+    means = [table[*own, f"balanced_accuracy, unseen, {which}"] for which in ("best", "validated", "mean", "worst")]
     assert means == pytest.approx([0.8, 0.6, 0.65, 0.5])
     order = [("D-BAT, 2 members", 1), ("D-BAT, 2 members", 2), ("one classifier", 1)]
     assert shown(rooms, results).index.tolist() == order

@@ -192,10 +192,10 @@ def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
     write_dataset(tmp_path / "data.h5", data, domain="x", config={}, seed=0)
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
         here = Here(tmp_path / "data.h5", tmp_path, {"sub_goals": ["down"]})
-        work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None)
-        work.browsed = 0
+        work = Work(Contents(tmp_path, [], [], [], []), arrays, None)
+        work.browsed = tmp_path
         monkeypatch.setattr(Work, "place_of", lambda work, judgement: {"artefact": "ensemble"})
-        rows = joined(look(work, Judgement(0, here, "down", States(observations[:0], labels), judged)))
+        rows = joined(look(work, Judgement(here, "down", States(observations[:0], labels), judged)))
         group = arrays["saliency/down"]
         assert group["observations"].shape == (3, 1, 3, 1)
         assert group["seen"].shape == (3, 1, 2, 1)
