@@ -22,7 +22,7 @@ from hypogoal.evaluation.run import find_artefacts, read_evaluation
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import draw_figures, report
+from hypogoal.stages.report import report
 
 QUIET = {"quiet": True}
 DBAT, NONE, ONE = "D-BAT, 2 members", "no diversity, 2 members", "one classifier"
