@@ -221,7 +221,14 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
 
 def runs(results):
     """Each agent (``chooser`` its own), and uniform-random choice among its own options."""
-    return with_choosers(house.per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN))
+    return with_choosers(
+        house.per_run(
+            results.of(sub_goal=""),
+            *OF_PLAY,
+            *OF_CHOICE,
+            scope=FROZEN,
+        )
+    )
 
 
 def with_choosers(runs: pd.DataFrame) -> pd.DataFrame:

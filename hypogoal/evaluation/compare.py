@@ -71,13 +71,13 @@ def differences(runs: Runs) -> pd.DataFrame:
 
 def compare_runs(runs: Runs) -> pd.DataFrame:
     """Spec F5: the first run against each other, ``agent`` by agent and method by method, over what they share."""
-    parts = [pd.DataFrame(columns=["of", "quantity", "first", "second"])]
+    parts = []
     for question in shared(runs):
         values = [paired_runs(question, results).assign(run=label) for label, results in runs.items()]
         for method, alike in pd.concat(values).groupby("method", sort=False):
             if alike["run"].nunique() == len(runs):
                 parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))
-    return pd.concat(parts)
+    return pd.concat(parts) if parts else pd.DataFrame(columns=["of", "quantity", "first", "second"])
 
 
 def read_pairs(path: Path) -> pd.DataFrame:

@@ -181,7 +181,11 @@ def figures(context):
     table = context["table"]
     means = table[table["quantity"].isin(WHICH)].pivot_table("mean", BY, "quantity", sort=False)
     if len(means):
-        yield Drawn("members", "Members' balanced accuracy on held-out states", members_figure(means))
+        yield Drawn(
+            "members",
+            "Members' balanced accuracy on held-out states",
+            members_figure(means),
+        )
 
 
 def members_figure(means: pd.DataFrame) -> Figure:

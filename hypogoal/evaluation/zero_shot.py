@@ -37,12 +37,14 @@ def shortest_ways(engine: Engine) -> Doubles:
     # with PyTorch, which a report needs not
     from hypogoal.options.planned import FAR, distances, places_of
 
-    plan, labels = engine.plan(), engine.labels(engine.ids)
+    plan = engine.plan()
+    labels = engine.labels(engine.ids)
     if plan is None:
         return np.full((engine.count, labels.shape[1] + 1), np.nan)
     place = places_of(plan, engine)
     holds = np.column_stack([engine.labels(plan.ids), plan.solved])
-    steps = distances(holds, place[plan.following], plan.final)[place[engine.ids]]
+    every = distances(holds, place[plan.following], plan.final)
+    steps = every[place[engine.ids]]
     return np.where(steps < FAR, steps, np.nan)
 
 
@@ -70,11 +72,14 @@ def alone(
         steps[going] += 1
         ends = going & moved.reached
         positive |= ends
-        reached |= ends & engine.labels(moved.next_ids)[:, goal]
-        going &= ~moved.reached & (engine.elapsed > 0)  # nor did the episode end
+        holds_now = engine.labels(moved.next_ids)[:, goal]
+        reached |= ends & holds_now
+        goes_on = engine.elapsed > 0  # the episode did not end
+        going &= ~moved.reached & goes_on
         if not going.any():
             break
-    numbers = scores(reached, steps, shortest) | {"false_positives": (positive & ~reached) * 1.0}
+    false_positives = positive & ~reached
+    numbers = scores(reached, steps, shortest) | {"false_positives": false_positives * 1.0}
     return {name: np.where(holds, np.nan, values) for name, values in numbers.items()}
 
 
@@ -97,7 +102,8 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[
     for option, (sub_goal, member) in enumerate(options_of(config)):
         if sub_goal in in_domain:  # else the user's own labels said it: its truth here is not known
             goal = in_domain.index(sub_goal)
-            yield {"sub_goal": sub_goal, "member": member}, alone(loop, option, goal, ways[:, goal])
+            fields = {"sub_goal": sub_goal, "member": member}
+            yield fields, alone(loop, option, goal, ways[:, goal])
 
 
 def rows(work):
@@ -109,7 +115,12 @@ def rows(work):
             if artefact.kind == "baseline":
                 continue
             for fields, numbers in played(artefact, layouts):
-                place = {**work.place(artefact), **fields, "layout": layouts, "scope": SCOPE}
+                place = {
+                    **work.place(artefact),
+                    **fields,
+                    "layout": layouts,
+                    "scope": SCOPE,
+                }
                 table = pd.DataFrame({**place, **numbers})
                 yield table.melt([*place], var_name="quantity")
 
