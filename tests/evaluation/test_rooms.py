@@ -91,5 +91,8 @@ def test_a_row_for_each_method_and_n_over_seeds() -> None:
     assert table["one classifier", 1, "accuracy, all, never positive"] == 0.75
     pairs = context["pairs"]
     assert pairs["N"].tolist() == [1, 1, 1] and pairs["difference"].tolist() == pytest.approx([0.3, -0.1, 0.1])
-    assert [drawn.name for drawn in figures(rooms, results)] == ["figure3"]
+    (drawn,) = figures(rooms, results)
+    (legend,) = drawn.figure.legends
+    named = [text.get_text() for text in legend.get_texts()]
+    assert drawn.name == "figure3" and named == ["D-BAT, 2 members", "one classifier"]
     assert context_of(rooms, results_of()) is None
