@@ -73,7 +73,9 @@ def compare_runs(runs: Runs) -> pd.DataFrame:
     """Spec F5: the first run against each other, ``agent`` by agent and method by method, over what they share."""
     parts = []
     for question in shared(runs):
-        values = [paired_runs(question, results).assign(run=label) for label, results in runs.items()]
+        values = [
+            paired_runs(question, results, question.runs(results)).assign(run=label) for label, results in runs.items()
+        ]
         for method, alike in pd.concat(values).groupby("method", sort=False):
             if alike["run"].nunique() == len(runs):
                 parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))

@@ -86,18 +86,22 @@ def context_of(question: ModuleType, results: Results) -> Context | None:
         if runs.empty:
             return None
         context["table"] = house.over(runs, question.BY)
-    if hasattr(question, "PAIRED"):
-        context["pairs"] = house.pairs(paired_runs(question, results))
+        if hasattr(question, "PAIRED"):
+            context["pairs"] = house.pairs(paired_runs(question, results, runs))
     if not hasattr(question, "context"):
         return context
     more = question.context(results)
     return None if more is None else context | more
 
 
-def paired_runs(question: ModuleType, results: Results) -> pd.DataFrame:
+def paired_runs(
+    question: ModuleType,
+    results: Results,
+    runs: pd.DataFrame,
+) -> pd.DataFrame:
     """Each run's numbers that are compared."""
-    runs = getattr(question, "compared", question.runs)(results)
-    return runs[runs["quantity"].isin(question.PAIRED)]
+    every = question.compared(results) if hasattr(question, "compared") else runs
+    return every[every["quantity"].isin(question.PAIRED)]
 
 
 def name_of(question: ModuleType) -> str:
@@ -135,12 +139,12 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
     return Results(house.joined(parts), facts | work.facts)
 
 
-def write(folder: Path, results: Results) -> None:
-    """Write ``numbers.csv``, ``run.json`` and ``tables/*.csv``."""
+def write(folder: Path, results: Results, every: list[Context]) -> None:
+    """Write ``numbers.csv``, ``run.json`` and, of :func:`answers`, ``tables/*.csv``."""
     results.numbers.to_csv(folder / "numbers.csv", index=False)
     (folder / "run.json").write_text(house.as_json(results.facts) + "\n", encoding="utf-8")
     tables = {"verdict": pd.DataFrame(verdict.findings(results))}
-    for context in answers(results):
+    for context in every:
         tables[context["name"]] = context["table"]
         tables[f"{context['name']}-pairs"] = context["pairs"]
     (folder / "tables").mkdir()
@@ -149,10 +153,10 @@ def write(folder: Path, results: Results) -> None:
             table.to_csv(folder / "tables" / f"{name}.csv", index=False)
 
 
-def summary(results: Results) -> Group:
+def summary(results: Results, every: list[Context]) -> Group:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
     tables: list[Any] = []
-    for context in answers(results):
+    for context in every:
         words = page.module(context["name"], context)
         shown = getattr(words, "shown", pd.DataFrame())
         if not shown.empty:

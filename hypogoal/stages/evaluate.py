@@ -63,7 +63,8 @@ def evaluate(
         if left := cells.unmade(run):
             line = f"{len(left)} of the run's cells are not done; the first is {left[0]}"
             results.facts["missing"].append(line)
-        questions.write(draft.files, results)
+        every = questions.answers(results)
+        questions.write(draft.files, results, every)
         cells.write_results(run, draft.files)
-    table = drawn(questions.summary(results), WIDTH).splitlines()
+    table = drawn(questions.summary(results, every), WIDTH).splitlines()
     return Done(table)

@@ -17,7 +17,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.data import open_dataset
 from hypogoal.evaluation import attributing, judging
 from hypogoal.evaluation.distance import HIT, MISS, STOP
-from hypogoal.evaluation.questions import summary
+from hypogoal.evaluation.questions import answers, summary
 from hypogoal.evaluation.run import find_artefacts, read_evaluation
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
@@ -161,7 +161,7 @@ def test_attributions_are_of_the_ensemble_that_options_were_learned_with(results
 def test_the_terminal_summary_fits(ladders, results):
     """Spec A5: methods x N, for members and for where options stop, at 80 columns."""
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(summary(results))
+    console.print(summary(results, answers(results)))
     lines = console.export_text().splitlines()
     assert max(map(len, lines)) <= 80
     text = "\n".join(lines)
@@ -196,7 +196,7 @@ def test_ensembles_alone(ladders, tmp_path):
     assert results.facts["missing"] == []
     page = (report(tmp_path).path / "index.html").read_text(encoding="utf-8")
     assert 'id="figure-figure3"' in page and "Options on ladders" not in page
-    Console(width=80, file=io.StringIO()).print(summary(results))
+    Console(width=80, file=io.StringIO()).print(summary(results, answers(results)))
 
 
 def test_options_without_their_ensembles_evaluation(ladders, tmp_path):
