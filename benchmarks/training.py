@@ -59,7 +59,7 @@ def plain(split: States, unlabelled: np.ndarray, config: EnsembleConfig, steps: 
     """Seconds of a step of the plain loop."""
     generator = torch.Generator().manual_seed(0)
     shape = split.observations.shape[1:]
-    name = network_for(config.network, split.observations.dtype)
+    name = network_for(config.network, shape, split.observations.dtype)
     members = [build_network(name, shape, generator).train() for _ in range(config.members)]
     adam = [
         torch.optim.Adam(member.parameters(), lr=config.learning_rate, weight_decay=config.l2_weight)

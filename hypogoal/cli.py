@@ -13,6 +13,7 @@ import shutil
 import signal
 import sys
 import textwrap
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -90,6 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, processes.stop)  # a cancelled job, too, leaves nothing half-written
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in the background
             signal.signal(signal.SIGINT, processes.stop)
+        warnings.formatwarning = lambda message, *_: f"hypogoal: {message}\n"
     words = [*(sys.argv[1:] if arguments is None else arguments)]
     own_code.allow(words)
     try:
@@ -302,7 +304,7 @@ def compare(
     say(*look.outcome(look.describe(out)), page)
 
 
-LABEL = "Episodes: a column, last:N frames, FILE.csv; data file: FILE.csv."
+LABEL = "Episodes: a column, last:N frames, FILE.csv, module:function; data file: FILE.csv."
 
 
 def _label(text: str) -> tuple[str, str]:
@@ -385,13 +387,19 @@ def check(
     domain: Annotated[str | None, Argument(help=stages.DOMAINS)] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
+    view: Annotated[str | None, Option(help="What members see: module:Class.")] = None,
+    teacher: Annotated[str | None, Option(help="What members are told: module:function.")] = None,
+    chooser: Annotated[str | None, Option(help="Who chooses options: module:Class.")] = None,
+    learner: Annotated[str | None, Option(help="How options learn: module:Class.")] = None,
+    termination: Annotated[str | None, Option(help="When options end: module:Class.")] = None,
     set_: stages.Set = None,
     seed: stages.Seed = 0,
 ) -> None:
-    """Check that your domain, objective or network keeps its contract.
+    """Check that your domain, or part of an agent, keeps its contract.
 
     Exit code 2 if not. It collects a few states of the domain twice; --set
-    changes how, as for 'collect'.
+    changes how, as for 'collect'. Parts see, or play in, that domain; without
+    one views and teachers see rooms, agents' parts play in doorkey.
     """
     from hypogoal import check as contracts
     from hypogoal.core import config as settings
@@ -399,6 +407,7 @@ def check(
 
     checks: list[Any] = []
     observations: tuple[Any, ...] = ()
+    loaded = chosen = None
     if domain is not None:
         loaded = domains.load_domain(domain)
         chosen = domains.settings_of("collect", domain, typed=settings.assigned(set_ or ()))
@@ -408,8 +417,15 @@ def check(
         checks.append(contracts.check_objective(diversity))
     if network is not None:
         checks.append(contracts.check_network(network, *observations))
+    if view is not None:
+        checks.append(contracts.check_view(view, loaded, chosen, seed))
+    if teacher is not None:
+        checks.append(contracts.check_teacher(teacher, loaded, chosen, seed))
+    for setting, name in {"chooser": chooser, "network": learner, "termination": termination}.items():
+        if name is not None:
+            checks.append(contracts.check_part(setting, name, loaded, seed))
     if not checks:
-        raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
+        raise UserError("nothing to check", None, "Give a domain, or an option such as --network.")
     for verdict in itertools.chain(*checks):
         say(*verdict.lines)
         if not verdict.ok:

@@ -1,11 +1,22 @@
-"""The contracts of domains, diversity objectives and networks, as laws that users check theirs by (Spec B6, C1).
+"""The contracts of domains, objectives, networks and other parts, as laws that users check theirs by (Spec B6, C1).
 
 ``hypogoal check`` prints a line for each law. In your own test suite: ``require(check_domain(DOMAIN))``.
 """
 
 from hypogoal.check.domains import check_domain
+from hypogoal.check.members import check_teacher, check_view
 from hypogoal.check.networks import check_network
 from hypogoal.check.objectives import check_objective
+from hypogoal.check.parts import check_part
 from hypogoal.check.verdict import Verdict, require
 
-__all__ = ["Verdict", "check_domain", "check_network", "check_objective", "require"]
+__all__ = [
+    "Verdict",
+    "check_domain",
+    "check_network",
+    "check_objective",
+    "check_part",
+    "check_teacher",
+    "check_view",
+    "require",
+]

@@ -88,7 +88,7 @@ class _Played:
 
     def two_engines(self) -> None:
         """Of the same layout seed: the same actions show the same."""
-        _require_same(self.play(self.make_engine()), self.play(self.make_engine()), SEEDED)
+        require_same(self.play(self.make_engine()), self.play(self.make_engine()), SEEDED)
 
     def restore(self) -> str | None:
         """A restored engine goes on as the one whose snapshot it got."""
@@ -99,7 +99,7 @@ class _Played:
         for _ in self.play(saved):
             pass
         restored.restore(saved.snapshot())
-        _require_same(self.play(saved), self.play(restored), "Save all that the next steps need.")
+        require_same(self.play(saved), self.play(restored), "Save all that the next steps need.")
         return None
 
     def collect(self) -> str:
@@ -144,7 +144,7 @@ class _Played:
             yield {**shown, "images": engine.images(ids), "labels": engine.labels(ids)}
 
 
-def _require_same(first: Iterator[dict[str, Any]], second: Iterator[dict[str, Any]], do: str) -> None:
+def require_same(first: Iterator[dict[str, Any]], second: Iterator[dict[str, Any]], do: str) -> None:
     """Two engines show the same."""
     for number, (left, right) in enumerate(zip(first, second, strict=True), 1):
         differ = [name for name, values in left.items() if not np.array_equal(values, right[name])]

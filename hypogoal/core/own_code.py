@@ -23,6 +23,7 @@ from hypogoal.core.errors import NumericalError, UserError
 TRUST = "--trust"
 VARIABLE = "HYPOGOAL_TRUST"
 NAMES = re.compile(r"--trust|[\w.]+:[^\W\d][\w.]*")
+CALLED = re.compile(r"([\w.<>]+)\(\) (?:takes|missing|got)")  # an error of a call with other arguments
 MOST_QUOTED = 200  # characters of an error
 PACKAGE = str(Path(__file__).parents[1]) + os.sep
 LIBRARIES = (*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), PACKAGE, "<")
@@ -96,9 +97,18 @@ def place_of(error: BaseException) -> str:
     return ""
 
 
+def culprit_of(error: BaseException) -> str:
+    """The user's function that takes other arguments, or class that lacks an attribute; empty if there is none."""
+    if isinstance(error, TypeError) and (called := CALLED.match(str(error))):
+        return called[1]
+    kind = type(getattr(error, "obj", None))
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None) or "<"
+    return "" if file.startswith(LIBRARIES) else f"{Path(file).name}, class {kind.__name__}"
+
+
 def of_user(error: BaseException) -> UserError | None:
     """An error that was raised in or through user code, as a ``UserError``; None for any other."""
-    place = place_of(error)
+    place = place_of(error) or (culprit_of(error) if _allowed else "")
     if not place or isinstance(error, UserError | NumericalError):
         return None
     return UserError(f"your code raised {_line(error)}", place, "--debug shows how it was called.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import NumericalError, UserError
@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     M = TypeVar("M", bound=nn.Module)
 
 
-def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors by name. NaN or Inf is a ``NumericalError`` and nothing is written (Spec G3)."""
+def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
+    """Write tensors or arrays by name. NaN or Inf is a ``NumericalError`` and nothing is written (Spec G3)."""
+    import torch
     from safetensors.torch import save
 
     weights = {}
-    for name, tensor in tensors.items():
+    for name, values in tensors.items():
+        tensor = torch.as_tensor(values)
         if not tensor.isfinite().all():
             raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
         weights[name] = tensor.detach().cpu().contiguous()

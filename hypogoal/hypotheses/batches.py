@@ -23,7 +23,7 @@ from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import at_once, inputs_of
-from hypogoal.hypotheses.views import Origins
+from hypogoal.hypotheses.views import Origins, changed_by, pools_of
 from hypogoal.observations import Observations, values_in
 
 Numbers = Ints  # of states, (B,)
@@ -123,7 +123,7 @@ class TrainingStates(Resumable):
         Half of the labelled ones are positive, unless the view has other pools (:meth:`View.pools`). Every state of a
         pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no such states.
         """
-        pools, share = self.view.pools(self.labels, self._origins)
+        pools, share = pools_of(self.view, self.labels, self._origins)
         positives = min(max(1, int(share * config.batch_size)), config.batch_size - 1)
         negatives = np.flatnonzero(~self.labels)
         others = config.batch_size if self.n_unlabelled else 0
@@ -160,7 +160,7 @@ class TrainingStates(Resumable):
                 continue
             seen = states[numbers]
             if self.view.changes:
-                seen = self.view.change(seen, rng if changing else None)
+                seen = changed_by(self.view, seen, rng if changing else None)
             rows.append(seen)
         return inputs_of(np.concatenate(rows), self.device)
 

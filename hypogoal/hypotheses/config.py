@@ -35,8 +35,8 @@ class EnsembleConfig(Config):
     )
     network: str = setting(
         "auto",
-        "member network: doorkey, montezuma, tiles, mlp, or module:function; auto: doorkey for "
-        "pictures, mlp for other observations; of cameras and numbers by key: front=tiles,state=mlp",
+        "member network: doorkey, montezuma, tiles, mlp, or module:function; auto: of these in turn the first that "
+        "takes the pictures, mlp for numbers; of cameras and numbers by key: front=tiles,state=mlp",
         source="the paper's appendix",
     )
     steps: int = setting(

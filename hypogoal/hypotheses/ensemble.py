@@ -88,10 +88,14 @@ class Ensemble(nn.Module):
         super().__init__()
         self.observation_shape = tuple(int(size) for size in observation_shape)
         self.view = view or FullView(self.observation_shape)
-        self.network = networks.network_for(network, self.view.dtype)
+        self.network = networks.network_for(network, self.view.shape, self.view.dtype)
         built = []
         for _ in range(members):
             built.append(networks.build_network(self.network, self.view.shape, generator, self.view.dtype))
+        weights = [weight for member in built for weight in (*member.parameters(), *member.buffers())]
+        if len({*weights}) < len(weights):
+            do = "Make new layers at every call, with weights from PyTorch's generator."
+            raise UserError("two members share weights", self.network, do)
         self.members = nn.ModuleList(built)
         self.networks = tuple(map(networks.reordered, built))
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))

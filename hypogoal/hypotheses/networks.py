@@ -28,7 +28,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 from hypogoal.hypotheses.load import ByKey
 from hypogoal.observations import (
-    NUMBERS,
     PICTURE,
     DType,
     Observations,
@@ -39,7 +38,12 @@ from hypogoal.observations import (
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
-SUITABLE = {PICTURE: "doorkey", NUMBERS: "mlp"}
+LEAST = {
+    "doorkey": 41,
+    "montezuma": 36,
+    "tiles": 24,
+}  # pixels of a picture's shorter side; the first that fits
+OTHERWISE = "mlp"
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
@@ -113,14 +117,14 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
 """By name: channels (size of the last axis) -> convolutional part, and widths of the hidden dense layers behind it."""
 
 
-def network_for(name: str, dtype: DType) -> str:
-    """Resolve ``auto`` by the type of observations; any other name stays.
+def network_for(name: str, shape: Shape, dtype: DType) -> str:
+    """Resolve ``auto`` by the shape and type of observations; any other name stays.
 
     Of mixed observations the names by key, ``front=doorkey,state=mlp``. A name without a key is for all pictures; a
     key that they lack is a ``UserError``.
     """
     if not dtype.names:
-        return SUITABLE[dtype] if name == AUTO else name
+        return _suitable(shape, dtype) if name == AUTO else name
     named = {}
     for part in name.split(","):
         key, _, network = part.strip().rpartition("=")
@@ -132,11 +136,19 @@ def network_for(name: str, dtype: DType) -> str:
             f"Known are {', '.join(dtype.names)}.",
         )
     resolved = []
-    for key in dtype.names:
-        kind = dtype[key].base
+    for key, (kind, size) in fields_of((), dtype).items():
         general = named.get("", AUTO) if kind == PICTURE else AUTO
-        resolved.append(f"{key}={network_for(named.get(key, general), kind)}")
+        resolved.append(f"{key}={network_for(named.get(key, general), size, kind)}")
     return ",".join(resolved)
+
+
+def _suitable(shape: Shape, dtype: DType) -> str:
+    """The network for pictures of this size, or for numbers."""
+    if dtype == PICTURE:
+        for network, least in LEAST.items():
+            if min(shape[:2]) >= least:
+                return network
+    return OTHERWISE
 
 
 def names_in(network: str) -> list[str]:
@@ -215,7 +227,11 @@ def build_network(
     for it, are a ``UserError``.
     """
     by_key = _by_key(name, generator, dtype) if dtype.names else None
-    example = torch.zeros(1, values_in((), dtype)) if by_key else as_input(torch.zeros(1, *observation_shape))
+    values = torch.linspace(-1, 1, values_in(observation_shape, dtype))
+    if dtype == PICTURE:
+        values = values.abs()
+    example = values[None] if by_key else as_input(values.view(1, *observation_shape))
+    before = example.clone()
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with DrawsFrom(torch.Generator().manual_seed(seed)):
         layers, hidden = ([by_key], (JOINT,)) if by_key else load_network(name)(observation_shape)
@@ -226,6 +242,8 @@ def build_network(
                 f"observation shape {tuple(observation_shape)}",
                 "Give another network (mlp takes any), larger pictures, or a network of your own.",
             )
+        if not torch.equal(example, before):
+            raise UserError("the network changes its input, which all members see", name, "Have it change a copy.")
         widths = [features.numel(), *hidden]
         dense: list[nn.Module] = []
         for inputs, outputs in pairwise(widths):
@@ -241,7 +259,7 @@ def _by_key(
 ) -> ByKey:
     """The encoders of mixed observations."""
     shapes, encoders = [], []
-    names = names_in(network_for(name, dtype))
+    names = names_in(network_for(name, (), dtype))
     for of_key, (_, shape) in zip(names, fields_of((), dtype).values(), strict=True):
         shapes.append(as_input(torch.zeros(1, *shape)).shape[1:])
         encoders.append(build_network(of_key, shape, generator)[:-1])

@@ -31,9 +31,11 @@ def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembl
     thresholds.threshold_rule(config.threshold)
     if config.teacher:
         teacher.load_teacher(config.teacher)
+    shape = dataset.observation_shape
     if config.view != views.FULL:
-        views.own_view(config.view, config.view_settings, dataset.observation_shape)
-    config = config.model_copy(update={"network": networks.network_for(config.network, dataset.observation_dtype)})
+        shape = views.own_view(config.view, config.view_settings, shape).shape
+    network = networks.network_for(config.network, shape, dataset.observation_dtype)
+    config = config.model_copy(update={"network": network})
     for name in networks.names_in(config.network):
         networks.load_network(name)
     sub_goals = config.sub_goals or dataset.sub_goals

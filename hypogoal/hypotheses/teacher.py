@@ -9,11 +9,14 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
+from hypogoal.observations import digest
 
 
 def load_teacher(name: str) -> Callable[..., Any]:
     """The function ``module:function``, or of an entry point; any other name is a ``UserError``."""
     teacher: Callable[..., Any] = load(name, "teacher", "hypogoal.teachers", {})
+    if not callable(teacher):
+        raise UserError("this is no teacher", name, "Give a function, see docs/extending.md.")
     return teacher
 
 
@@ -31,12 +34,17 @@ def taught_by(
     """
     teacher = load_teacher(name)
     shape = (members, len(unlabelled))
-    taught = teacher(observations, labels, unlabelled, members, seed)
-    scores = np.array(taught, dtype=np.float32)
-    if scores.shape != shape or not np.isfinite(scores).all():
-        raise UserError(
-            f"the teacher gave scores {scores.shape}",
-            name,
-            f"Give finite ones, {shape}.",
-        )
-    return torch.from_numpy(scores)
+    states = observations, labels, unlabelled
+    before = [*map(digest, states)]
+    taught = teacher(*states, members, seed)
+    if before != [*map(digest, states)]:
+        raise UserError("the teacher changes what it gets", name, "Have it change a copy.")
+    do = f"Give finite ones, {shape}: above 0 for positive, below for negative."
+    try:
+        given = np.asarray(taught)
+        scores = given.astype(np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise UserError(f"the teacher gave no scores ({error})", name, do) from None
+    if scores.shape != shape or given.dtype == np.bool_ or not np.isfinite(scores).all():
+        raise UserError(f"the teacher gave scores {given.dtype} {scores.shape}", name, do)
+    return torch.from_numpy(scores.clip(-1, 1).astype(np.float32))

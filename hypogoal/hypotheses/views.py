@@ -154,6 +154,8 @@ def own_view(name: str, settings: Sequence[str], observation_shape: Shape) -> Vi
     if not (inspect.isclass(kind) and issubclass(kind, View)):
         raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
     view: View = kind(observation_shape, resolve(kind.Settings, assigned(settings), stage=name))
+    if "_modules" not in vars(view) or not hasattr(view, "shape"):
+        raise UserError("the view is not ready", name, "Call super().__init__() and set self.shape in its __init__.")
     return view
 
 
@@ -176,8 +178,36 @@ def view_of(
         raise UserError(f"the view is of {view.dtype}, these observations are {observations.dtype}", config.view)
     if fitted:
         view.fit(observations, unlabelled, origins, seed)
-    seen = view.see(observations[:1])
-    if seen.dtype != view.dtype or seen.shape != (1, *view.shape):
+    two = observations[:2].copy()
+    seen = np.asarray(view.see(two))
+    if seen.dtype != view.dtype or seen.shape != (len(two), *view.shape):
         shown = f"{seen.dtype} {seen.shape}"
-        raise UserError(f"the view shows {shown} of one state", config.view, f"Show {view.dtype} {(1, *view.shape)}.")
+        do = f"Show {view.dtype} {(len(two), *view.shape)}."
+        raise UserError(f"the view shows {shown} of {len(two)} states", config.view, do)
+    if not np.array_equal(two, observations[:2]):
+        raise UserError("the view changes the observations", config.view, "Have it change a copy.")
     return view
+
+
+def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
+    """:meth:`View.change`; anything but (B, *shape) of the view's type, or pictures in 0..1, is a ``UserError``."""
+    changed = np.asarray(view.change(batch, rng))
+    fits = changed.shape == (len(batch), *view.shape) and changed.dtype in (view.dtype, NUMBERS)
+    if fits and changed.dtype != view.dtype:
+        fits = changed.min() >= 0 and changed.max() <= 1
+    if not fits:
+        shown = f"{changed.dtype} {changed.shape}, at most {changed.max()}"
+        do = f"Give {view.dtype} {(len(batch), *view.shape)}, or float32 in 0..1."
+        raise UserError(f"the view changes a batch to {shown}", type(view).__name__, do)
+    return changed
+
+
+def pools_of(view: View, labels: Bools, origins: Origins) -> tuple[list[Ints], float]:
+    """:meth:`View.pools`; pools that are empty or not of positives, or another share, are a ``UserError``."""
+    pools, share = view.pools(labels, origins)
+    numbers = np.concatenate(pools) if all(map(len, pools)) and pools else np.zeros(0)
+    are_positives = np.isin(numbers, np.flatnonzero(labels)).all()
+    if numbers.dtype.kind not in "iu" or not are_positives or not 0 < share < 1:
+        do = "Give lists of numbers of positives, none empty, and their share of a batch, between 0 and 1."
+        raise UserError(f"the view gave {len(pools)} pools and the share {share}", type(view).__name__, do)
+    return pools, share

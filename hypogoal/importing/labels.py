@@ -10,6 +10,7 @@ import pandas as pd
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
+from hypogoal.core.own_code import load
 from hypogoal.data import Collected, Labels, joined, open_dataset, write_dataset
 from hypogoal.importing.episodes import UNLABELLED, Array
 from hypogoal.importing.states import Frames
@@ -27,8 +28,8 @@ TRUTHS = {"0": False, "1": True}
 def labels_of(frames: Frames, rules: Mapping[str, str]) -> Labels:
     """Whether each sub-goal holds in frames, (N, G), by the rule for it.
 
-    A column above 0; ``last:N`` frames of each success; or a table, ``FILE.csv``. Episodes that a table does not list
-    become unlabelled.
+    A column above 0; ``last:N`` frames of each success; a table, ``FILE.csv``; or ``module:function`` of what is seen,
+    of several keys a dictionary. Episodes that a table does not list become unlabelled.
     """
     marks = [_marks(frames, rule) for rule in rules.values()]
     labels = np.stack(marks, axis=1)
@@ -52,12 +53,24 @@ def _marks(frames: Frames, rule: str) -> Any:
                 succeeds = columns[name] > 0
                 return is_last & succeeds.groupby(episode).transform("any")
         return is_last
+    if ":" in rule and rule not in columns:
+        return _by_function(frames, rule)
     values = columns.get(rule, pd.Series(["none"]))
     are_numbers = values.dtype.kind in "biuf"
     if not are_numbers or not np.isfinite(values).all():
         names = ", ".join([*columns]) or "none"
         raise UserError("no column with a number for each frame", rule, f"There are {names}.")
     return values
+
+
+def _by_function(frames: Frames, rule: str) -> Array:
+    """1 in the frames of which a function of what is seen says so, NaN in those that are not kept."""
+    holds = load(rule, "label", "", {})
+    marks = np.full(len(frames.table), np.nan)
+    for row, *parts in zip(np.flatnonzero(frames.table["kept"]), *frames.seen.values(), strict=True):
+        seen = dict(zip(frames.seen, parts, strict=True)) if len(parts) > 1 else parts[0]
+        marks[row] = bool(holds(seen))
+    return marks
 
 
 def _by_table(table: pd.DataFrame, path: Path) -> Array:

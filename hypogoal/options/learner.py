@@ -17,7 +17,7 @@ from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
-from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part, saved_row
+from hypogoal.options.parts import Flags, Floats, Ids, Part, answer_of, load_part, saved_row
 from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.termination import ORACLE, Terminations
 
@@ -124,7 +124,8 @@ class Learner(Part, ABC):
 
     def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
-        chosen = self.greedy(ids, options, age)
+        chosen = self.greedy(ids, options.copy(), age.copy())
+        chosen = answer_of(self, "greedy", chosen, np.int64, len(ids), self.engine.n_actions - 1)
         if explore and isinstance(self.config, LearnerConfig):
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen

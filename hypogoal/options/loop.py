@@ -18,6 +18,7 @@ from hypogoal.domains.base import Engine, Step, check_step
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.parts import answer_of, learned_by
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations
 from hypogoal.options.visited import Visited
@@ -75,7 +76,7 @@ class OptionLoop(Resumable):
     def step(self) -> dict[str, float]:
         """One step of every environment, then the updates that are due; returns numbers to log."""
         self.advance()
-        return self.learner.learn() | self.chooser.learn()
+        return learned_by(self.learner) | learned_by(self.chooser)
 
     def advance(self, *, learning: bool = True) -> Transitions:
         """One step of every environment, before the updates that are due.
@@ -83,14 +84,15 @@ class OptionLoop(Resumable):
         Without ``learning`` the agent is frozen: options are greedy, and nothing is kept that could be learned from.
         """
         first = (self.option == NONE).all()
-        self._choose()
+        self._choose(learning)
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=learning)
         step = self.engine.step(actions)
         if first:
             check_step(self.engine, step)
         log_odds = self.terminations.log_odds(step.next_ids, option)
-        reached = self.terminations.reached(log_odds, option, self.age)
+        reached = self.terminations.reached(log_odds, option.copy(), self.age.copy())
+        reached = answer_of(self.terminations, "reached", reached, np.bool_, len(option))
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
@@ -118,7 +120,7 @@ class OptionLoop(Resumable):
         self._finish_options(step, moved, learning=learning)
         return moved
 
-    def _choose(self) -> None:
+    def _choose(self, learning: bool) -> None:
         free = np.flatnonzero(self.option == NONE)
         if not len(free):
             return
@@ -126,7 +128,11 @@ class OptionLoop(Resumable):
         offered = np.ones((len(free), self.terminations.options), dtype=np.bool_)
         if self.config.mask_reached:
             offered = offered_options(self.terminations.of(ids))
-        chosen = self.chooser.choose(free, ids, offered)
+        chosen = self.chooser.choose(free, ids, offered.copy())
+        chosen = answer_of(self.chooser, "choose", chosen, np.int64, len(free), self.terminations.options - 1)
+        if learning and not offered[np.arange(len(free)), chosen].all():
+            fault = f"choose gave options {chosen}, of which not all are offered"
+            raise UserError(fault, type(self.chooser).__name__, "Choose where 'offered' is true.")
         self.option[free], self.began[free] = chosen, ids
         self.inside[free] = self.terminations.of_running(ids, chosen)
         self.age[free] = 0

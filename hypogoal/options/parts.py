@@ -32,6 +32,29 @@ class Part(Resumable):
         """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
 
 
+def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most: int = 1) -> NDArray[Any]:
+    """What a part's method gave for each of ``count`` environments, from 0 to ``most``, else a ``UserError``."""
+    given = np.asarray(values)
+    kinds = "b" if dtype == np.bool_ else "iu"
+    if given.shape != (count,) or given.dtype.kind not in kinds:
+        shown = f"{given.dtype} {given.shape}"
+    elif given.min() < 0 or given.max() > most:
+        shown = f"{given.min()} to {given.max()}"
+    else:
+        return given
+    do = f"Give {np.dtype(dtype)} ({count},), from 0 to {most}."
+    raise UserError(f"{method} gave {shown}", type(part).__name__, do)
+
+
+def learned_by(part: Any) -> dict[str, float]:
+    """The numbers of the updates that were due; anything but a dictionary is a ``UserError``."""
+    numbers = part.learn()
+    if not isinstance(numbers, dict):
+        do = "Return a dict of numbers to log, empty where no update was due."
+        raise UserError(f"learn gave {numbers!r}", type(part).__name__, do)
+    return numbers
+
+
 def saved_row(weights: Mapping[str, Tensor], name: str, options: int, dtype: Any) -> NDArray[Any]:
     """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing or damaged."""
     row = weights.get(name)
@@ -45,13 +68,14 @@ Kind = TypeVar("Kind", bound=Part)
 
 
 def load_part(name: str, kind: str, base: type[Kind], built_in: Mapping[str, str]) -> type[Kind]:
-    """The subclass of ``base`` called ``name``: built-in, an installed entry point, or ``module:Class``.
+    """The subclass of ``base`` called ``name``: built-in, or ``module:Class``.
 
-    Entry points of choosers are in the group ``hypogoal.choosers``, and so on. Anything else, and code that the user
-    did not allow, is a ``UserError`` that says which ``kind`` of part is meant.
+    Anything else, and code that the user did not allow, is a ``UserError`` that says which ``kind`` of part is meant.
     """
-    part = load(name, kind, f"hypogoal.{kind.replace(' ', '_')}s", built_in)
+    part = load(name, kind, "", built_in)
+    do = f"Give a subclass of {base.__module__}.{base.__name__}."
     if not (inspect.isclass(part) and issubclass(part, base)):
-        do = f"Give a subclass of {base.__module__}.{base.__name__}."
         raise UserError(f"this is no {kind}", name, do)
+    if missing := sorted(getattr(part, "__abstractmethods__", ())):
+        raise UserError(f"this {kind} lacks {', '.join(missing)}", name, do)
     return part

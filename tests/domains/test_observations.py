@@ -123,6 +123,21 @@ def test_frames_and_colours_are_stacked_in_their_order() -> None:
         np.testing.assert_array_equal([take(state, "the state", stack=True)[0] for state in states], wanted)
 
 
+def test_minigrids_dictionary_is_read_without_its_text() -> None:
+    """Spec B6: a picture and a number by key; a line says so."""
+    env = gymnasium.make("MiniGrid-Empty-8x8-v0")
+    with pytest.warns(UserWarning, match="observations are read without their text: mission"):
+        reader = reader_of(env)
+    seen, _ = env.reset(seed=0)
+    read = reader.read(seen)
+    assert read.dtype.names == ("direction", "image")
+    np.testing.assert_array_equal(read["image"], seen["image"])
+    assert read["direction"].tolist() == [1.0, 0.0, 0.0, 0.0]
+    nothing_else = spaces.Dict(mission=env.observation_space["mission"])
+    with pytest.raises(UserError, match="observations must be images"):
+        reader_of(Says(nothing_else, None))
+
+
 def test_a_dictionary_hides_no_picture() -> None:
     """Spec B6: stacks, floats and integers in the shape of pictures are no more guessed in there than alone."""
     speed = spaces.Box(0, 1, (2,))

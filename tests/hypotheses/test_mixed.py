@@ -54,10 +54,10 @@ def test_a_file_keeps_each_key(made: Path) -> None:
 def test_each_key_has_its_encoder(made: Path) -> None:
     """Spec C5, H6: pictures the picture network, numbers the mlp; a name for one key, or for all pictures."""
     dtype = open_dataset(made / "data.h5").observation_dtype
-    assert network_for("auto", dtype) == "front=doorkey,state=mlp,wrist=doorkey"
-    assert network_for("tiles,wrist=montezuma", dtype) == "front=tiles,state=mlp,wrist=montezuma"
+    assert network_for("auto", (), dtype) == "front=doorkey,state=mlp,wrist=doorkey"
+    assert network_for("tiles,wrist=montezuma", (), dtype) == "front=tiles,state=mlp,wrist=montezuma"
     with pytest.raises(UserError, match="no such key in the observations: arm"):
-        network_for("arm=tiles", dtype)
+        network_for("arm=tiles", (), dtype)
     ensemble = hypogoal.load_ensemble(made / "ensemble", GOAL)
     assert ensemble.network == "front=doorkey,state=mlp,wrist=doorkey"
     seen, labels = states(30, 5)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network, folded, reordered
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network, folded, network_for, reordered
+from hypogoal.observations import NUMBERS, PICTURE
 
 SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "tiles": (48, 48, 3), "mlp": (6, 7, 3)}
 
@@ -59,6 +62,19 @@ def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
         network_of(name, (smallest - 1, smallest, 1))
     page = (Path(__file__).parents[2] / "docs" / "own-domain.md").read_text(encoding="utf-8")
     assert f"{smallest}x{smallest}" in page
+
+
+@pytest.mark.parametrize(
+    ("shape", "name"),
+    [((41, 99, 3), "doorkey"), ((40, 56, 3), "montezuma"), ((99, 35, 1), "tiles"), ((7, 7, 3), "mlp")],
+)
+def test_auto_is_a_network_that_takes_the_pictures(shape: tuple[int, ...], name: str) -> None:
+    """Spec C5: the first of the four; numbers have the last."""
+    assert network_for("auto", shape, PICTURE) == name
+    ensemble = Ensemble("auto", shape, 2, torch.Generator()).eval()
+    assert ensemble.network == name
+    assert ensemble.predict(np.zeros((2, *shape), np.uint8)).shape == (2, 2)
+    assert network_for("auto", (99, 99), NUMBERS) == "mlp"
 
 
 def test_wrong_names_and_shapes_are_one_clear_line() -> None:

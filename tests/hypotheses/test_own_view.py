@@ -119,7 +119,7 @@ def test_pools_of_positives_take_turns(kinds: list[int], each: tuple[int, int]) 
         ({"view": "own_view:Settings"}, "this is no view: own_view:Settings"),
         ({"view_settings": ("jiter=3",)}, "own_view:Moved has no setting: jiter. Did you mean 'jitter'"),
         ({"view_settings": ("jitter=9",)}, "value not allowed: jitter='9' in own_view:Moved. Allowed: 0 .. 8"),
-        ({"view": "own_view:Wrong"}, r"the view shows uint8 \(1, 41, 42, 3\) of one state: .* Show uint8 \(1, 42, 42"),
+        ({"view": "own_view:Wrong"}, r"the view shows uint8 \(2, 41, 42, 3\) of 2 states: .* Show uint8 \(2, 42, 42"),
         ({"view": "own_view:OfNumbers", "view_settings": ()}, "the view is of float32, these observations are uint8"),
     ],
 )

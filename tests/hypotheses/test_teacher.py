@@ -71,8 +71,8 @@ def test_a_teacher_is_one_more_term_of_the_loss() -> None:
 @pytest.mark.parametrize(
     ("teacher", "message"),
     [
-        ("too_few", r"the teacher gave scores \(1,\): test_teacher:too_few\. Give finite ones, \(2, 128\)"),
-        ("not_finite", r"gave scores \(2, 128\): .*Give finite ones"),
+        ("too_few", r"the teacher gave scores float64 \(1,\): test_teacher:too_few\. Give finite ones, \(2, 128\)"),
+        ("not_finite", r"gave scores float64 \(2, 128\): .*Give finite ones"),
     ],
 )
 def test_scores_that_do_not_fit_are_refused(teacher: str, message: str) -> None:

@@ -103,6 +103,20 @@ def test_labels_of_last_frames_and_of_a_table(datasets: Path, tmp_path: Path) ->
     assert positives == sorted(round(float(at), 4) for at in [zero[0], *zero[8:], *three[7:]])
 
 
+def test_labels_of_a_function(datasets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec I6: of what is seen in a frame, of several keys a dictionary."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    far = f"def far(state): return state[0] > 0.5\ndef by_key(seen): return far(seen[{STATE!r}])\n"
+    (tmp_path / "rules.py").write_text(far)
+    source, out = datasets / "v2.1-image", tmp_path / "data.h5"
+    for rule, keys, every in (("far", [STATE], "1"), ("by_key", [STATE, TOP], "2")):
+        chosen = [word for key in keys for word in ("--key", key)]
+        data = imported(source, out, *chosen, "--label", f"reached=rules:{rule}", "--every", every)
+        labels = [(state[STATE] if data.observation_dtype.names else state, label) for state, label in frames_of(data)]
+        assert {label for _, label in labels} == {None, True, False}
+        assert all(label in (None, state[0] > 0.5) for state, label in labels)
+
+
 def test_every_third_frame_and_the_last(datasets: Path, tmp_path: Path) -> None:
     few = imported(datasets / "v3.0-video", tmp_path / "few.h5", *LABEL, "--every", "3")
     every = imported(datasets / "v3.0-video", tmp_path / "all.h5", *LABEL)

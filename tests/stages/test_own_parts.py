@@ -134,6 +134,11 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
         (["network={}:Straight", "experience=own"], "straight options have no experience: experience=own"),
         (["chooser={}:Straight"], "this is no chooser"),
         (["chooser={}:Missing"], "the chooser cannot be loaded"),
+        (["chooser=odd_parts:Abstract"], "this chooser lacks choose"),
+        (["chooser=odd_parts:Last"], "of which not all are offered: Last"),
+        (["chooser=odd_parts:Forgetful"], "learn gave None: Forgetful"),
+        (["network=odd_parts:Values"], "greedy gave float64 (4, 2): Values"),
+        (["termination=odd_parts:Counts"], "reached gave int64 (4,): Counts"),
     ],
 )
 def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_run: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ a structured type, see ``hypogoal.observations``.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -64,10 +65,21 @@ class Reader:
 def reader_of(env: gymnasium.Env) -> Reader:
     """A reader of an environment's observations; a ``UserError`` if they are neither pictures nor numbers.
 
-    A ``Dict`` of pictures and others, each under a key of its own, is read by key. Other spaces that Gymnasium's
-    ``flatten`` accepts become float32 (D,) in its order.
+    A ``Dict`` of pictures and others, each under a key of its own, is read by key, without its text. Other spaces that
+    Gymnasium's ``flatten`` accepts become float32 (D,) in its order.
     """
-    return _reader(env.observation_space)
+    return _reader(_without_text(env.observation_space))
+
+
+def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """A space without the text among its entries, which a warning names."""
+    if not isinstance(space, spaces.Dict):
+        return space
+    texts = [key for key, part in space.items() if part.dtype is not None and part.dtype.kind == "U"]
+    if not 0 < len(texts) < len(space):
+        return space
+    warnings.warn(f"observations are read without their text: {', '.join(texts)}", stacklevel=2)
+    return spaces.Dict({key: part for key, part in space.items() if key not in texts})
 
 
 def _reader(space: spaces.Space[Any], key: str = "") -> Reader:

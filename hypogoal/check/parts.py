@@ -1,0 +1,125 @@
+"""The contracts of an agent's parts (:mod:`hypogoal.options.parts`): each is made, played, resumed and kept."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+
+from hypogoal.check.domains import SEEDED, require_same
+from hypogoal.check.verdict import Verdict, promise, verdicts
+from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.domains.base import Domain, Engine, load_domain
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.setup import Setup
+from hypogoal.meta.training import assemble
+from hypogoal.observations import PICTURE, standard_of
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.parts import Floats, Ids, learned_by
+from hypogoal.options.termination import Terminations, load_rule
+
+STEPS = 60  # joint steps
+SMALL = {"environments": 4, "max_episode_steps": 30, "option_timeout": 5, "warm_up": 40, "option_batch": 8}
+SOURCE = {"sub_goals": ("one", "other"), "members": 2, "domain_config": {}}
+PLAYED_AS = {"chooser": "chooser", "network": "learner", "termination": "terminations"}  # settings in a loop
+
+
+def check_part(setting: str, name: str, domain: Domain | None = None, seed: int = 0) -> Iterator[Verdict]:
+    """Whether a chooser, an option learner (``network``) or a termination rule, by its ``module:Class``, works.
+
+    It is played for some steps, in DoorKey by default, beside built-in parts. Four options aim at made-up sub-goals,
+    each of which holds in a third of the states.
+    """
+    laws = [_Played.plays, _Played.again, _Played.resumes, _Played.is_kept]
+    return verdicts(laws, _Played(setting, name, domain or load_domain("doorkey"), seed))
+
+
+@dataclass
+class _Played:
+    """A part by its setting and name, and where it is played."""
+
+    setting: str
+    name: str
+    domain: Domain
+    seed: int
+
+    def plays(self) -> str:
+        """Its answers are of the shapes, types and ranges that are asked for, at every step."""
+        loop = self.loop()
+        reached = [moved["reached"].sum() for moved in _play(loop)]
+        if self.setting == "termination" and not sum(reached):
+            warnings.warn(f"no option reached its sub-goal in {STEPS * loop.engine.count} steps", stacklevel=1)
+        return f"{sum(reached)} sub-goals reached in {STEPS * loop.engine.count} steps"
+
+    def again(self) -> None:
+        """Of the same seed: the same is played."""
+        require_same(_play(self.loop()), _play(self.loop()), SEEDED)
+
+    def resumes(self) -> str | None:
+        """From a checkpoint it goes on as if there had been no break."""
+        loop, resumed = self.loop(), self.loop()
+        if not loop.engine.resumes:
+            return "not looked at: this domain cannot be resumed"
+        for _ in _play(loop):
+            pass
+        with TemporaryDirectory() as folder:
+            checkpoints = Checkpoints(Path(folder, "state"))
+            checkpoints.save(loop.snapshot())
+            saved = checkpoints.load()
+        promise(saved, "what changes is not finite", "Look for NaN or Inf in what CHANGING names.")
+        resumed.restore(saved or {})
+        require_same(_play(loop), _play(resumed), "Name in CHANGING all that changes.")
+        return None
+
+    def is_kept(self) -> str:
+        """What an artefact keeps of it, a fresh one loads."""
+        loop = self.loop()
+        for _ in _play(loop):
+            pass
+        state = self.part(loop).state()
+        promise(isinstance(state, dict), f"state gave {state!r}", "Return a dict of tensors by name.")
+        fresh = self.part(self.loop())
+        with TemporaryDirectory() as folder:
+            place = Path(folder, "part.safetensors")
+            save_tensors(place, state)
+            fresh.load(load_tensors(place))
+        for name, values in fresh.state().items():
+            is_same = torch.equal(torch.as_tensor(values), torch.as_tensor(state[name]))
+            promise(is_same, f"{name} is another one when loaded", "Give all in 'state' or 'weights', and load it.")
+        return f"{len(state)} arrays"
+
+    def part(self, loop: OptionLoop) -> Any:
+        """The part that is checked."""
+        return getattr(loop, PLAYED_AS[self.setting])
+
+    def loop(self) -> OptionLoop:
+        """It and other parts, fresh."""
+        config = TrainMetaConfig.of(**{**SMALL, "network": "light", "chooser": "random", self.setting: self.name})
+        return assemble(Setup(self.domain, SOURCE, Path(), config, self.seed), _made_up)
+
+
+def _made_up(setup: Setup, engine: Engine) -> Terminations:
+    """Terminations of sub-goals that depend on the state's number alone."""
+    rule = load_rule(setup.config.termination)
+    rule.refuse(setup.config, engine)
+    if engine.observation_dtype != PICTURE:
+        engine.standard = standard_of(engine.observation_shape)
+    options = np.arange(1, 1 + setup.options)
+
+    def classify(ids: Ids) -> Floats:
+        return (8 * np.sin(ids[:, None] * options) - 4).astype(np.float32)
+
+    return rule(classify, setup.options, None, np.zeros(setup.options, np.float32), engine.count)
+
+
+def _play(loop: OptionLoop) -> Iterator[dict[str, Any]]:
+    """What happens in each step, and the updates that are due after it."""
+    for _ in range(STEPS):
+        yield vars(loop.advance())
+        learned_by(loop.learner)
+        learned_by(loop.chooser)

@@ -1,0 +1,77 @@
+"""``hypogoal check`` of agents' parts, views and teachers: right ones pass, each fault is one line (Spec G2)."""
+
+from __future__ import annotations
+
+import pytest
+from command_line import fails, run
+
+KEPT = [
+    ("--chooser", "First", 4),
+    ("--learner", "Straight", 4),
+    ("--termination", "Twice", 4),
+    ("--view", "Whole", 4),
+    ("--teacher", "shade", 1),
+]
+
+
+@pytest.mark.parametrize(("option", "part", "laws"), KEPT)
+def test_parts_that_keep_the_contract_pass(option: str, part: str, laws: int) -> None:
+    told = run("check", option, f"odd_parts:{part}").out.splitlines()
+    assert len(told) == laws and all(line.startswith("ok   ") for line in told)
+
+
+@pytest.mark.parametrize(
+    ("option", "part", "said"),
+    [
+        ("--termination", "Never", "warn plays: no option reached its sub-goal in 240 steps"),
+        ("--teacher", "alike", "warn teaches: all 3 members are told the same"),
+    ],
+)
+def test_what_may_surprise_is_a_warning(option: str, part: str, said: str) -> None:
+    assert said in run("check", option, f"odd_parts:{part}").out.splitlines()
+
+
+BROKEN = [
+    ("--chooser", "Abstract", "plays: this chooser lacks choose"),
+    ("--chooser", "Fractions", "plays: choose gave float64 (4,): Fractions. Give int64 (4,), from 0 to 3."),
+    ("--chooser", "Column", "plays: choose gave int64 (4, 1)"),
+    ("--chooser", "Last", "of which not all are offered: Last. Choose where 'offered' is true."),
+    ("--chooser", "Beyond", "plays: choose gave 4 to 4"),
+    ("--chooser", "Forgetful", "plays: learn gave None: Forgetful. Return a dict"),
+    ("--chooser", "Moody", "again: options differ in step"),
+    ("--chooser", "Turning", "Name in CHANGING all that changes."),
+    ("--chooser", "Unnamed", "resumes: your code raised AttributeError: 'Unnamed' object has no attribute 'memory'"),
+    ("--learner", "Values", "plays: greedy gave float64 (4, 7): Values. Give int64 (4,), from 0 to 6."),
+    ("--learner", "Negative", "plays: greedy gave -1 to -1"),
+    ("--learner", "Unsaved", "is kept: table is another one when loaded"),
+    ("--termination", "Chances", "plays: reached gave float32 (4,): Chances. Give bool (4,)"),
+    ("--termination", "Counts", "plays: reached gave int64 (4,)"),
+    ("--termination", "Bare", "object has no attribute 'options': odd_parts.py, class Bare"),
+    ("--view", "Unready", "shows: the view is not ready"),
+    ("--view", "Few", "takes 2 positional arguments but 3 were given: Few.__init__"),
+    ("--view", "OneRow", "shows: the view shows uint8 (1, 48, 48, 3) of 2 states"),
+    ("--view", "Blackened", "shows: the view changes the observations"),
+    ("--view", "ByBatch", "shows: a state alone and among others differ"),
+    ("--view", "Mean", "learns: what it learned is not loaded. Keep it in parameters or buffers."),
+    ("--view", "Half", "changes: the view changes a batch to uint8 (8, 24, 48, 3)"),
+    ("--view", "Bright", "changes: the view changes a batch to float32 (8, 48, 48, 3), at most 2"),
+    ("--view", "Always", "changes: without a generator a batch is not what members see"),
+    ("--view", "AnyState", "draws: the view gave 1 pools and the share 0.5"),
+    ("--view", "Mask", "draws: the view gave 1 pools"),
+    ("--view", "Share", "draws: the view gave 1 pools and the share 5"),
+    ("--teacher", "turned", "teaches: the teacher gave scores float64 (2048, 3)"),
+    ("--teacher", "words", "teaches: the teacher gave no scores (could not convert string to float: "),
+    ("--teacher", "truths", "teaches: the teacher gave scores bool (3, 2048)"),
+    ("--teacher", "blackens", "teaches: the teacher changes what it gets"),
+    ("--teacher", "moody", "teaches: scores differ when asked again"),
+    ("--teacher", "of_two", "takes 2 positional arguments but 5 were given: of_two"),
+    ("--teacher", "nobody", "teaches: the teacher cannot be loaded"),
+]
+
+
+@pytest.mark.parametrize(("option", "part", "fault"), BROKEN)
+def test_each_fault_is_one_line(option: str, part: str, fault: str) -> None:
+    """The last line says which law, what and what to do; the exit code is 2."""
+    told = fails("check", option, f"odd_parts:{part}")
+    last = told.out.splitlines()[-1]
+    assert last.startswith("FAIL ") and fault in last and told.err == "", last

@@ -1,0 +1,277 @@
+"""Choosers, learners, termination rules, views and teachers as strangers write them: right ones, and one fault each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.hypotheses.views import View
+from hypogoal.options.choosers import Chooser
+from hypogoal.options.learner import Learner
+from hypogoal.options.termination import Terminations
+
+NOBODYS = np.random.default_rng(5)
+Pictures = NDArray[np.uint8]
+
+
+class First(Chooser):
+    """The first option offered, as a list, which is as good as an array."""
+
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        return offered.argmax(1).tolist()
+
+
+class Abstract(Chooser):
+    """It does not choose."""
+
+
+class Fractions(First):
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        return offered.argmax(1) + 0.4
+
+
+class Column(First):
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        return offered.argmax(1)[:, None]
+
+
+class Last(First):
+    """Whatever is offered."""
+
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        offered[:] = True  # a copy
+        return np.full(len(ids), offered.shape[1] - 1)
+
+
+class Beyond(First):
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        return np.full(len(ids), offered.shape[1])
+
+
+class Forgetful(First):
+    """It does not return the numbers of its updates."""
+
+    def learn(self) -> Any:
+        pass
+
+
+class Moody(First):
+    """It draws from nobody's seed."""
+
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        return np.where(offered, NOBODYS.random(offered.shape), -1.0).argmax(1)
+
+
+class Turning(First):
+    """It counts its choices, which a checkpoint does not know."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
+        self.count += 1
+        turned = (np.arange(offered.shape[1]) + self.count) % offered.shape[1]
+        return np.where(offered, turned, -1).argmax(1)
+
+
+class Unnamed(First):
+    CHANGING = ("memory",)
+
+
+class Straight(Learner):
+    """Its options play by the state's number."""
+
+    @staticmethod
+    def reach(config: Any, options: int) -> int:
+        return 0
+
+    def build(self, config: Any, seed: int) -> None:
+        self.table = torch.zeros(self.options)
+
+    def greedy(self, ids: Any, options: Any, age: Any) -> Any:
+        return (ids + options) % self.engine.n_actions
+
+    def observe(self, moved: Any) -> None:
+        self.count(moved.options)
+
+
+class Unsaved(Straight):
+    """What it learned is saved, and not loaded."""
+
+    CHANGING = (*Straight.CHANGING, "table")
+
+    def observe(self, moved: Any) -> None:
+        super().observe(moved)
+        self.table += 1
+
+    def weights(self) -> dict[str, Tensor]:
+        return {"table": self.table.clone()}
+
+
+class Values(Straight):
+    """It gives the actions' values."""
+
+    def greedy(self, ids: Any, options: Any, age: Any) -> Any:
+        return np.zeros((len(ids), self.engine.n_actions))
+
+
+class Negative(Straight):
+    def greedy(self, ids: Any, options: Any, age: Any) -> Any:
+        return np.full(len(ids), -1)
+
+
+class Twice(Terminations):
+    """Two positive predictions in a row."""
+
+    CHANGING = (*Terminations.CHANGING, "row")
+
+    def __init__(self, *arguments: Any, **more: Any):
+        super().__init__(*arguments, **more)
+        self.row = np.zeros(self.environments, dtype=np.int64)
+
+    def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
+        self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
+        return self.row >= 2
+
+
+class Never(Terminations):
+    def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
+        return np.zeros(len(options), np.bool_)
+
+
+class Chances(Terminations):
+    def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
+        return 1 / (1 + np.exp(-log_odds))
+
+
+class Counts(Terminations):
+    def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
+        return (log_odds > 0).astype(np.int64)
+
+
+class Bare(Terminations):
+    def __init__(self, *arguments: Any, **more: Any):
+        pass
+
+
+class Whole(View):
+    """All of a picture."""
+
+    def __init__(self, observation_shape: tuple[int, ...], settings: object):
+        super().__init__()
+        self.shape = observation_shape
+
+
+class Unready(View):
+    def __init__(self, observation_shape: tuple[int, ...], settings: object):
+        super().__init__()
+
+
+class Few(View):
+    def __init__(self, observation_shape: tuple[int, ...]):
+        super().__init__()
+
+
+class OneRow(Whole):
+    def see(self, observations: Pictures) -> Any:
+        return observations[:1]
+
+
+class Blackened(Whole):
+    def see(self, observations: Pictures) -> Any:
+        observations[:] = 0
+        return observations
+
+
+class ByBatch(Whole):
+    def see(self, observations: Pictures) -> Any:
+        return np.where(observations > observations.mean(), 255, 0).astype(np.uint8)
+
+
+class Mean(Whole):
+    """What it learned is no buffer."""
+
+    mean = 0
+
+    def fit(self, labelled: Any, unlabelled: Any, origins: Any, seed: int) -> None:
+        self.mean = int(labelled.mean())
+
+    def see(self, observations: Pictures) -> Any:
+        return np.maximum(observations, self.mean) - np.uint8(self.mean)
+
+
+class Half(Whole):
+    changes = True
+
+    def change(self, batch: Any, rng: Any) -> Any:
+        return batch[:, ::2] if rng else batch
+
+
+class Bright(Whole):
+    changes = True
+
+    def change(self, batch: Any, rng: Any) -> Any:
+        return batch.astype(np.float32) if rng else batch
+
+
+class Always(Whole):
+    """It changes what a trained member sees, too."""
+
+    changes = True
+
+    def change(self, batch: Any, rng: Any) -> Any:
+        return 255 - batch
+
+
+class AnyState(Whole):
+    def pools(self, labels: Any, origins: Any) -> Any:
+        return [np.arange(len(labels))], 0.5
+
+
+class Mask(Whole):
+    def pools(self, labels: Any, origins: Any) -> Any:
+        return [labels], 0.5
+
+
+class Share(Whole):
+    def pools(self, labels: Any, origins: Any) -> Any:
+        return [np.flatnonzero(labels)], 5
+
+
+def shade(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    """Each member is told to tell bright pictures, surer and surer."""
+    brightness = unlabelled.mean((1, 2, 3))
+    return np.arange(1, members + 1)[:, None] * (brightness - brightness.mean())
+
+
+def alike(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    return [[1.0] * len(unlabelled)] * members
+
+
+def turned(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    return np.ones((len(unlabelled), members))
+
+
+def words(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    return [["yes"] * len(unlabelled)] * members
+
+
+def truths(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    return np.ones((members, len(unlabelled)), np.bool_)
+
+
+def blackens(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    unlabelled[:] = 0
+    return np.ones((members, len(unlabelled)))
+
+
+def moody(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
+    return NOBODYS.normal(size=(members, len(unlabelled)))
+
+
+def of_two(observations: Any, labels: Any) -> Any:
+    return None
