@@ -417,10 +417,9 @@ def check(
         checks.append(contracts.check_objective(diversity))
     if network is not None:
         checks.append(contracts.check_network(network, *observations))
-    if view is not None:
-        checks.append(contracts.check_view(view, loaded, chosen, seed))
-    if teacher is not None:
-        checks.append(contracts.check_teacher(teacher, loaded, chosen, seed))
+    for name, check_it in ((view, contracts.check_view), (teacher, contracts.check_teacher)):
+        if name is not None:
+            checks.append(check_it(name, loaded, chosen, seed))
     for setting, name in {"chooser": chooser, "network": learner, "termination": termination}.items():
         if name is not None:
             checks.append(contracts.check_part(setting, name, loaded, seed))

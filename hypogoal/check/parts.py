@@ -13,14 +13,12 @@ import torch
 from hypogoal.check.domains import SEEDED, require_same
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import Domain, Engine, load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import assemble
 from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.parts import Floats, Ids, learned_by
 from hypogoal.options.termination import Terminations, load_rule
 
 STEPS = 60  # joint steps
@@ -50,11 +48,10 @@ class _Played:
 
     def plays(self) -> str:
         """Its answers are of the shapes, types and ranges that are asked for, at every step."""
-        loop = self.loop()
-        reached = [moved["reached"].sum() for moved in _play(loop)]
-        if self.setting == "termination" and not sum(reached):
-            warnings.warn(f"no option reached its sub-goal in {STEPS * loop.engine.count} steps", stacklevel=1)
-        return f"{sum(reached)} sub-goals reached in {STEPS * loop.engine.count} steps"
+        loop = self.played()
+        if self.setting == "termination" and not any(loop.recorder.stops):
+            warnings.warn(f"no option reached its sub-goal in {loop.recorder.steps} steps", stacklevel=1)
+        return f"{loop.recorder.steps} steps"
 
     def again(self) -> None:
         """Of the same seed: the same is played."""
@@ -62,11 +59,9 @@ class _Played:
 
     def resumes(self) -> str | None:
         """From a checkpoint it goes on as if there had been no break."""
-        loop, resumed = self.loop(), self.loop()
+        loop, resumed = self.played(), self.loop()
         if not loop.engine.resumes:
             return "not looked at: this domain cannot be resumed"
-        for _ in _play(loop):
-            pass
         with TemporaryDirectory() as folder:
             checkpoints = Checkpoints(Path(folder, "state"))
             checkpoints.save(loop.snapshot())
@@ -78,20 +73,21 @@ class _Played:
 
     def is_kept(self) -> str:
         """What an artefact keeps of it, a fresh one loads."""
+        kept = self.part(self.played()).state()
+        state = {name: torch.as_tensor(values) for name, values in kept.items()}
+        fresh = self.part(self.loop())
+        fresh.load(state)
+        for name, values in fresh.state().items():
+            is_same = torch.equal(torch.as_tensor(values), state[name])
+            promise(is_same, f"{name} is another one when loaded", "Give all in 'state' or 'weights', and load it.")
+        return f"{len(state)} arrays"
+
+    def played(self) -> OptionLoop:
+        """It and other parts, after some steps."""
         loop = self.loop()
         for _ in _play(loop):
             pass
-        state = self.part(loop).state()
-        promise(isinstance(state, dict), f"state gave {state!r}", "Return a dict of tensors by name.")
-        fresh = self.part(self.loop())
-        with TemporaryDirectory() as folder:
-            place = Path(folder, "part.safetensors")
-            save_tensors(place, state)
-            fresh.load(load_tensors(place))
-        for name, values in fresh.state().items():
-            is_same = torch.equal(torch.as_tensor(values), torch.as_tensor(state[name]))
-            promise(is_same, f"{name} is another one when loaded", "Give all in 'state' or 'weights', and load it.")
-        return f"{len(state)} arrays"
+        return loop
 
     def part(self, loop: OptionLoop) -> Any:
         """The part that is checked."""
@@ -110,16 +106,15 @@ def _made_up(setup: Setup, engine: Engine) -> Terminations:
     if engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape)
     options = np.arange(1, 1 + setup.options)
-
-    def classify(ids: Ids) -> Floats:
-        return (8 * np.sin(ids[:, None] * options) - 4).astype(np.float32)
-
-    return rule(classify, setup.options, None, np.zeros(setup.options, np.float32), engine.count)
+    return rule(
+        lambda ids: (8 * np.sin(ids[:, None] * options) - 4).astype(np.float32),
+        setup.options,
+        environments=engine.count,
+    )
 
 
 def _play(loop: OptionLoop) -> Iterator[dict[str, Any]]:
-    """What happens in each step, and the updates that are due after it."""
+    """What every step leads to."""
     for _ in range(STEPS):
-        yield vars(loop.advance())
-        learned_by(loop.learner)
-        learned_by(loop.chooser)
+        loop.step()
+        yield {"options": loop.option.copy(), "states": loop.engine.ids.copy()}

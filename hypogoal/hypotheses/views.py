@@ -180,10 +180,10 @@ def view_of(
         view.fit(observations, unlabelled, origins, seed)
     two = observations[:2].copy()
     seen = np.asarray(view.see(two))
-    if seen.dtype != view.dtype or seen.shape != (len(two), *view.shape):
-        shown = f"{seen.dtype} {seen.shape}"
-        do = f"Show {view.dtype} {(len(two), *view.shape)}."
-        raise UserError(f"the view shows {shown} of {len(two)} states", config.view, do)
+    wanted = (len(two), *view.shape)
+    if seen.dtype != view.dtype or seen.shape != wanted:
+        fault = f"the view shows {seen.dtype} {seen.shape} of {len(two)} states"
+        raise UserError(fault, config.view, f"Show {view.dtype} {wanted}.")
     if not np.array_equal(two, observations[:2]):
         raise UserError("the view changes the observations", config.view, "Have it change a copy.")
     return view
@@ -192,12 +192,11 @@ def view_of(
 def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
     """:meth:`View.change`; anything but (B, *shape) of the view's type, or pictures in 0..1, is a ``UserError``."""
     changed = np.asarray(view.change(batch, rng))
-    fits = changed.shape == (len(batch), *view.shape) and changed.dtype in (view.dtype, NUMBERS)
-    if fits and changed.dtype != view.dtype:
-        fits = changed.min() >= 0 and changed.max() <= 1
-    if not fits:
+    wanted = (len(batch), *view.shape)
+    most = np.inf if changed.dtype == view.dtype else 1
+    if changed.shape != wanted or changed.dtype not in (view.dtype, NUMBERS) or changed.max() > most:
         shown = f"{changed.dtype} {changed.shape}, at most {changed.max()}"
-        do = f"Give {view.dtype} {(len(batch), *view.shape)}, or float32 in 0..1."
+        do = f"Give {view.dtype} {wanted}, or float32 in 0..1."
         raise UserError(f"the view changes a batch to {shown}", type(view).__name__, do)
     return changed
 

@@ -71,7 +71,8 @@ def import_data(
         of_pictures = (source / POSITIVE).is_dir()
         reader = None if of_pictures else reader_of(source)
         if bool(rules) != bool(reader) or (rules and sub_goals):
-            raise UserError("nothing says where the sub-goal holds", source, NAMING)
+            fault = "this is no recording" if rules and not reader else "nothing says where the sub-goal holds"
+            raise UserError(fault, source, NAMING)
         if group and (reader or of_pictures):
             raise UserError("--group is for arrays", source, "Episodes and folders are groups already.")
         left: Counter[str] = Counter()

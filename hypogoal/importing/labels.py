@@ -67,9 +67,8 @@ def _by_function(frames: Frames, rule: str) -> Array:
     """1 in the frames of which a function of what is seen says so, NaN in those that are not kept."""
     holds = load(rule, "label", "", {})
     marks = np.full(len(frames.table), np.nan)
-    for row, *parts in zip(np.flatnonzero(frames.table["kept"]), *frames.seen.values(), strict=True):
-        seen = dict(zip(frames.seen, parts, strict=True)) if len(parts) > 1 else parts[0]
-        marks[row] = bool(holds(seen))
+    by_key = pd.DataFrame(frames.seen).to_dict("records")
+    marks[frames.table["kept"]] = [bool(holds(seen.get("", seen))) for seen in by_key]
     return marks
 
 

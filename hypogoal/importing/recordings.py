@@ -16,7 +16,7 @@ from hypogoal.importing.lerobot import INFO, read_lerobot
 
 MINARI = Path("data") / "metadata.json"  # in a dataset's folder
 HDF5 = (".h5", ".hdf5")
-DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it."
+DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it; arrays as .npz."
 TABLE = ".csv"  # labels of films, beside them
 
 # From a source, the keys to read, and what counts by suffix the files that are not read.

@@ -102,7 +102,7 @@ def _parts(
             parts[name] = values[kept]
         elif keys:
             names = ", ".join(episode.observations)
-            raise UserError(f"no pictures or numbers {key!r}", episode.name, f"There are {names}.")
+            raise UserError(f"no pictures or numbers {key!r}", episode.name, f"Its keys are {names}.")
         else:
             left[f"times {key!r}, neither pictures nor numbers"] += 1
     if len(parts) > 1:

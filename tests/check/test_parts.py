@@ -38,7 +38,7 @@ BROKEN = [
     ("--chooser", "Last", "of which not all are offered: Last. Choose where 'offered' is true."),
     ("--chooser", "Beyond", "plays: choose gave 4 to 4"),
     ("--chooser", "Forgetful", "plays: learn gave None: Forgetful. Return a dict"),
-    ("--chooser", "Moody", "again: options differ in step"),
+    ("--chooser", "Moody", "again: options"),
     ("--chooser", "Turning", "Name in CHANGING all that changes."),
     ("--chooser", "Unnamed", "resumes: your code raised AttributeError: 'Unnamed' object has no attribute 'memory'"),
     ("--learner", "Values", "plays: greedy gave float64 (4, 7): Values. Give int64 (4,), from 0 to 6."),

@@ -75,7 +75,7 @@ def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """A space without the text among its entries, which a warning names."""
     if not isinstance(space, spaces.Dict):
         return space
-    texts = [key for key, part in space.items() if part.dtype is not None and part.dtype.kind == "U"]
+    texts = [key for key, part in space.items() if str(part.dtype).startswith("<U")]
     if not 0 < len(texts) < len(space):
         return space
     warnings.warn(f"observations are read without their text: {', '.join(texts)}", stacklevel=2)
