@@ -25,7 +25,7 @@ from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load
+from hypogoal.core.own_code import load, place_of
 from hypogoal.hypotheses.load import ByKey
 from hypogoal.observations import (
     PICTURE,
@@ -186,8 +186,14 @@ def load_network(name: str) -> Callable[[Shape], Parts]:
 
 def _encoder(name: str, network: nn.Module, shape: Shape) -> Parts:
     """A user's encoder, :func:`as_input` -> (N, F), as parts."""
-    with torch.no_grad():
-        features = network.eval()(as_input(torch.zeros(1, *shape)))
+    try:
+        with torch.no_grad():
+            features = network.eval()(as_input(torch.zeros(1, *shape)))
+    except (RuntimeError, NotImplementedError) as error:
+        if place_of(error):
+            raise
+        fault = f"the network takes no such input: {error}"
+        raise UserError(fault, name, "Have it take float32 (N, C, H, W) on the CPU, or (N, *shape).") from None
     kind = getattr(features, "dtype", type(features))
     size = tuple(getattr(features, "shape", ()))
     if kind != torch.float32 or size[:-1] != (1,) or not all(size):

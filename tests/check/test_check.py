@@ -232,6 +232,8 @@ NETWORK_FAULTS = [
     (drifting, "members", "of one seed differ"),
     (lambda channels: convolution(kind=Detached), "gradients", "0.0.weight gets no gradient"),
     (lambda channels: convolution(nn.Softmax(0)), "answers", "among others differ"),
+    (lambda channels: convolution(nn.Threshold(9.0, torch.nan)), "answers", "probabilities are not finite"),
+    (lambda channels: convolution().double(), "logits", "the network takes no such input: Input type"),
 ]
 
 

@@ -135,7 +135,7 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
         (["chooser={}:Straight"], "this is no chooser"),
         (["chooser={}:Missing"], "the chooser cannot be loaded"),
         (["chooser=odd_parts:Abstract"], "this chooser lacks choose"),
-        (["chooser=odd_parts:Last"], "of which not all are offered: Last"),
+        (["chooser=odd_parts:Beyond"], "choose gave 4 to 4: Beyond"),
         (["chooser=odd_parts:Forgetful"], "learn gave None: Forgetful"),
         (["network=odd_parts:Values"], "greedy gave float64 (4, 2): Values"),
         (["termination=odd_parts:Counts"], "reached gave int64 (4,): Counts"),
