@@ -248,10 +248,6 @@ def shade(observations: Any, labels: Any, unlabelled: Any, members: int, seed: i
     return np.arange(1, members + 1)[:, None] * (brightness - brightness.mean())
 
 
-def alike(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
-    return [[1.0] * len(unlabelled)] * members
-
-
 def turned(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
     return np.ones((len(unlabelled), members))
 
