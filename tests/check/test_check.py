@@ -213,6 +213,11 @@ class Detached(nn.Conv2d):
         return super().forward(input).detach()
 
 
+class Lost(nn.Module):
+    def forward(self, features: Tensor) -> Tensor:
+        return features * torch.nan
+
+
 def convolution(*others: nn.Module, kind: type[nn.Conv2d] = nn.Conv2d) -> nn.Module:
     """An encoder with fresh weights."""
     return nn.Sequential(kind(3, 4, 8, 8), *others, nn.Flatten())
@@ -232,7 +237,7 @@ NETWORK_FAULTS = [
     (drifting, "members", "of one seed differ"),
     (lambda channels: convolution(kind=Detached), "gradients", "0.0.weight gets no gradient"),
     (lambda channels: convolution(nn.Softmax(0)), "answers", "among others differ"),
-    (lambda channels: convolution(nn.Threshold(9.0, torch.nan)), "answers", "probabilities are not finite"),
+    (lambda channels: convolution(Lost()), "answers", "probabilities are not finite"),
     (lambda channels: convolution().double(), "logits", "the network takes no such input: Input type"),
 ]
 

@@ -337,10 +337,10 @@ def test_what_other_recordings_lack_is_one_line(datasets: Path, tmp_path: Path) 
     few, some = (save_minari(tmp_path / f"{count}-v0", count, nested=True) for count in (2, 3))
     for source, rule, key, said in (
         (datasets / "demo.hdf5", "actions", "robot0_eef_pos", "no column with a number for each frame: actions"),
-        (datasets / "takes", "last:3", "top", "There are video"),
+        (datasets / "takes", "last:3", "top", "Its keys are video"),
         (datasets / "takes", "rewards", "video", "There are none"),
         (few, few / "right.csv", "image", "there are no heldout states"),
-        (some, some / "right.csv", "imag", "'imag': episode_0. There are arm/speed, image, task"),
+        (some, some / "right.csv", "imag", "'imag': episode_0. Its keys are arm/speed, image, task"),
         (some, some / "right.csv", "task", "no pictures or numbers 'task'"),
     ):
         refuses(said, "import", source, "--out", tmp_path / "data.h5", "--label", f"a={rule}", "--key", key)
