@@ -75,6 +75,6 @@ class _Network:
         many = ensemble.predict(np.concatenate([self.states] * 40))
         alone = ensemble.predict(self.states[:1])
         worst = np.abs(many[:1] - alone).max()
-        promise(np.isfinite(many).all(), "probabilities are not finite", "Look for NaN or Inf among its features.")
+        promise(np.isfinite(worst), "probabilities are not finite", "Look for NaN or Inf among its features.")
         fault = f"probabilities alone and among others differ by {worst:.2g}"
         promise(worst < CLOSE, fault, "Use layers that act on each state alone, and neither count nor draw.")

@@ -129,7 +129,8 @@ def message(error: BaseException) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno:
         where = f": {error.filename}" if error.filename else ""
         return f"{error.strerror}{where}. {REMEDIES.get(error.errno, '--debug shows more.')}", 2
-    return f"internal error: {_line(error)}. Run again with --debug for the traceback.", 1
+    own = " Code of your own is in use: 'hypogoal check' looks at it." if _allowed else ""
+    return f"internal error: {_line(error)}.{own} Run again with --debug for the traceback.", 1
 
 
 def _line(error: BaseException) -> str:

@@ -233,6 +233,7 @@ SHARED = convolution()
 NETWORK_FAULTS = [
     (None, "logits", "cannot be loaded"),
     (lambda channels: nn.Sequential(nn.Threshold(0.5, 0.0, True), convolution()), "logits", "changes its input"),
+    (lambda channels: nn.Sequential(nn.ReLU(inplace=True), convolution()), "logits", "changes its input"),
     (lambda channels: SHARED, "logits", "two members share weights"),
     (drifting, "members", "of one seed differ"),
     (lambda channels: convolution(kind=Detached), "gradients", "0.0.weight gets no gradient"),
