@@ -38,11 +38,7 @@ from hypogoal.observations import (
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
-LEAST = {
-    "doorkey": 41,
-    "montezuma": 36,
-    "tiles": 24,
-}  # pixels of a picture's shorter side; the first that fits
+LEAST = {"doorkey": 41, "montezuma": 36, "tiles": 24}  # pixels of a picture's shorter side
 OTHERWISE = "mlp"
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
