@@ -33,12 +33,12 @@ def check_part(setting: str, name: str, domain: Domain | None = None, seed: int 
     It is played for some steps, in DoorKey by default, beside built-in parts. Four options aim at made-up sub-goals,
     each of which holds in a third of the states.
     """
-    laws = [_Played.plays, _Played.again, _Played.resumes, _Played.is_kept]
-    return verdicts(laws, _Played(setting, name, domain or load_domain("doorkey"), seed))
+    laws = [_PlayedPart.plays, _PlayedPart.again, _PlayedPart.resumes, _PlayedPart.is_kept]
+    return verdicts(laws, _PlayedPart(setting, name, domain or load_domain("doorkey"), seed))
 
 
 @dataclass
-class _Played:
+class _PlayedPart:
     """A part by its setting and name, and where it is played."""
 
     setting: str
