@@ -31,10 +31,9 @@ from hypogoal.options.loop import OptionLoop
 from hypogoal.options.tables import Exploits
 from hypogoal.options.termination import Terminations, load_rule
 
-BEFORE, MENDED, SEARCH = POLICIES = ("before", "mended", "search")
+BEFORE, MENDED = POLICIES = ("before", "mended")
 CELL = 8  # of positions that count as one place
 FILMS = 4  # kinds that are shown
-NEVER = -100.0  # log-odds
 RANDOM_STEPS = 4_000  # of random play
 DECIMALS = 6  # of a threshold, which float32 log-odds round
 
@@ -42,23 +41,15 @@ DECIMALS = 6  # of a threshold, which float32 log-odds round
 def terminations_of(
     classifier: Classifier,
     member: int,
-    column: int,
     policies: Mapping[str, float],
     setup: Setup,
     engine: Engine,
 ) -> Terminations:
-    """Options that end at a member's positives, one for each policy's threshold.
-
-    That of the policy ``search`` ends at false positives alone, where sub-goal number ``column`` does not hold.
-    """
-    names = [*policies]
+    """Options that end at a member's positives, one for each policy's threshold."""
 
     def log_odds(ids: Ints) -> Floats:
         of_members = classifier.log_odds(engine.images(ids))
-        every = of_members[:, [member] * len(names)].astype(np.float32)
-        if SEARCH in names:
-            every[engine.labels(ids)[:, column], names.index(SEARCH)] = NEVER
-        return every
+        return of_members[:, [member] * len(policies)].astype(np.float32)
 
     if engine.observation_dtype != PICTURE:
         standard = classifier.view.standard if isinstance(classifier, Ensemble) else None
@@ -68,7 +59,7 @@ def terminations_of(
     edges = log_odds_of(np.array([*policies.values()]))
     return rule(
         log_odds,
-        len(names),
+        len(policies),
         None,
         edges.astype(np.float32),
         engine.count,
@@ -94,10 +85,7 @@ def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict
 
 def shares_of(report: Mapping[str, Any]) -> dict[str, float | None]:
     """The shares of false positives: of the last executions of policies, of the states that random play met."""
-    shares = {"policy": report[BEFORE]["fires_far"]}
-    if report[SEARCH]:
-        shares["search"] = report[SEARCH]["fires_far"]
-    return {**shares, "play": report["random_play"]["false_positives"]}
+    return {"policy": report[BEFORE]["fires_far"], "play": report["random_play"]["false_positives"]}
 
 
 def findings(

@@ -135,4 +135,3 @@ class AuditConfig(PracticeConfig):
         high=1.0,
     )
     mend: float = setting(0.95, "a second policy learns against this higher threshold; 0: none", low=0.0, high=1.0)
-    search: bool = setting(False, "a further policy is paid for false positives alone: can any be reached?")

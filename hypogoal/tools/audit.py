@@ -22,7 +22,7 @@ FAILED = 3
 
 @stage(
     "audit ensemble --domain doorkey --sub-goal go-to-goal --out audit",
-    often=["steps", "layout_seed", "option_timeout", "mend", "search"],
+    often=["steps", "layout_seed", "option_timeout", "mend"],
 )
 def audit(
     call: Call,
@@ -97,7 +97,7 @@ def _in_play(
     inputs = [source.path] if source else []
     try:
         with call.training("audit", settings, inputs, config.steps) as work:
-            ends = partial(played.terminations_of, audited, member, column, policies)
+            ends = partial(played.terminations_of, audited, member, policies)
             loop = assemble(setup, ends)
             agents.learn(work, setup, loop, config.steps)
             files = work.draft.files
@@ -121,8 +121,6 @@ def _policies(config: Any, threshold: float) -> dict[str, float]:
     policies = {"before": threshold}
     if config.mend:
         policies["mended"] = config.mend
-    if config.search:
-        policies["search"] = threshold
     if 0 < config.mend <= threshold:
         fault = f"mend must be above the threshold {threshold:g}"
         raise UserError(fault, f"mend={config.mend:g}", "Give a higher one, or 0.")
