@@ -62,27 +62,26 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
         "how": attributions.method,
         "completeness_error": error.max(),
     }
+    looked_at["sub_goals"][sub_goal] = facts
     values: Any = attributions.values
-    arrays = {}
+    group = work.arrays.create_group(f"saliency/{sub_goal}")
     if are_pictures:
         default = 3 if dataset.observation_shape[-1] == 3 else 1
         facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
         facts["places"] = [place_of(split.origins, state) for state in states]
-        arrays = {
-            "observations": observations[states],
-            "labels": split.labels[states],
-            "probabilities": judgement.judged.probabilities[states],
-            "predictions": judgement.judged.predictions[states],
-            "seen": seen,
-        }
+        group["observations"] = observations[states]
+        group["labels"] = split.labels[states]
+        group["probabilities"] = judgement.judged.probabilities[states]
+        group["predictions"] = judgement.judged.predictions[states]
+        group["seen"] = seen
     else:
         facts["features"] = dataset.features()
         values = of_features(values.reshape(*error.shape, -1), seen.dtype)
-    looked_at["sub_goals"][sub_goal] = facts
-    group = work.arrays.create_group(f"saliency/{sub_goal}")
-    for name, array in arrays.items():
-        group[name] = array
-    group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
+    group.create_dataset(
+        "attributions",
+        data=values.astype(np.float32),
+        compression="gzip",
+    )
     for row, kind in enumerate(kinds):
         columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
         yield tidy_members(columns, **place, scope=f"state: {kind}")

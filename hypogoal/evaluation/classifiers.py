@@ -8,7 +8,11 @@ import numpy as np
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
-from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, read_ensemble
+from hypogoal.hypotheses.ensemble import (
+    THRESHOLD,
+    Ensemble,
+    read_ensemble,
+)
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.observations import Observations
 
@@ -46,7 +50,11 @@ class OwnClassifier:
 Classifier = Ensemble | OwnClassifier
 
 
-def classifier_of(name: str, sub_goal: str, device: str) -> tuple[Classifier, Artefact | None]:
+def classifier_of(
+    name: str,
+    sub_goal: str,
+    device: str,
+) -> tuple[Classifier, Artefact | None]:
     """The members of an ensemble artefact, and that, or code of the user's own; anything else is a ``UserError``."""
     if ":" in name and not Path(name).is_dir():
         return OwnClassifier(name), None

@@ -90,7 +90,11 @@ def between(
     return "" if pd.isna(low) else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
 
 
-def mean(row: Any, digits: int = 2, scale: float = 1.0) -> str:
+def mean(
+    row: Any,
+    digits: int = 2,
+    scale: float = 1.0,
+) -> str:
     """The mean."""
     return fixed(row["mean"], digits, scale)
 
@@ -110,7 +114,11 @@ def spread(
 deviation = partial(spread, error="standard_deviation")  # beside the mean the standard deviation over seeds
 
 
-def bounded(row: Any, digits: int = 2, scale: float = 1.0) -> str:
+def bounded(
+    row: Any,
+    digits: int = 2,
+    scale: float = 1.0,
+) -> str:
     """The mean or the interquartile mean, whichever the 95 % interval beside it is of."""
     value = row["mean"] if row["units"] < BOOTSTRAP_FROM else row["iqm"]
     bounds = between(row["low"], row["high"], digits, scale)

@@ -12,9 +12,17 @@ from PIL import Image
 
 from hypogoal.core.arrays import Bytes, Doubles
 from hypogoal.core.errors import UserError
-from hypogoal.data import SPLITS, States, open_dataset
+from hypogoal.data import (
+    SPLITS,
+    States,
+    open_dataset,
+)
 from hypogoal.evaluation.plots import BLUE, VERMILLION
-from hypogoal.observations import PICTURE, fields_of, spread_rows
+from hypogoal.observations import (
+    PICTURE,
+    fields_of,
+    spread_rows,
+)
 
 MOST_SIDE = 128  # pixels of a picture on the page
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION], N=25)  # few: small files
@@ -27,13 +35,19 @@ GAP = 2  # pixels around each state
 PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
 
 
-def last_frame(values: Any, colours: int | None = None) -> Any:
+def last_frame(
+    values: Any,
+    colours: int | None = None,
+) -> Any:
     """Of pictures (..., C) the last frame's channels, so many ``colours``: by default 3 where C is 3, else 1."""
     default = 3 if values.shape[-1] == 3 else 1
     return values[..., -(colours or default) :]
 
 
-def coloured(observations: Bytes, colours: int | None = None) -> Bytes:
+def coloured(
+    observations: Bytes,
+    colours: int | None = None,
+) -> Bytes:
     """Observations (..., C) as they are shown, (..., 3): of the last frame."""
     shown: Bytes = last_frame(observations, colours)
     return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
@@ -100,7 +114,10 @@ def overlay(states: Bytes) -> Bytes:
     return laid_over.round().astype(np.uint8)
 
 
-def write_sheets(path: Path, folder: Path) -> list[Path]:
+def write_sheets(
+    path: Path,
+    folder: Path,
+) -> list[Path]:
     """Draw a data file's labelled and held-out states, a picture for each room and label, to check labels by eye.
 
     The files are ``labelled/SUB_GOAL/room-01-positives.png`` and so on in ``folder``. A path that is no data file and

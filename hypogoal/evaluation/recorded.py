@@ -79,7 +79,7 @@ def findings_of(classifier: Classifier, dataset: Dataset, sub_goal: str) -> Find
         failures.append((known.observations[worst], known_scores[worst]))
 
     positive = scores[compared] > thresholds
-    disagree = positive.any(axis=1) & ~positive.all(axis=1)
+    disagree = positive.any(axis=1) != positive.all(axis=1)
     numbers = {
         "sub_goal": sub_goal,
         "known": len(known.labels),
