@@ -24,17 +24,16 @@ from hypogoal.evaluation.page import (
     Drawn,
     Results,
     draw_page,
+    lines_of,
+    listed,
     section,
 )
 from hypogoal.evaluation.provenance import domains_of, settings_of
-from hypogoal.evaluation.questions import (
-    lines_of,
-    name_of,
-    paired_runs,
-)
+from hypogoal.evaluation.questions import name_of, paired_runs
 
 Runs = Mapping[str, Results]  # by a run's label
 QUESTIONS = (curves, hypotheses, rooms, distance)
+FIRST = 4  # lines that the page begins with
 
 
 def labels_of(paths: Sequence[str]) -> list[str]:
@@ -113,7 +112,6 @@ def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[st
         tables[name] = pd.concat(of_runs).sort_values(question.BY, kind="stable")
     context = {
         "paths": paths,
-        "domains": domains_of(first),
         "first": label,
         "results": first,
         "titles": titles,
@@ -123,15 +121,14 @@ def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[st
     }
     part = section("compared", context)
     title = f"hypogoal: {len(runs)} runs compared"
-    return (
-        draw_page(
-            title,
-            [("compared", "What is compared", part, False)],
-            "page.html",
-        ),
-        figures,
-        tables,
+    page = draw_page(
+        title,
+        [("compared", "What is compared", part, False)],
+        "lines.html",
+        about=listed(domains_of(first)),
+        lines=winners(tables["pairs"])[:FIRST],
     )
+    return page, figures, tables
 
 
 def _curves(runs: Runs) -> Iterator[Drawn]:

@@ -21,9 +21,7 @@ from hypogoal.evaluation.house import (
 from hypogoal.evaluation.page import Drawn, Results
 from hypogoal.evaluation.plots import (
     DOTTED,
-    banded,
     legend_below,
-    looks,
     plot,
     styled,
 )
@@ -202,12 +200,20 @@ def learning_curves(
     unit = "layout" if drawn["layout"].nunique() > 1 else "artefact"
     with styled():
         figure, axes = plot(2.9)
-        for method, look in looks(drawn["method"]).items():
-            rows = drawn[drawn["method"] == method]
+        for method, rows in drawn.groupby("method", sort=False):
             values = rows.pivot_table(index="step", columns=unit, values="value", dropna=False)
-            values.index = values.index.astype(float) / 1000
-            banded(axes, values.mean(axis=1), values.sem(axis=1), label=method, **look)
+            steps = values.index.astype(float) / 1000
+            middle, wide = values.mean(axis=1), values.sem(axis=1)
+            [line] = axes.plot(steps, middle, label=method)
+            axes.fill_between(
+                steps,
+                middle - wide,
+                middle + wide,
+                color=line.get_color(),
+                alpha=0.18,
+                linewidth=0,
+            )
         axes.axhline(reference, **DOTTED)
         axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
-        legend_below(figure, [axes], 2)
+        legend_below(figure, 2)
     return figure

@@ -225,7 +225,8 @@ def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, pd.DataFr
             product(options.items(), shown),
             strict=True,
         ):
-            plots.show_picture(place, rooms[str(room)], f"{method}\nroom {room}")
+            name = method if room == shown[0] else ""
+            plots.show_picture(place, rooms[str(room)], f"{name}\nroom {room}")
             for fate, (label, marker, colour) in FATES.items():
                 inside = stops[(stops["room"] == room) & (stops["fate"] == fate)]
                 place.scatter(
@@ -236,5 +237,5 @@ def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, pd.DataFr
                     label=label,
                     alpha=0.75,
                 )
-        plots.legend_below(figure, places, 3)
+        plots.legend_below(figure, 3)
     return figure

@@ -2,14 +2,11 @@
 
 import io
 import re
-from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from hashlib import blake2b
-from itertools import cycle
 from typing import Any
 
 import matplotlib.style
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -19,7 +16,6 @@ INK = "#24272b"
 BLUE, VERMILLION, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, ORANGE, SKY, GREY = "#cc79a7", "#e69f00", "#56b4e9", "#808890"
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)  # of methods; grey is for what is no method
-STYLES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))  # of lines; dotted is what is no method
 WIDTH = 5.6  # inches; readable on a phone, where it is scaled to the screen
 # Formats of files, and what they would say of when and by what they were written.
 UNDATED = {
@@ -45,56 +41,18 @@ def plot(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
     return figure, figure.subplots()
 
 
-def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Each method's colour and line."""
-    distinct = dict.fromkeys(methods)
-    kinds = zip(distinct, cycle(PALETTE), cycle(STYLES))
-    return {method: {"color": colour, "linestyle": style} for method, colour, style in kinds}
-
-
-def banded(axes: Axes, middle: pd.Series, wide: pd.Series, **look: Any) -> None:
-    """A line against its index with a band around it."""
-    axes.plot(middle.index, middle, **look)
-    axes.fill_between(
-        middle.index,
-        middle - wide,
-        middle + wide,
-        color=look["color"],
-        alpha=0.18,
-        linewidth=0,
-    )
-
-
 def bars(kind: Any, means: Any, height: float, **errors: Any) -> tuple[Figure, Axes]:
     """Bars of each method (a column) side by side at each place (a row), ``bar`` or ``barh``, with their errors."""
     figure, axes = plot(height)
-    means.plot(kind=kind, ax=axes, capsize=3, alpha=0.8, rot=0, legend=False, **errors)
-    legend_below(figure, [axes], 2)
+    means.plot(kind=kind, ax=axes, alpha=0.8, rot=0, legend=False, **errors)
+    legend_below(figure, 2)
     return figure, axes
 
 
-def whiskers(axes: Axes, table: pd.DataFrame, **look: Any) -> None:
-    """The means of a table of :func:`house.over` against its index, with their standard deviations."""
-    wide = table["standard_deviation"].fillna(0)
-    axes.errorbar(
-        table.index,
-        table["mean"],
-        yerr=wide,
-        marker="o",
-        markersize=4,
-        alpha=0.8,
-        **look,
-    )
-
-
-def legend_below(
-    figure: Figure,
-    axes: Sequence[Axes],
-    columns: int,
-) -> None:
+def legend_below(figure: Figure, columns: int) -> None:
     """A legend under the plots, each label once; the figure becomes higher by its lines."""
     by_label: dict[str, Any] = {}
-    for place in axes:
+    for place in figure.axes:
         handles, labels = place.get_legend_handles_labels()
         by_label |= zip(labels, handles, strict=True)
     if max(map(len, by_label), default=0) > 80 // columns:

@@ -172,13 +172,7 @@ def summary(results: Results, every: list[Context]) -> Group:
 
 def sentences(results: Results) -> list[str]:
     """The verdict, a sentence a line."""
-    return lines_of("verdict.txt", verdict.context(results))
-
-
-def lines_of(template: str, context: Context) -> list[str]:
-    """What a template of lines says."""
-    text = page.templates().get_template(template).render(context)
-    return [line for line in text.splitlines() if line]
+    return page.lines_of("verdict.txt", verdict.context(results))
 
 
 def render(results: Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
@@ -204,4 +198,4 @@ def captions(every: Iterable[Context]) -> dict[str, tuple[Drawn, str]]:
 
 def not_drawn(names: Iterable[str]) -> list[str]:
     """A line for each of the paper's Figures 2 to 9 that is not among a run's figures."""
-    return lines_of("needed.txt", {"drawn": [name.partition("-")[0] for name in names]})
+    return page.lines_of("needed.txt", {"drawn": [name.partition("-")[0] for name in names]})

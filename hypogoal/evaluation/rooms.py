@@ -81,15 +81,24 @@ def scores_over_groups(table: pd.DataFrame) -> Figure:
     never = table[table["quantity"] == NEVER].drop_duplicates("N").set_index("N")["mean"]
     with plots.styled():
         figure = Figure(figsize=(plots.WIDTH, 4.55))
-        axes = [*figure.subplots(2, 2, sharex=True, sharey=True).flat]
+        axes = figure.subplots(2, 2, sharex=True, sharey=True).flat
         for place, (quantity, title) in zip(axes, PANELS.items(), strict=True):
             shown = table[table["quantity"] == quantity].set_index("N")
-            for method, look in plots.looks(table["method"]).items():
-                plots.whiskers(place, shown[shown["method"] == method], label=method, **look)
+            for method in table["method"].unique():
+                rows = shown[shown["method"] == method]
+                place.errorbar(
+                    rows.index,
+                    rows["mean"],
+                    yerr=rows["standard_deviation"].fillna(0),
+                    label=method,
+                    marker="o",
+                    markersize=4,
+                    alpha=0.8,
+                )
             blind = never if quantity.startswith("accuracy") else never * 0 + 0.5
             place.plot(blind.index, blind, **plots.DOTTED, marker=".")
             place.set_title(title, fontsize=9.5)
             place.set(xlabel="labelled groups, N", ylabel="fraction", xticks=sorted(never.index))
             place.label_outer()
-        plots.legend_below(figure, axes, 3)
+        plots.legend_below(figure, 3)
     return figure

@@ -152,8 +152,6 @@ def bars_of_features(attributions: Floats, names: Sequence[str]) -> Figure:
     sizes = pd.DataFrame(np.abs(attributions).mean(axis=0).T, index=[*names]).add_prefix("member ")
     most = sizes.mean(axis=1).nlargest(MOST_BARS).index
     with plots.styled():
-        figure, axes = plots.plot(0.7 + 0.35 * len(most))
-        sizes.loc[most[::-1]].plot.barh(ax=axes, width=0.8, legend=False)
+        figure, axes = plots.bars("barh", sizes.loc[most[::-1]], 0.7 + 0.35 * len(most))
         axes.set_xlabel("mean absolute attribution, log-odds")
-        plots.legend_below(figure, [axes], 4)
     return figure

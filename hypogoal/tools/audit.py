@@ -178,7 +178,7 @@ def _on_recorded_data(
             progress.advance()
         lines = page.lines_of("audited.txt", {"parts": parts})
         title = f"hypogoal: audit of {Path(source).name}"
-        text = page.draw_page(title, sections, "audit.html", lines=lines)
+        text = page.draw_page(title, sections, "lines.html", lines=lines, about="recorded data")
         (draft.files / "index.html").write_text(text, encoding="utf-8")
         (draft.files / REPORT).write_text(as_json({"sub_goals": parts}) + "\n", encoding="utf-8")
     shares = []
