@@ -26,7 +26,6 @@ from hypogoal.evaluation.page import (
     draw_page,
     lines_of,
     listed,
-    section,
 )
 from hypogoal.evaluation.provenance import domains_of, settings_of
 from hypogoal.evaluation.questions import name_of, paired_runs
@@ -111,6 +110,9 @@ def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[st
         ]
         tables[name] = pd.concat(of_runs).sort_values(question.BY, kind="stable")
     context = {
+        "name": "compared",
+        "title": "What is compared",
+        "folded": False,
         "paths": paths,
         "first": label,
         "results": first,
@@ -119,11 +121,9 @@ def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[st
         "figures": [],
         "curves": figures,
     }
-    part = section("compared", context)
-    title = f"hypogoal: {len(runs)} runs compared"
     page = draw_page(
-        title,
-        [("compared", "What is compared", part, False)],
+        f"hypogoal: {len(runs)} runs compared",
+        [context],
         "lines.html",
         about=listed(domains_of(first)),
         lines=winners(tables["pairs"])[:FIRST],

@@ -239,23 +239,21 @@ def module(name: str, context: Mapping[str, Any]) -> Any:
     return templates().get_template(f"{name}.html").make_module(dict(context))
 
 
-def caption(words: Any, drawn: Drawn) -> str:
-    """A figure's caption, a macro in its question's template, see :func:`module`."""
-    return " ".join(Markup(words.caption(drawn)).unescape().split())
-
-
 def draw_page(
     title: str,
-    sections: Sequence[tuple[str, str, Markup, bool]],
+    sections: Sequence[Mapping[str, Any]],
     template: str,
     **lead: Any,
 ) -> str:
-    """Sections (id, title, part, folded) as one HTML file that needs nothing else; ``lead``: what stands above them."""
-    version = versions().get("hypogoal", "unknown")
+    """One HTML file that needs nothing else; ``lead``: what stands above its sections.
+
+    A section is what its template is given, with ``name``, its id, ``title``, and whether it is ``folded``;
+    ``template``: where that is not called as the section.
+    """
     context = {
         "title": title,
         "sections": sections,
-        "version": version,
+        "version": versions().get("hypogoal", "unknown"),
     }
     return templates().get_template(template).render(context | lead)
 

@@ -177,10 +177,7 @@ def sentences(results: Results) -> list[str]:
 
 def render(results: Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
     """Spec F7: the page of a run, self-contained, with the figures of drawn :func:`answers`."""
-    sections = []
-    for context in sorted(every, key=lambda context: context["folded"]):  # what is open comes first
-        part = page.section(context["name"], context)
-        sections.append((context["name"], context["title"], part, context["folded"]))
+    sections = sorted(every, key=lambda context: context["folded"])  # what is open comes first
     lead = verdict.context(results)
     lead |= {"sentences": sentences(results), "films": films, "domains": provenance.domains_of(results)}
     return page.draw_page(f"hypogoal: {results.facts['run']}", sections, "run.html", **lead)
@@ -192,7 +189,8 @@ def captions(every: Iterable[Context]) -> dict[str, tuple[Drawn, str]]:
     for context in every:
         words = page.module(context["name"], context | {"figures": []})
         for figure in context["figures"]:
-            by_name[figure.name] = figure, page.caption(words, figure)
+            caption = words.caption(figure).unescape()
+            by_name[figure.name] = figure, " ".join(caption.split())
     return by_name
 
 

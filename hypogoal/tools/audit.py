@@ -173,8 +173,8 @@ def _on_recorded_data(
             findings = recorded.findings_of(classifier, dataset, goal)
             recorded.write_next(draft.files / "next" / goal, COLUMNS, findings)
             parts.append(findings.numbers)
-            section = page.section("audited", vars(findings))
-            sections.append((slug(goal), goal, section, False))
+            heading = {"name": slug(goal), "title": goal, "template": "audited", "folded": False}
+            sections.append(heading | vars(findings))
             progress.advance()
         lines = page.lines_of("audited.txt", {"parts": parts})
         title = f"hypogoal: audit of {Path(source).name}"
