@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from command_line import settings
 from corridor import Corridor
-from test_examples import settings
 from torch import Tensor
 
 import hypogoal
 from examples import distilled
-from examples.distilled import FINAL, PLANNED, VISITED, Deep, Grid, Learner
+from examples.distilled import Learner
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
@@ -30,7 +30,6 @@ from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.parts import Ids
-from hypogoal.options.planned import FAR, PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
 
@@ -92,50 +91,6 @@ def test_options_carry_over_to_layouts_that_nobody_played() -> None:
     assert distilled_options.mean() > 2 * random_actions.mean()
 
 
-def test_what_it_learns_are_the_plans_best_actions() -> None:
-    """In every state of every layout played, all actions that a planned option may begin a shortest way with."""
-    loop = loop_of(DoorKeyEngine(layouts(3, 5), 8))
-    learner = loop.learner
-    assert isinstance(learner, Learner)
-    for _ in range(30):
-        loop.step()
-    for seed in (3, 5):
-        engine = DoorKeyEngine(seed)
-        ends = oracle_terminations(engine, range(GOALS))
-        planned = PlannedLearner(engine, ends, TrainOptionsConfig(network="planned"), 0)
-        theirs = engine.plan()
-        ours = learner.engine.plan(np.array([loop.engine._start(seed)]))
-        assert len(ours.ids) == len(theirs.ids)
-        place = {row.tobytes(): number for number, row in enumerate(engine.codes(theirs.ids))}
-        same = np.array([place[row.tobytes()] for row in learner.engine.codes(ours.ids)])
-        ahead = planned.steps[planned._after[same]]  # (n, A, O)
-        nearest = ahead.min(1)
-        wanted = (ahead == nearest[:, None]) & (nearest < FAR)[:, None]
-        bits = learner.best[ours.ids].astype(np.int64)[:, None] >> learner.actions[:, None] & 1
-        assert np.array_equal(bits.astype(bool), wanted)
-        assert np.array_equal(learner.kind[ours.ids] == FINAL, ours.final)
-        assert (learner.kind[ours.ids[~ours.final]] >= PLANNED).all()
-    assert 0 < (learner.kind == VISITED).sum() < (learner.kind >= PLANNED).sum() / 4
-
-
-def test_while_it_learns_its_plan_plays_and_afterwards_its_network() -> None:
-    """Three tenths of the actions are random, which may be best by luck; then play needs no plan at all."""
-    loop = loop_of(DoorKeyEngine(layouts(3, 5, 7), 8))
-    learner, best = loop.learner, []
-    for _ in range(200):
-        loop._choose()
-        ids, options = loop.engine.ids.copy(), loop.option.copy()
-        moved = loop.advance()
-        chosen = learner.best[ids, options] >> moved.actions & 1
-        best += chosen[learner.best[ids, options] > 0].tolist()
-    assert 0.7 < np.mean(best) < 0.85
-    fresh = loop_of(DoorKeyEngine(layouts(11), 8))
-    fresh.learner.load(learner.state())
-    for _ in range(30):
-        assert fresh.step() == {}
-    assert len(fresh.learner.kind) == 0
-
-
 def test_it_goes_on_where_it_was() -> None:
     """Spec G1: the same weights as without a break."""
     whole, begun, resumed = (loop_of(DoorKeyEngine(layouts(3, 5), 8)) for _ in range(3))
@@ -156,27 +111,6 @@ def test_it_needs_a_model() -> None:
     config = TrainOptionsConfig.of(network="examples.distilled:Learner")
     with pytest.raises(UserError, match=r"does not know what each action leads to: network=examples.distilled:Learner"):
         Learner(engine, oracle_terminations(engine, (0,)), config, seed=0)
-
-
-def test_the_grid_has_one_rule_for_all_places() -> None:
-    """What it makes of a cell depends on the cells within two of it, wherever they are."""
-    torch.manual_seed(0)
-    pictures, tile = torch.zeros(3, 3, 80, 88), torch.rand(3, 8, 8)
-    pictures[1, :, 32:40, 32:40], pictures[2, :, 40:48, 48:56] = tile, tile
-    plain, first, second = Grid((80, 88, 3))(pictures).view(3, 16, 10, 11)
-    changed = (first - plain).abs().amax(0) > 0
-    assert changed[2:7, 2:7].sum() > 9 and changed.sum() == changed[2:7, 2:7].sum()
-    torch.testing.assert_close(first[:, 2:7, 2:7], second[:, 3:8, 4:9])
-
-
-def test_deep_sees_all_cells_and_where_they_are() -> None:
-    """What it reads anywhere changes with any cell, and with the place of the same picture."""
-    torch.manual_seed(0)
-    pictures, tile = torch.zeros(3, 3, 80, 88), torch.rand(3, 8, 8)
-    pictures[1, :, 72:, :8], pictures[2, :, 32:40, 32:40] = tile, tile
-    plain, corner, middle = Deep((80, 88, 3))(pictures)
-    assert len(plain) == 24 * 5
-    assert not torch.allclose(plain, corner, atol=1e-3) and not torch.allclose(corner, middle, atol=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore:a masked option runs")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import csv
 import json
 import runpy
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from command_line import fails, run, settings
 from openings import agrees
 from PIL import Image
 from safetensors.torch import load_file
@@ -37,20 +37,6 @@ def in_the_examples_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
 
 
-def code_lines(path: Path) -> int:
-    """Lines of a module that are neither empty nor comments nor docstrings."""
-    text = path.read_text(encoding="utf-8")
-    lines = {number for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"}
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            lines -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return len(lines)
-
-
-def settings(*pairs: str) -> list[str]:
-    return [word for pair in pairs for word in ("--set", pair)]
-
-
 LAYOUTS = settings("labelled_seeds=0", "unlabelled_seeds=1", "heldout_seeds=2", "steps=600")
 PLAY = settings("steps=240", "environments=2", "warm_up=50", "layout_seed=0", "max_episode_steps=60")
 SHORT = {  # appended to the page's commands, so that they end in seconds
@@ -72,7 +58,7 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
     page = EXAMPLES.parent / "docs" / "own-domain.md"
     example = EXAMPLES / "unlock_pickup.py"
     assert blocks(page, "python")[0] == example.read_text(encoding="utf-8")
-    assert code_lines(example) < MOST_LINES
+    assert len(example.read_text(encoding="utf-8").splitlines()) < MOST_LINES
     for name in ("unlock_pickup.py", "margin.py", "wide_network.py"):
         (tmp_path / name).write_bytes((EXAMPLES / name).read_bytes())
     monkeypatch.chdir(tmp_path)
@@ -111,10 +97,7 @@ def test_the_example_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_the_audits_page_audits_its_classifier(tmp_path: Path) -> None:
-    """Spec H5: the page's command, on the shortest ways instead of learned ones, fools the classifier as the page says.
-
-    The film in the page is the one that the command makes.
-    """
+    """Spec H5: the page's command, on shortest ways instead of learned ones, fools the classifier as in its film."""
     page = EXAMPLES.parent / "docs" / "audit.md"
     words = commands(page)[0]
     out = tmp_path / "audit"
@@ -123,66 +106,44 @@ def test_the_audits_page_audits_its_classifier(tmp_path: Path) -> None:
     report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
     assert (report["before"]["fires_far"], report["mended"]["fires_far"]) == (1.0, 0.0)
     assert [kind["holds"] for kind in report["before"]["kinds"]] == [[]]
-    film = page.with_name("audit.gif")
-    assert film.stat().st_size < 300_000
-    with Image.open(film) as shown, Image.open(out / "before-1.gif") as made:
+    with Image.open(page.with_name("audit.gif")) as shown, Image.open(out / "before-1.gif") as made:
         assert shown.n_frames == made.n_frames == 4
-    with (page.parent / "results" / "audit-layouts.csv").open(newline="", encoding="utf-8") as file:
-        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-    assert len(rows) == 20 and all(row["executions"] == row["mended_executions"] == 100 for row in rows)
-    fooled = [f"{row['layout']:.0f}" for row in rows if row["fooled"] == 100]
-    assert f"On layouts {', '.join(fooled[:-1])} and {fooled[-1]} every" in page.read_text(encoding="utf-8")
-    assert sum(row["there"] for row in rows) == 1_600 and {row["mended_there"] for row in rows} == {100}
 
 
 @pytest.mark.slow
-def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_vector_goals_goes_through_all_stages(tmp_path: Path) -> None:
     """Spec B6: observations that are a dictionary of numbers; what is of pictures only is left out, or refused."""
-    example = EXAMPLES / "vector_goals.py"
-    text = example.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= (110 if "hypogoal run examples" in text else 40)
-    run = tmp_path / "run"
-    data, ensemble, options, meta = (str(run / name) for name in ("data.h5", "ensemble", "options", "meta"))
+    folder = tmp_path / "run"
+    data, ensemble, options, meta = (folder / name for name in ("data.h5", "ensemble", "options", "meta"))
     play = settings("steps=2500", "environments=4", "warm_up=200", "layout_seed=0")
     few = settings("unlabelled_seeds=1", "heldout_seeds=2")
-    for words in (
-        ["collect", "vector_goals:DOMAIN", "--out", data, *few],
-        ["train-ensemble", data, "--out", ensemble, *settings("members=2", "workers=1")],
-        ["train-options", ensemble, "--out", options, *play, *settings("save_visited=50")],
-        ["train-meta", ensemble, "--out", meta, "--options", options, *play],
-        ["train-baseline", "vector_goals:DOMAIN", "--out", str(run / "ppo"), "--data", data, *settings("steps=600")],
-        ["evaluate", str(run)],
-        ["report", str(run)],
-    ):
-        assert main([*words, "-q"] if words[0] != "report" else words) == 0, words
-    assert main(["verify", str(run)]) == 0
-    config = json.loads((run / "ensemble" / "manifest.json").read_text(encoding="utf-8"))["config"]
+    run("collect", "vector_goals:DOMAIN", "--out", data, "-q", *few)
+    run("train-ensemble", data, "--out", ensemble, "-q", *settings("members=2", "workers=1"))
+    run("train-options", ensemble, "--out", options, "-q", *play, *settings("save_visited=50"))
+    run("train-meta", ensemble, "--out", meta, "--options", options, "-q", *play)
+    run("train-baseline", "vector_goals:DOMAIN", "--out", folder / "ppo", "--data", data, "-q", "--steps", 600)
+    run("evaluate", folder, "-q")
+    run("report", folder)
+    run("verify", folder)
+    config = json.loads((ensemble / "manifest.json").read_text(encoding="utf-8"))["config"]
     assert [config[key] for key in ("network", "observation_shape", "observation_dtype")] == ["mlp", [6], "float32"]
-    page = (run / "report" / "index.html").read_text(encoding="utf-8")
-    assert 'id="figure-features' in page
-    drawn = "".join(path.read_text(encoding="utf-8") for path in (run / "report" / "figures").glob("features*.svg"))
+    page = (folder / "report" / "index.html").read_text(encoding="utf-8")
+    assert 'id="figure-features' in page and "States to look through" not in page
+    drawn = "".join(path.read_text(encoding="utf-8") for path in (folder / "report/figures").glob("features*.svg"))
     assert "position[0]" in drawn and "held[1]" in drawn
-    assert not any(text in page for text in ("States to look through", "laid over each other"))
-    agrees(run, OWN_TASK, UNKNOWN)
-    assert open_dataset(run / "options" / "visited.h5").unlabelled().dtype == "float32"
+    agrees(folder, OWN_TASK, UNKNOWN)
+    assert open_dataset(options / "visited.h5").unlabelled().dtype == "float32"
     policies = load_options(options)
     env = OptionEnv(policies.make_env(), policies)
     observation, _ = env.reset(seed=0)
     assert set(observation) == {"position", "key", "held"} and env.action_masks().shape == (4,)
     assert 1 <= env.step(0)[4]["duration"] <= 20
-    capsys.readouterr()
-    for words in (["report", str(run), "--videos", "1", "--force"], ["show", data, "--pictures", str(tmp_path)]):
-        assert main(words) == 2 and "pictures" in capsys.readouterr().err
+    assert "pictures" in fails("report", folder, "--videos", "1", "--force").err
+    assert "pictures" in fails("show", data, "--pictures", tmp_path).err
     for setting in ("network=paper", "meta_network=paper"):
-        assert (
-            main(["train-meta", ensemble, "--out", str(tmp_path / "m"), "-q", *settings(setting, "experience=own")])
-            == 2
-        )
-        assert f"see pictures only: {setting}" in capsys.readouterr().err
-    minari = tmp_path / "played-v0"
-    assert main(["export", meta, "--out", str(minari), "--episodes", "2", "-q"]) == 0
-    space = json.loads(json.loads((minari / "data" / "metadata.json").read_text())["observation_space"])
-    assert (space["dtype"], space["shape"]) == ("float32", [6])
+        own = settings(setting, "experience=own")
+        told = fails("train-meta", ensemble, "--out", tmp_path / "m", "-q", *own)
+        assert f"see pictures only: {setting}" in told.err
 
 
 @pytest.mark.slow
@@ -256,22 +217,3 @@ def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: py
     assert members["best"] > 0.95 and members["worst"] < 0.9
     assert "lamp-on" in Path("runs/lamp/report/index.html").read_text(encoding="utf-8")
     agrees(Path("runs/lamp"), "", "No agent has been trained yet")
-
-
-@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_examples_are_short(example: Path) -> None:
-    """Spec B6: what one reads before one writes one's own; sweeps, figures, a robot and own parts may be longer."""
-    text = example.read_text(encoding="utf-8")
-    longer = {
-        "hypogoal run examples": 110,
-        "robot_bin.py": 150,
-        "robot_bin": 60,
-        "def policy(": 80,
-        "QUESTION = ": 60,
-        "class Frozen": 60,
-        "objectives:ace": 90,
-        "teacher=joint": 350,
-        "class Learner(": 350,
-        "view=one_room": 360,
-    }
-    assert len(text.splitlines()) <= next((lines for word, lines in longer.items() if word in text), 40)

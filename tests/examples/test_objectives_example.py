@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from hypogoal.check.objectives import check_objective
@@ -18,7 +15,6 @@ from hypogoal.diversity import Objective, load_objective
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.scores import mean_disagreement
 from hypogoal.hypotheses.training import train
-from tests.logits import confident, context_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("repulsive", "ace")
@@ -38,46 +34,6 @@ def objective(name: str) -> Objective:
 def test_they_keep_the_laws(name: str) -> None:
     """Spec C1, C2: shapes, empty sets, any order, extreme logits, a gradient for each member."""
     require(check_objective(objective(name)))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_members_that_differ_have_a_lower_loss(name: str) -> None:
-    """Spec C2: on half of the states, against members that are nearly the same."""
-    agreeing = torch.stack([confident(1, 1, 0, 0), confident(1, 1, 0, 0, gap=6.1)])
-    differing = torch.stack([confident(1, 1, 0, 0), confident(1, 0, 1, 0, gap=6.1)])
-    third = confident(0, 0, 0, 0)[None]
-    losses = []
-    for members in (agreeing, differing):
-        context = context_of(3, 4)
-        losses.append(objective(name).loss(replace(context, unlabelled=torch.cat([members, third]))).item())
-    assert losses[1] < losses[0]
-
-
-def test_repulsive_is_the_kernels_own_repulsion() -> None:
-    """Its gradient by one member's gaps is the sum of the kernel's gradients over the kernel's sum."""
-    context = context_of(3, 5)
-    (gradient,) = torch.autograd.grad(objective("repulsive").loss(context).sum(), context.unlabelled)
-    gaps = (context.unlabelled[..., 1] - context.unlabelled[..., 0]).detach()
-    squared = (gaps[:, None] - gaps[None]).square().mean(-1)
-    width = squared[~torch.eye(3, dtype=torch.bool)].median() / math.log(3)
-    kernel = torch.exp(-squared / width)
-    for member in range(3):
-        away = sum(kernel[member, j] * -2 * (gaps[member] - gaps[j]) / 5 / width for j in range(3))
-        torch.testing.assert_close(gradient[member, :, 1], away / kernel[member].sum())
-    assert objective("repulsive").loss(context_of(1)).item() == 0.0
-
-
-def test_ace_asks_for_the_easiest_tenth_only() -> None:
-    """Of 20 states the two cheapest of each direction; the others get no gradient."""
-    generator = torch.Generator().manual_seed(1)
-    logits = torch.randn(2, 20, 2, generator=generator, dtype=torch.float64).requires_grad_()
-    loss = objective("ace").loss(replace(context_of(2, 20), unlabelled=logits)).sum()
-    log = torch.log_softmax(logits.detach(), -1)
-    costs = [-(log[0, :, 1] + log[1, :, 0]), -(log[1, :, 1] + log[0, :, 0])]
-    assert loss.item() == pytest.approx(sum(float(cost.sort().values[:2].mean()) for cost in costs))
-    (gradient,) = torch.autograd.grad(loss, logits)
-    asked = set(costs[0].argsort()[:2].tolist()) | set(costs[1].argsort()[:2].tolist())
-    assert set((gradient.abs().sum((0, 2)) > 0).nonzero().flatten().tolist()) == asked
 
 
 def numbers(easy: NDArray[np.bool_], hard: NDArray[np.bool_], seed: int) -> NDArray[np.float32]:
