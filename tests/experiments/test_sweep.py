@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import random
 import re
 import shutil
 import signal
@@ -74,33 +73,6 @@ def begun(*words: object) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "HYPOGOAL_CHECKPOINT_SECONDS": "0"}
     command = [sys.executable, "-m", "hypogoal", *map(str, words)]
     return subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True, stderr=subprocess.DEVNULL)
-
-
-def test_killed_at_any_moment_it_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    """Spec G1: five cells, killed at random, all processes or the first alone; nothing is made twice."""
-    toy, broken = write_toy(tmp_path / "toy.toml"), tmp_path / "broken"
-    started = time.monotonic()
-    run("run", toy, "--out", tmp_path / "whole", "-q")
-    seconds = time.monotonic() - started
-    rng, killed, before = random.Random(2), 0, dict[str, int]()
-    while killed < 2:
-        process = begun("run", toy, "--out", broken, "-q", "--resume")
-        try:
-            process.wait(rng.uniform(0.2, 0.9) * seconds / 2 + 5.0)
-            shutil.rmtree(broken)  # it came to its end
-        except subprocess.TimeoutExpired:
-            if killed % 2:
-                process.kill()  # its cells go on, and are waited for
-            else:
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-            killed += 1
-            if (broken / "sweep.json").exists():
-                assert not {*before} & {*renewed(before, broken)}
-                before = made(broken)
-    run("run", toy, "--out", broken, "-q", "--resume")
-    assert bytes_of(broken) == bytes_of(tmp_path / "whole")
-    assert {*states(broken).values()} == {"done"} and not list(broken.rglob(".*"))
 
 
 def test_forked_and_fresh_cells_make_the_same_bytes(whole: Path, tmp_path: Path) -> None:
