@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -169,17 +168,6 @@ def test_robomimics_file_is_read(datasets: Path, tmp_path: Path) -> None:
     assert held.dtype.names == ("arm.speed", "robot0_eef_pos") and len(held) == LENGTHS[1] + LENGTHS[4]
 
 
-def test_a_recorder_that_was_killed_is_named(tmp_path: Path) -> None:
-    """Spec G2: HDF5 tells how to clear the mark that it left."""
-    code = (
-        "import h5py, os, sys; f = h5py.File(sys.argv[1], 'w', libver='latest'); f['data/demo_0/obs/x'] = [1.0]; "
-        "f.flush(); os._exit(1)"
-    )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.hdf5")], check=False)
-    command = ["import", tmp_path / "x.hdf5", "--out", tmp_path / "d.h5", "--label", "a=rewards"]
-    refuses(f"one has crashed: h5clear -s {tmp_path / 'x.hdf5'}", *command)
-
-
 def test_minari_is_read(tmp_path: Path) -> None:
     """Spec B6: whole episodes are labelled, unlabelled or held out, the same for the same seed."""
     folder, data = save_minari(tmp_path / "own-v0"), tmp_path / "data.h5"
@@ -238,19 +226,6 @@ def test_a_folder_of_films_is_read(datasets: Path, tmp_path: Path) -> None:
         bright = np.flatnonzero(state[20, :, 0] > 150).mean()
         if label is not None and abs(bright - 31.5) > 0.3:  # half a pixel from the middle
             assert label == (bright > 31.5), bright
-
-
-def test_links_out_of_a_folder_are_followed(datasets: Path, tmp_path: Path) -> None:
-    """Spec I6: as the hub's cache and data-version stores keep files."""
-    cache, snapshot = tmp_path / "blobs", tmp_path / "snapshot"
-    cache.mkdir()
-    for number, file in enumerate(sorted(file for file in (datasets / "v3.0-video").rglob("*") if file.is_file())):
-        shutil.copy(file, cache / str(number))
-        link = snapshot / file.relative_to(datasets / "v3.0-video")
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(os.path.relpath(cache / str(number), link.parent))
-    plain = imported(datasets / "v3.0-video", tmp_path / "plain.h5", *LABEL)
-    np.testing.assert_array_equal(imported(snapshot, tmp_path / "linked.h5", *LABEL).unlabelled(), plain.unlabelled())
 
 
 def test_what_channels_mean_is_kept(tmp_path: Path) -> None:
@@ -331,19 +306,6 @@ def test_what_does_not_fit_is_one_line(datasets: Path, tmp_path: Path, words: st
         (tmp_path / "labels.csv").write_text(words)
         given = ["--label", f"reached={tmp_path / 'labels.csv'}", "--key", STATE]
     refuses(said, "import", datasets / "v3.0-image", "--out", tmp_path / "data.h5", *given)
-
-
-def test_what_other_recordings_lack_is_one_line(datasets: Path, tmp_path: Path) -> None:
-    few, some = (save_minari(tmp_path / f"{count}-v0", count, nested=True) for count in (2, 3))
-    for source, rule, key, said in (
-        (datasets / "demo.hdf5", "actions", "robot0_eef_pos", "no column with a number for each frame: actions"),
-        (datasets / "takes", "last:3", "top", "Its keys are video"),
-        (datasets / "takes", "rewards", "video", "There are none"),
-        (few, few / "right.csv", "image", "there are no heldout states"),
-        (some, some / "right.csv", "imag", "'imag': episode_0. Its keys are arm/speed, image, task"),
-        (some, some / "right.csv", "task", "no pictures or numbers 'task'"),
-    ):
-        refuses(said, "import", source, "--out", tmp_path / "data.h5", "--label", f"a={rule}", "--key", key)
 
 
 def test_the_missing_extra_is_named(datasets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
