@@ -26,8 +26,6 @@ import hypogoal
 from hypogoal.cli import main
 
 CHECKOUT = Path(hypogoal.__file__).parents[1]  # of the code that is run, with its tests and examples
-ROOMS = os.environ.get("ROOMS", "rooms")  # the domain with planted features: which-feature in 0.23.0
-RENAMED = {"which-feature": "rooms"}  # texts in tables: as they will be called
 SEED = 3
 OBJECTIVES = ("dbat", "divdis", "mutual-information", "none")
 DOORKEY_GOALS = ("collect-blue-key", "open-red-door")  # of the options
@@ -125,7 +123,7 @@ def montezuma_data(work: Path) -> Path:
 
 
 def rooms_data(work: Path) -> Path:
-    return made(work / "rooms.h5", "collect", ROOMS, *settings(labelled=64, unlabelled=128))
+    return made(work / "rooms.h5", "collect", "rooms", *settings(labelled=64, unlabelled=128))
 
 
 def vector_data(work: Path) -> Path:
@@ -160,12 +158,10 @@ def number(value: float) -> str:
 
 
 def hashes(data: Path) -> Table:
-    """Each array of an HDF5 file by its sha256, without the column ``draw`` that 0.23.0 alone has."""
+    """Each array of an HDF5 file by its sha256."""
     rows: Table = [("array", "dtype", "shape", "sha256")]
     with h5py.File(data) as file:
         for name, array in sorted(arrays_of(file)):
-            if name.endswith("/origin/draw"):
-                continue
             values = array[()]
             digest = hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
             rows.append((name, str(values.dtype), "x".join(map(str, values.shape)), digest))
@@ -279,7 +275,7 @@ def numbers_of(path: Path) -> Table:
     curves: dict[str, list[tuple[int, str]]] = {}
     for row in rows_of(path):
         value, step = row.pop("value"), row.pop("step")
-        place = " ".join(f"{column}={renamed(text)}" for column, text in row.items() if text)
+        place = " ".join(f"{column}={text}" for column, text in row.items() if text)
         if step:
             curves.setdefault(place, []).append((int(step), value))
         else:
@@ -306,12 +302,6 @@ def thinned(items: list[Any]) -> list[Any]:
         return items
     places = np.linspace(0, len(items) - 1, CURVE_POINTS).astype(int)
     return [items[place] for place in places.tolist()]
-
-
-def renamed(text: str) -> str:
-    for old, new in RENAMED.items():
-        text = text.replace(old, new)
-    return text
 
 
 # Collected states: the same bytes.
@@ -467,7 +457,7 @@ def evaluation_rooms(work: Path) -> Table:
     run = work / "rooms"
     methods = {"dbat": settings(diversity="dbat", members=3), "one": settings(diversity="none", members=1)}
     for seed in range(970, 978):
-        data = made(run / f"data/seed-{seed}.h5", "collect", ROOMS, seed=seed)
+        data = made(run / f"data/seed-{seed}.h5", "collect", "rooms", seed=seed)
         for method, chosen in methods.items():
             words = [*chosen, *settings(steps=100, schedule="simultaneous", workers=1)]
             out = run / f"ensemble/method-{method}-seed-{seed}"
