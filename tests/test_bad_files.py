@@ -105,17 +105,3 @@ def test_a_byte_order_mark_is_read(there: Path, name: str) -> None:
     path = there / name
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     run(*words_for(name, there), *(settings("workers=1") if "preset" in name else []))
-
-
-def test_paths_that_do_not_exist_are_said_to_be_missing(tmp_path: Path) -> None:
-    """Not that they are damaged, or no recording."""
-    for words in (
-        "train-ensemble {0} --out {0}-o",
-        "train-options {0} --out {0}-o",
-        "import {0} --out {0}-o",
-        "evaluate {0}",
-        "show {0}",
-    ):
-        line = refuses("nothing", *words.format(tmp_path / "nothing").split())
-        missing = ("no such", "missing", "no artefact", "does not exist", "nothing to")
-        assert any(text in line.lower() for text in missing), line

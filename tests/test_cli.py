@@ -1,17 +1,11 @@
 """The command line end to end on a toy scale, and each mistake's one line (Spec A1-A8, G2)."""
 
 import json
-import re
-import shutil
 from pathlib import Path
 
 import pytest
 from command_line import refuses, run
 from shared_runs import DOORKEY_RUN, command
-from toy_data import reseal
-
-from hypogoal.core.config import MODELS, described
-from hypogoal.experiments.named import config_class_of
 
 
 def test_steps_of_both_stages_count(tiny_run: Path) -> None:
@@ -55,17 +49,11 @@ def test_what_is_complete_is_kept(tiny_run: Path) -> None:
 
 
 def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
-    """Spec A6, G1: other settings, seeds, inputs and kinds are one line."""
-    made_with = "the complete output was made with"
-    data, ensemble, meta = (tiny_run / name for name in ("data.h5", "ensemble", "meta"))
-    refuses(f"{made_with} seed=0, not 1", *resumed(tiny_run, "data.h5", "--seed", "1"))
+    """Spec A6, G1: by each command; which settings, seeds and inputs differ is the store's to find."""
+    made_with, data = "the complete output was made with", tiny_run / "data.h5"
     refuses(f"{made_with} domain=doorkey, not montezuma", "collect", "montezuma", "--out", data, "--resume")
-    refuses(f"{made_with} diversity=dbat, not none", *resumed(tiny_run, "ensemble", "--diversity", "none"))
-    refuses(f"{made_with} seed=0, not 3", *resumed(tiny_run, "ensemble", "--seed", "3"))
     refuses(f"{made_with} other inputs", *resumed(tiny_run, "ensemble", "--unlabelled", str(data)))
-    refuses("no such file", "train-ensemble", tiny_run / "none.h5", "--out", ensemble, "--resume")
-    refuses("not of kind 'meta'", "train-meta", ensemble, "--out", tiny_run / "options", "--resume")
-    refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", meta, "--resume")
+    refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", tiny_run / "meta", "--resume")
     refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
 
 
@@ -83,16 +71,11 @@ def test_same_seed_same_bytes(tiny_run: Path, tiny_copy: Path, tmp_path: Path) -
         assert any((boards / name).iterdir()), name
 
 
-@pytest.fixture(scope="module")
-def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Where things are that commands are told of: what was made, a damaged file, an artefact to come, nothing."""
-    folder = tmp_path_factory.mktemp("mistakes")
-    (folder / "cut.h5").write_bytes((tiny_run / "data.h5").read_bytes()[:5000])
-    shutil.copytree(tiny_run / "ensemble", folder / "newer")
-    reseal(folder / "newer", format=4)
-    own = {name: folder / name for name in ("newer", "none", "out")}
+@pytest.fixture
+def places(tiny_run: Path, tmp_path: Path) -> dict[str, Path]:
+    """Where things are that commands are told of: what was made, an artefact to come, nothing."""
     made = {"made": tiny_run, "data": tiny_run / "data.h5", "ensemble": tiny_run / "ensemble"}
-    return {**made, **own, "cut": folder / "cut.h5"}
+    return made | {name: tmp_path / name for name in ("none", "out")}
 
 
 @pytest.mark.parametrize(
@@ -102,27 +85,16 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         ("train-ensemble {ensemble} --out {out}", "is a directory"),
         ("train-meta {data} --out {out}", "no artefact here"),
         ("train-meta {made}/options --out {out}", "'options' artefact, but ensemble is needed"),
-        ("train-meta {ensemble} --options {ensemble} --out {out}", "but options is needed"),
         ("train-ensemble {data} --out {ensemble}", "exists already"),
-        ("collect doorkey --out {data}", "exists already"),
         ("train-ensemble {data} --out {data} --force", "would replace an input"),
-        ("train-meta {ensemble} --out {ensemble} --force", "would replace an input"),
-        ("collect doorkey --out {ensemble} --force", "not of kind 'data'"),
-        ("evaluate {ensemble} --out {ensemble} --force", "would replace an input"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
         ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
         ("collect doorkey --out {out} --seed -1", "greater than or equal to 0"),
         ("collect chess --out {out}", "unknown domain: chess"),
         ("collect nosuchmodule:DOMAIN --out {out}", "cannot be loaded"),
-        ("run doorkey --out {out} --preset turbo", "no such preset: turbo"),
-        ("train-meta {ensemble} --out {out} --set steps=0", "value not allowed"),
         ("train-ensemble {data} --out {out} --diversity magic", "magic"),
-        ("train-ensemble {cut} --out {out}", "the data file cannot be read"),
-        ("train-meta {newer} --out {out}", "format: Input should be 3"),
         ("train-meta {ensemble} --out {out} --device tpu", "unknown device"),
-        ("train-meta {ensemble} --options {made}/options --out {out} --layout-seed 3", "layout_seed"),
         ("evaluate {none}", "no such run: "),
-        ("report {none}", "no such run: "),
         ("report {made} --format pdf", "--format is for --figures"),
         ("config bake", "no such stage"),
     ],
@@ -130,15 +102,6 @@ def places(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def test_mistakes(places: dict[str, Path], line: str, words: str) -> None:
     """Spec G2: missing input, wrong kind, unknown names, values out of range: one line, nothing written."""
     refuses(words, *line.format(**places).split())
-
-
-@pytest.mark.parametrize("stage", ["collect", *MODELS, "run"])
-@pytest.mark.parametrize("domain", ["doorkey", "montezuma"])
-def test_sources_of_settings_are_those_that_a_reader_can_look_up(stage: str, domain: str) -> None:
-    """The paper's tables and sections, not numbers of our requirements."""
-    rows = described(config_class_of(stage, domain))
-    assert rows
-    assert not [row["source"] for row in rows if re.search(r"\bSpec\b|\b[A-H][1-9]\b", row["source"])]
 
 
 def test_config_lists_every_setting() -> None:

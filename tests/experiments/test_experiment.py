@@ -11,9 +11,7 @@ from command_line import run
 
 from hypogoal.cells import Cell
 from hypogoal.core import own_code
-from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
-from hypogoal.experiments.named import config_class_of, read_toml
 from hypogoal.experiments.plan import plan
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -233,21 +231,3 @@ def test_the_papers_figures_are_experiments() -> None:
     assert places == {(7, 3), (8, 5)}
     with pytest.raises(UserError, match="10 layouts cannot be paired with 2 seeds"):
         cells_of("figure6", seeds="0,1")
-
-
-def test_settings_of_run_are_the_signatures() -> None:
-    """'hypogoal config run' lists types, defaults, bounds and meanings of the arguments."""
-    rows = {row["name"]: row for row in described(config_class_of("run", "montezuma"))}
-    assert (rows["groups"]["default"], rows["groups"]["allowed"]) == ([1, 2, 3, 7], "1 .. 7")
-    assert rows["methods"]["allowed"] == "dbat|none|cnn" and rows["methods"]["source"] == "Figure 3"
-    assert "workers" in rows and "evaluate" in rows
-    assert {*read_toml(ROOT / "examples" / "sweep-doorkey.toml").model.model_fields} > {"seed", "layout", "members"}
-
-
-@pytest.mark.parametrize(("name", "count"), [("figure6", 133), ("preference", 139), ("choosing_baselines", 23)])
-def test_the_examples_are_experiments(monkeypatch: pytest.MonkeyPatch, name: str, count: int) -> None:
-    """The functions in examples/."""
-    monkeypatch.chdir(ROOT)
-    monkeypatch.syspath_prepend(str(ROOT))
-    own_code.allow([f"examples.{name}:{name}"])
-    assert len(cells_of(f"examples.{name}:{name}")) == count

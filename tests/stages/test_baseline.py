@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from breaking import Breaking, Broken
+from corridor import Corridor
 from gymnasium import spaces
 
 from hypogoal.core.artefacts import open_artefact
@@ -22,7 +23,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings, PPOSettings
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 from hypogoal.learners.config import WorldConfig
 from hypogoal.learners.world import make_engine
 from hypogoal.stages.train_baseline import train_baseline
@@ -30,20 +31,18 @@ from hypogoal.stages.train_baseline import train_baseline
 EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 6_000, ("dqn", "tuned"): 12_000}
 
 
-class Corridor:
+class Row(Corridor):
     """Five cells in a row: action 2 steps right, action 0 left, the others do nothing; the goal is the last cell."""
 
     n_actions, n_states, resumes = 7, 5, False
-    observation_shape: tuple[int, ...] = (64, 64, 3)
+    observation_shape = (64, 64, 3)
+    tiles = np.stack([np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), (255, 40, 40), np.uint8)])
 
     def __init__(self, count: int, max_steps: int = 20):
-        self.count, self.max_steps = count, max_steps
-        self.ids = np.zeros(count, dtype=np.int64)
-        self.elapsed = np.zeros(count, dtype=np.int64)
-        self.steps_seen = 0
+        super().__init__(count, max_steps)
 
     def reset(self):
-        self.ids[:], self.elapsed[:] = 0, 0
+        self.ids, self.elapsed = np.zeros((2, self.count), dtype=np.int64)
         return self.ids.copy()
 
     def step(self, actions):
@@ -56,18 +55,10 @@ class Corridor:
         self.elapsed = np.where(over, 0, self.elapsed)
         return Step(following, terminated.astype(np.float32), terminated, truncated)
 
-    @property
-    def tiles(self):
-        return np.stack([np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), (255, 40, 40), np.uint8)])
-
     def codes(self, ids):
         codes = np.zeros((len(ids), 64), dtype=np.uint8)
         codes[np.arange(len(ids)), 9 + np.asarray(ids)] = 1
         return codes
-
-    def images(self, ids, out=None):
-        drawn = self.tiles[self.codes(ids)].reshape(-1, 8, 8, 8, 8, 3)
-        return drawn.transpose(0, 1, 3, 2, 4, 5).reshape(-1, 64, 64, 3)
 
     def labels(self, ids):
         return (np.asarray(ids) == 4)[:, None]
@@ -83,10 +74,10 @@ def learn(env, chosen, steps, folder, kept=None):
 def test_solves_an_easy_task(agent, setting, tmp_path):
     """Spec E7: every baseline, in either setting, learns a corridor that random play rarely finishes in time."""
     chosen = HYPERPARAMETERS[agent, setting]
-    env = EngineEnv(Corridor(chosen.environments))
+    env = EngineEnv(Row(chosen.environments))
     trained = learn(env, chosen, EASY_STEPS[agent, setting], tmp_path)
     assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.8
-    trial = EngineEnv(Corridor(1))
+    trial = EngineEnv(Row(1))
     observation: Any = trial.reset()
     while not trial.episodes:
         observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
@@ -94,8 +85,8 @@ def test_solves_an_easy_task(agent, setting, tmp_path):
 
 
 def test_a_time_limit_is_not_a_terminal_state():
-    """Spec E7, D2: an episode that is cut is told to the agent as truncated, with the state it was cut in."""
-    corridor = Corridor(2, max_steps=3)
+    """Spec E7, D2: a cut episode is told to the agent as truncated, with the state it was cut in; the goal is not."""
+    corridor = Row(2, max_steps=3)
     env = EngineEnv(corridor)
     env.reset()
     for _ in range(2):
@@ -106,18 +97,12 @@ def test_a_time_limit_is_not_a_terminal_state():
     assert infos[1]["terminal_observation"].tolist() == corridor.codes(np.array([3]))[0].tolist()
     assert np.array_equal(np.asarray(observations), corridor.codes(np.array([0, 0])))  # the next episode's start
     assert env.episodes == [(6, 3, 0.0, 0, 0), (6, 3, 0.0, 0, 0)]
-
-
-def test_reaching_the_goal_is_a_terminal_state():
-    """Spec E7: the goal ends the episode without a truncation mark, also on the last step before the limit."""
-    env = EngineEnv(Corridor(1, max_steps=4))
+    env = EngineEnv(Row(1, max_steps=4))
     env.reset()
     for _ in range(3):
         env.step(np.array([2]))
-    _, rewards, done, infos = env.step(np.array([2]))
-    assert done[0]
-    assert rewards[0] == 1.0
-    assert infos[0]["TimeLimit.truncated"] is False
+    _, rewards, done, infos = env.step(np.array([2]))  # the goal, on the last step before the limit
+    assert (done[0], rewards[0], infos[0]["TimeLimit.truncated"]) == (True, 1.0, False)
     assert env.episodes == [(4, 4, 1.0, 1, 1)]
 
 
@@ -151,8 +136,6 @@ def test_block_convolution_is_a_convolution():
 def test_epsilon_waits_for_the_first_goal():
     """Spec E7, Table 4: 1 -> 0.01 over 8,000 steps from the start; the tuned one falls from its first goal on."""
     paper, tuned = HYPERPARAMETERS["dqn", "paper"], HYPERPARAMETERS["dqn", "tuned"]
-    assert isinstance(paper, DQNSettings)
-    assert isinstance(tuned, DQNSettings)
     assert [round(epsilon(paper, step, None), 3) for step in (0, 4_000, 8_000, 9_000)] == [1.0, 0.505, 0.01, 0.01]
     assert epsilon(tuned, 200_000, None) == 1.0
     assert epsilon(tuned, 36_000, first_goal=20_000) == pytest.approx(0.525)
@@ -161,8 +144,6 @@ def test_epsilon_waits_for_the_first_goal():
 def test_the_paper_setting_is_the_papers():
     """Spec E3, D3, E7: the numbers of Tables 4 and 5."""
     ppo, dqn = HYPERPARAMETERS["ppo", "paper"], HYPERPARAMETERS["dqn", "paper"]
-    assert isinstance(ppo, PPOSettings)
-    assert isinstance(dqn, DQNSettings)
     assert (ppo.rollout, ppo.entropy, ppo.gae_lambda, ppo.batch, ppo.epochs) == (100, 0.01, 0.97, 64, 10)
     assert (dqn.replay, dqn.target_interval, dqn.epsilon_steps, dqn.epsilon_final) == (100_000, 10, 8_000, 0.01)
     assert (dqn.learning_rate, dqn.batch, dqn.environments) == (2.5e-4, 32, 4)
@@ -193,7 +174,7 @@ def test_global_randomness_is_given_back(tmp_path):
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    learn(EngineEnv(Corridor(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
+    learn(EngineEnv(Row(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
     assert torch.rand(1) == expected
 
 

@@ -149,25 +149,9 @@ def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_ru
 
 @pytest.mark.parametrize(("pair", "without"), [("entropy=0.1", "chooser=random"), ("replay=500", "network=planned")])
 def test_settings_that_do_nothing_are_refused(pair: str, without: str, corridor_run: Path, tmp_path: Path) -> None:
-    """Spec G2: where they were given; those of a preset, or of an experiment for all its cells, pass."""
-    command = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW]
-    refuses(
-        f"has this setting only beside another choice: {pair.partition('=')[0]}", *command, *settings(pair, without)
-    )
-    preset = tmp_path / "all.toml"
-    preset.write_text("[train-meta]\nentropy = 0.1\n")
-    run(*command, "--preset", preset, "--set", "chooser=random")
-
-
-@pytest.mark.parametrize("name", ["train-options", "train-meta"])
-def test_what_is_complete_is_not_built_again(
-    name: str, corridor_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Spec A6, G1: ``--resume`` looks at the manifest, and makes neither engine nor networks."""
-    command = [name, corridor_run / "ensemble", "--out", tmp_path / "out", *FEW]
-    run(*command)
-    monkeypatch.setattr("hypogoal.meta.training.assemble", None)
-    run(*command, "--resume")
+    """Spec G2: beside choosers and learners without them."""
+    words = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *settings(pair, without)]
+    refuses(f"has this setting only beside another choice: {pair.partition('=')[0]}", *words)
 
 
 def ensembles_on(engine: DoorKeyEngine) -> list[Ensemble]:

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import corridor_env
 import gymnasium
 import numpy as np
 import pytest
-from command_line import refuses, run
-from corridor_env import SUB_GOALS as SUB_GOALS_OF_CORRIDOR
-from corridor_env import CorridorEnv
+from command_line import refuses, run, settings
 
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.data import open_dataset
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.env import SUB_GOALS
-from hypogoal.domains.gymnasium.domain import GymnasiumDomain
-from hypogoal.evaluation import selection
 from hypogoal.evaluation.run import read_evaluation
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import assemble
 
-FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
+FEW = [*settings("steps=600", "environments=4", "random_episodes=5"), "-q"]
 
 
 def walked(layout_seed: int, steps: int) -> np.ndarray:
@@ -45,8 +41,7 @@ def own_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     given = ["--sub-goal", "at-the-door", "--domain", "doorkey", "-q"]
     run("import", own_run / "own.npz", "--out", own_run / "data.h5", *given)
-    few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
-    run("train-ensemble", own_run / "data.h5", "--out", own_run / "ensemble", *few)
+    run("train-ensemble", own_run / "data.h5", "--out", own_run / "ensemble", "-q", *settings("steps=5", "workers=1"))
     return own_run
 
 
@@ -65,40 +60,27 @@ def test_an_agent_of_own_labels_is_evaluated(own_run: Path) -> None:
     assert "no truth of at-the-door" in (own_run / "report" / "index.html").read_text(encoding="utf-8")
 
 
-def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_of_options_only_says_where_to_add_the_truth(
+    corridor_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Spec A5, F6: of a domain of one's own, the place where the sub-goal's function belongs; added, it is matched."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    env, rng = CorridorEnv(), np.random.default_rng(0)
-    pictures = {}
-    for seed in range(8):
-        env.reset(seed=seed)
-        for _ in range(60):
-            if env.step(int(rng.integers(2)))[2]:
-                env.reset(seed=seed)
-            pictures[env.image().tobytes()] = env.image(), env.cell == 4
-    shown, labels = (np.stack(column) for column in zip(*pictures.values(), strict=True))
-    np.savez(tmp_path / "own.npz", observations=shown, labels=labels, unlabelled=shown)
-    data, made = tmp_path / "data.h5", tmp_path / "made"
-    given = ["--sub-goal", "near-the-end", "--domain", "corridor_env:DOMAIN", "-q"]
+    """Spec A5, F6: in a domain of one's own, where the sub-goal's function belongs; added, it is matched."""
+    data, ensemble, made = tmp_path / "data.h5", tmp_path / "ensemble", tmp_path / "made"
+    shown = open_dataset(corridor_run / "data.h5").unlabelled()
+    near = shown[:, 0, 32, 0] > 0  # cell 4 is white
+    np.savez(tmp_path / "own.npz", observations=shown, labels=near, unlabelled=shown)
+    given = ["--sub-goal", "near-the-end", "--domain", "own_domain:DOMAIN", "-q"]
     run("import", tmp_path / "own.npz", "--out", data, *given)
-    few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
-    run("train-ensemble", data, "--out", tmp_path / "ensemble", *few)
-    run("train-options", tmp_path / "ensemble", "--out", made / "options", *FEW)
+    run("train-ensemble", data, "--out", ensemble, *settings("steps=5", "members=2", "workers=1"), "-q")
+    run("train-options", ensemble, "--out", made / "options", *FEW)
     assert "random choice while options learn" in " ".join(run("evaluate", made).out.split())
-    results = read_evaluation(made)
-    assert results.facts["missing"][1:] == [
-        "no truth of near-the-end to match members with: corridor_env:DOMAIN has left-end and right-end"
+    assert read_evaluation(made).facts["missing"][1:] == [
+        "no truth of near-the-end to match members with: own_domain:DOMAIN has left-end and right-end"
     ]
-    members = selection.context(results)["members"]
-    assert members["chosen"].sum() > 0 and members["duration"].dropna().between(1, 10).all()
     run("report", made)
     page = (made / "report" / "index.html").read_text(encoding="utf-8")
     assert "andom choice while options learn" in page and "Whether hypotheses mattered is unknown" in page
-    known = GymnasiumDomain(CorridorEnv, {**SUB_GOALS_OF_CORRIDOR, "near-the-end": lambda env: env.unwrapped.cell == 4})
-    monkeypatch.setattr(corridor_env, "DOMAIN", known)
+    monkeypatch.setattr("own_domain.CorridorDomain.sub_goals", ("near-the-end",))
+    monkeypatch.setattr("own_domain.TallCorridor.labels", lambda self, ids: (ids == 4)[:, None])
     run("evaluate", made, "--force", "-q")
     assert read_evaluation(made).facts["missing"] == ["no ensemble"]
 
