@@ -39,6 +39,11 @@ HELP = """import contextlib, io
 from hypogoal.cli import main
 with contextlib.redirect_stdout(io.StringIO()):
     assert main(["--help"]) == 0"""
+STEP = """import torch
+from hypogoal.core.adam import Adam
+weight = torch.ones(3, requires_grad=True)
+weight.sum().backward()
+Adam([weight], 0.1).step()"""
 UNSAFE = re.compile(r"(torch|PPO|DQN)\.(load|save)\(|allow_pickle(?!=False)|from torch import .*\b(load|save)\b")
 
 
@@ -116,21 +121,16 @@ def test_every_data_file_of_the_package_is_installed() -> None:
         assert any(fnmatch.fnmatch(path.as_posix(), pattern) for pattern in patterns), f"{path} is not packaged"
 
 
-def test_versions_of_python_are_those_that_are_tested() -> None:
-    """Classifiers are those of ``make versions``, the first is the least allowed; extras that a line names exist."""
-    named = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
-    others = re.search(r"^OTHERS := (.*)$", text_of("Makefile"), re.M)
-    assert others and ["3.11", *others[1].split()] == named and PROJECT["requires-python"] == ">=3.11"
+def test_extras_that_a_line_names_exist() -> None:
     sources = "".join(path.read_text("utf-8") for path in PACKAGE.rglob("*.py"))
-    named_extras = ",".join(re.findall(r"hypogoal\\*\[([\w,]+)\]", sources))
-    extras = {*named_extras.split(",")}
-    assert extras == {"lerobot", "minari", "montezuma", "tensorboard"} <= PROJECT["optional-dependencies"].keys()
+    named = ",".join(re.findall(r"hypogoal\\*\[([\w,]+)\]", sources)).split(",")
+    assert {*named} == {"lerobot", "minari", "montezuma", "tensorboard"} <= PROJECT["optional-dependencies"].keys()
 
 
 @pytest.mark.parametrize(
     ("code", "loaded", "unloaded"),
     [
-        ("import torch", {"torch"}, set()),  # the check sees it
+        (STEP, {"torch"}, {"torch._dynamo"}),
         ("import hypogoal, hypogoal.cli", {"typer"}, HEAVY),
         (HELP, {"typer"}, HEAVY),
         ("import hypogoal.experiments.plan, hypogoal.experiments.run", set(), {"torch"}),
@@ -140,7 +140,7 @@ def test_versions_of_python_are_those_that_are_tested() -> None:
 )
 def test_imports_are_light(code: str, loaded: set[str], unloaded: set[str]) -> None:
     """Heavy packages wait for the command that needs them, SciPy's statistics for the evaluation."""
-    script = f"import sys\n{code}\nprint(*[name for name in sys.modules if '.' not in name])"
+    script = f"import sys\n{code}\nprint(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     names = {*done.stdout.split()}
     assert loaded <= names and not unloaded & names
@@ -177,20 +177,15 @@ def test_set_up_is_done_once_and_again_when_the_versions_change(tmp_path: Path) 
         shutil.copy(ROOT / name, clone)
     done = make(clone, "setup", "PYTHON=false")
     assert done.returncode != 0 and "needs Python 3.11" in done.stderr and not (clone / ".venv").exists()
-    create_it, install = "-m venv .venv", "pip install"
-    for target in ("demo", "test", "check", "bench"):
-        fresh = make(clone, "-n", target).stdout
-        assert create_it in fresh and install in fresh
-        assert ("[dev]" in fresh) == (target != "demo"), "who runs the demo needs no developers' tools"
+    assert "-m venv .venv" in make(clone, "-n", "test").stdout
     (clone / ".venv/bin").mkdir(parents=True)
     (clone / ".venv/bin/python").touch()
     (clone / ".venv/.installed-dev").touch()
     again = make(clone, "-n", "test").stdout
-    assert "pytest" in again and create_it not in again and install not in again
+    assert "pytest" in again and "pip install" not in again
     later = (clone / ".venv/.installed-dev").stat().st_mtime + 10
     os.utime(clone / "constraints.txt", (later, later))
-    changed = make(clone, "-n", "test").stdout
-    assert install in changed and create_it not in changed
+    assert "pip install" in make(clone, "-n", "test").stdout
 
 
 def test_formats_are_readable_without_hypogoal(

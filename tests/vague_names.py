@@ -2,7 +2,6 @@
 
 import ast
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,13 +11,7 @@ VAGUE = frozenset((
     "yes", "chance", "thing", "things", "stuff",
 ))  # fmt: skip
 LIMIT = 0.01
-WORST = 10
 Function = ast.FunctionDef | ast.AsyncFunctionDef
-
-
-def functions(tree: ast.AST) -> Iterator[Function]:
-    """Every function and method of a module, nested ones too."""
-    return (node for node in ast.walk(tree) if isinstance(node, Function))
 
 
 def vague_names(function: Function) -> set[str]:
@@ -39,25 +32,19 @@ def _within(function: Function) -> Iterator[ast.AST]:
             waiting += ast.iter_child_nodes(node)
 
 
-def count(package: Path) -> tuple[int, Counter[str]]:
-    """The number of functions in a package, and of those with a vague name, by file."""
-    total, vague = 0, Counter[str]()
-    for path in sorted(package.rglob("*.py")):
-        for function in functions(ast.parse(path.read_text(encoding="utf-8"))):
-            total += 1
-            vague[path.relative_to(package).as_posix()] += bool(vague_names(function))
-    return total, vague
-
-
-def main(package: Path = PACKAGE, limit: float = LIMIT) -> int:
-    """Print the share and the worst files; 1 where the share is above the limit, else 0."""
-    total, vague = count(package)
-    share = vague.total() / max(total, 1)
-    print(f"vague names: {vague.total()} of {total} functions ({share:.1%}), at most {limit:.0%}")
-    if share <= limit:
+def main() -> int:
+    """Print the share, and above the limit each function; 1 where the share is above the limit, else 0."""
+    total, vague = 0, []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, Function):
+                total += 1
+                names = sorted(vague_names(node))
+                vague += [f"  {path.relative_to(PACKAGE)}: {node.name}: {', '.join(names)}"] if names else []
+    print(f"vague names: {len(vague)} of {total} functions, at most {LIMIT:.0%}")
+    if len(vague) <= LIMIT * total:
         return 0
-    for path, number in vague.most_common(WORST):
-        print(f"  {number:3} in {path}")
+    print(*vague, sep="\n")
     return 1
 
 
