@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import fails, refuses, run, settings
+from command_line import fails, refuses, settings
 from corridor_env import SUB_GOALS, CorridorEnv
 from own_domain import CorridorDomain, TallCorridor
 from torch import Tensor, nn
@@ -82,12 +82,9 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     return ended
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """States of the corridor."""
-    path = tmp_path_factory.mktemp("data") / "data.h5"
-    run("collect", "corridor_env:DOMAIN", *settings("steps=80", "heldout_seeds=4,5"), "-q", "--out", path)
-    return path
+@pytest.fixture
+def data(corridor_run: Path) -> Path:
+    return corridor_run / "data.h5"
 
 
 @pytest.mark.parametrize(("domain", "fault"), MALFORMED)

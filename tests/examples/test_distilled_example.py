@@ -48,11 +48,6 @@ SHORT = {  # appended to the page's commands, so that they end in seconds
 }
 
 
-@pytest.fixture(autouse=True)
-def trusted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-
-
 def loop_of(engine: Any, kind: type[Learner] = Learner) -> OptionLoop:
     ends, config = oracle_terminations(engine, range(GOALS)), TrainOptionsConfig.of(**QUICK)
     learner, recorder = kind(engine, ends, config, seed=0), Recorder(GOALS, engine)

@@ -18,7 +18,6 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import train
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("shape", "place")
 TAUGHT = EnsembleConfig(
     members=2, diversity="none", teacher="joint:independent", network="tiles", steps=150, learning_rate=2e-3
@@ -28,8 +27,6 @@ TAUGHT = EnsembleConfig(
 @pytest.fixture
 def joint(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The example, with few starts."""
-    monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     load("joint:teach", "teacher", "", {})
     example = sys.modules["joint"]
     monkeypatch.setattr(example, "RESTARTS", 8)

@@ -28,11 +28,6 @@ import one_room
 WINDOW = {"view": "one_room:AgentView", "network": "one_room:network"}
 
 
-@pytest.fixture(autouse=True)
-def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-
-
 def test_a_window_by_hand() -> None:
     """Of pixels that say their row and column: around the agent, black outside of the picture."""
     rows, columns = np.mgrid[:6, :7]
@@ -46,8 +41,8 @@ def test_a_window_by_hand() -> None:
 def test_data_that_do_not_say_enough_are_one_line(missing: str) -> None:
     """Spec G2: where the agent is, and which ladder's base a positive is."""
     observations = np.zeros((12, 84, 84, 4), np.uint8)
-    names = {"room", "x", "y", "dying", "ladder", "action", "previous_action"} - {missing}
-    origins = {name: np.ones(12, np.int64) for name in names}
+    where = {"room": 1, "x": 75, "y": 190, "dying": 0, "ladder": 0, "action": 0, "previous_action": 0}
+    origins = {name: np.full(12, value) for name, value in where.items() if name != missing}
     config = EnsembleConfig(members=2, steps=1, view_settings=("localiser_steps=1",), **WINDOW)
     with pytest.raises(UserError, match=f"the data do not say {missing} of each state"):
         train(observations, np.arange(12) < 4, observations, config, 0, origins=StateOrigins(origins, origins))

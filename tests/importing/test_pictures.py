@@ -26,7 +26,6 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     """Spec G2: the file is named, and PostScript is not even opened: Pillow would run a program."""
     folder = save_pictures(tmp_path / "images")
     file = folder / "positive" / "zz.png"
-    clear = saved(np.zeros((SIDE, SIDE, 4), np.uint8))
     palette = io.BytesIO()
     Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
     for data, said in (
@@ -34,9 +33,7 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
         (b"no image", "this cannot be read"),
         (saved(pictures(1)[0][0])[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
-        (clear, "it is transparent in places"),
         (palette.getvalue(), "it is transparent in places"),
-        (saved(np.zeros((SIDE, SIDE), np.float32), "TIFF"), "it has 32 bits a channel"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n", "git lfs pull"),
     ):
         file.write_bytes(data)
