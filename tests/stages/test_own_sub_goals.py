@@ -41,7 +41,8 @@ def own_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     given = ["--sub-goal", "at-the-door", "--domain", "doorkey", "-q"]
     run("import", own_run / "own.npz", "--out", own_run / "data.h5", *given)
-    run("train-ensemble", own_run / "data.h5", "--out", own_run / "ensemble", "-q", *settings("steps=5", "workers=1"))
+    few = settings("steps=5", "members=2", "workers=1")
+    run("train-ensemble", own_run / "data.h5", "--out", own_run / "ensemble", "-q", *few)
     return own_run
 
 
