@@ -308,6 +308,19 @@ def test_what_does_not_fit_is_one_line(datasets: Path, tmp_path: Path, words: st
     refuses(said, "import", datasets / "v3.0-image", "--out", tmp_path / "data.h5", *given)
 
 
+def test_what_other_recordings_lack_is_one_line(datasets: Path, tmp_path: Path) -> None:
+    few, some = (save_minari(tmp_path / f"{count}-v0", count, nested=True) for count in (2, 3))
+    for source, rule, key, said in (
+        (datasets / "demo.hdf5", "actions", "robot0_eef_pos", "no column with a number for each frame: actions"),
+        (datasets / "takes", "last:3", "top", "Its keys are video"),
+        (datasets / "takes", "rewards", "video", "There are none"),
+        (few, few / "right.csv", "image", "there are no heldout states"),
+        (some, some / "right.csv", "imag", "'imag': episode_0. Its keys are arm/speed, image, task"),
+        (some, some / "right.csv", "task", "no pictures or numbers 'task'"),
+    ):
+        refuses(said, "import", source, "--out", tmp_path / "data.h5", "--label", f"a={rule}", "--key", key)
+
+
 def test_the_missing_extra_is_named(datasets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     words = ["import", datasets / "v3.0-video", "--out", tmp_path / "data.h5", *LABEL]
