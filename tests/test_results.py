@@ -11,7 +11,7 @@ import pytest
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig
-from studies import figure6, hypotheses, ladder_options, pages
+from studies import hypotheses, pages
 from studies.cells import collect_once, difference, interval, run_cells
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -103,15 +103,6 @@ def test_intervals_of_shares_stay_within_0_and_1() -> None:
     assert difference(np.array([0.0, 0.5, 1.0]), 2) == "0.50 [-0.74, 1.74]"
 
 
-def test_agents_of_figure_6_are_told_apart() -> None:
-    """By the folders of ``examples/figure6.py``, where the ensemble's name is in those of other agents, too."""
-    place = "method-dbat-k3-layout-300-seed-3000"
-    assert figure6.method_of({}, place) == "dbat-k3"
-    assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
-    assert figure6.method_of({"network": "paper"}, "meta") == "literal"
-    assert figure6.method_of({}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
-
-
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
     """A mean over some of the sub-goals is of no use beside one over all."""
     lines = (RESULTS / "hypotheses-doorkey.csv").read_text(encoding="utf-8").splitlines()
@@ -142,17 +133,6 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert ran == [("a", 2), ("b", 2), ("a", 3)]
     rows = path.read_text(encoding="utf-8").splitlines()
     assert rows == ["cell,step,score", "a,1,0.1429", "a,2,0.2857", "b,1,0.1429", "b,2,0.2857", "a,3,0.4286"]
-
-
-def test_leads_on_ladders_are_means_over_seeds_of_what_has_no_labels() -> None:
-    """Ladders of the labelled group do not count, nor does one without a peer."""
-    far, near = np.array([9.0, 5.0]), np.array([1.0, 3.0])
-    pairs = {("none", ladder): {10: far, 11: far + 2} for ladder in ("1L", "3-9", "14-22", "0-4")}
-    pairs |= {("dbat", ladder): {10: near, 11: near} for ladder in ("1L", "3-9", "14-22")}
-    pairs["none", "14-22"] = {10: far + 2, 11: far + 4}
-    best, mean = ladder_options._leads(1, {"": pairs})
-    assert best == "no diversity minus D-BAT, best member: 6 [-7, 19], 2 ladders"  # 5 and 7
-    assert mean == "no diversity minus D-BAT, mean member: 7 [-6, 20], 2 ladders"  # 6 and 8; t(1) = 12.7
 
 
 def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
