@@ -3,8 +3,8 @@
     python -m benchmarks.doorkey [--short] [--json PATH]
 
 All play uniformly random actions, drawn beforehand, on the same layouts, and deliver the full image as uint8
-(64, 64, 3) at every step: MiniGrid as ``RGBImgObsWrapper(tile_size=8)`` around the same three-key env; the engine, of
-64 environments, into the caller's buffer. The last row delivers the cells' codes, which the light networks read.
+(64, 64, 3) at every step: MiniGrid as ``RGBImgObsWrapper(tile_size=8)`` around the same three-key env; the engine of
+64 environments. The last row delivers the cells' codes, which the light networks read.
 MiniGrid has no way to step many at once that is faster than one, so its figure is the yardstick for all.
 Engines start cold in every repeat, which has a layout of its own: what they remember of it, they work out within the
 time measured.
@@ -46,14 +46,13 @@ def minigrid(env: Any, actions: list[int]) -> float:
 
 
 def engine(layout_seed: int, actions: np.ndarray, images: bool) -> float:
-    """CPU seconds of a step of ours: its images are drawn into the caller's buffer, or the cells' codes read."""
+    """CPU seconds of a step of ours: its images are drawn, or the cells' codes read."""
     played = DoorKeyEngine(layout_seed, MANY)
-    buffer = np.empty((MANY, *played.observation_shape), np.uint8)
 
     def play() -> None:
         for row in actions:
             played.step(row)
-            _ = played.images(played.ids, buffer) if images else played.codes(played.ids)
+            _ = played.images(played.ids) if images else played.codes(played.ids)
 
     return timing.cpu_seconds(play) / actions.size
 

@@ -72,7 +72,7 @@ def meta(ensemble: Path, steps: int, folder: Path, *more: str) -> float:
         played = time.process_time() - begin
         return solved
 
-    changes = (word for pair in ("random_episodes=1", f"steps={steps}", *more) for word in ("--set", pair))
+    changes = (word for pair in (f"steps={steps}", *more) for word in ("--set", pair))
     with patch.object(agents, "train", train):
         out = folder / f"out-{time.monotonic_ns()}"
         quietly("train-meta", ensemble, "--layout-seed", LAYOUT, "--out", out, *changes)
@@ -91,7 +91,7 @@ def stage(steps: int, folder: Path, *command: object) -> float:
 
 def climbing(ensemble: Path, steps: int, folder: Path) -> float:
     """An agent step of ``train-options`` at a ladder."""
-    changes = ("start=1L", "termination=oracle", "random_episodes=0")
+    changes = ("start=1L", "termination=oracle")
     return stage(steps, folder, "train-options", ensemble, *(word for pair in changes for word in ("--set", pair)))
 
 
@@ -103,7 +103,7 @@ def ceiling(steps: int) -> float:
     from hypogoal.domains.montezuma.ladders import LADDERS
 
     actions = np.random.default_rng(0).integers(N_ACTIONS, size=steps).tolist()
-    emulator = Emulator(0)
+    emulator = Emulator()
     state = emulator.place(*LADDERS[0].top)
     assert state is not None
 

@@ -31,6 +31,7 @@ import torch
 from torch import Tensor, nn
 
 import hypogoal
+from hypogoal.core.arrays import Ints, tensor
 from hypogoal.learners.double_dqn import DoubleDQN, descend
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.exploration import Exploration
@@ -38,7 +39,6 @@ from hypogoal.options.learner import Learner as AnyLearner
 from hypogoal.options.learner import Transitions
 from hypogoal.options.light import GRADIENT_NORM, LightLearner
 from hypogoal.options.networks import apply_to_states
-from hypogoal.options.parts import Ids
 from hypogoal.options.planned import FAR, distances, places_of, plan_of
 
 CELL = 8  # pixels
@@ -133,7 +133,7 @@ class Learner(LightLearner):
     def reach(config: Any, options: int) -> int:
         return 0
 
-    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
+    def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
         """While it learns, the plan's with random actions in between; afterwards the network's."""
         if self.loaded or not explore:
             return self.greedy(ids, options, age)
@@ -167,7 +167,7 @@ class Learner(LightLearner):
         super().load(state)
         self.loaded = True
 
-    def _plan(self, ids: Ids) -> None:
+    def _plan(self, ids: Ints) -> None:
         """Plan the layouts of those states that are in no plan yet."""
         self._grow()
         new = np.unique(ids[self.kind[ids] == UNKNOWN])
@@ -198,7 +198,7 @@ class Learner(LightLearner):
         best[~leads] = True  # where no way leads to a sub-goal nothing is wrong
         networks = self.networks
         scores = apply_to_states(networks.online, self.engine, states).log_softmax(2)
-        of_best = scores.masked_fill(self.tensor(~best), -torch.inf).logsumexp(2)
+        of_best = scores.masked_fill(tensor(~best, self.device), -torch.inf).logsumexp(2)
         loss = of_best.neg().sum() / max(1, int(leads.sum()))
         fallen = min(1.0, self.steps / self.last)
         networks.optimiser.lr = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
@@ -208,7 +208,7 @@ class Learner(LightLearner):
         planned = int((self.kind >= PLANNED).sum())
         return {"option_loss": float(loss.detach()), "planned_states": float(planned)}
 
-    def _batch(self) -> Ids:
+    def _batch(self) -> Ints:
         """States int64 (n,), a share of them visited, the others out of all plans."""
         some = round(UNIFORM * self.config.option_batch)
         visited, planned = np.flatnonzero(self.kind == VISITED), np.flatnonzero(self.kind >= PLANNED)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.config import Config, setting
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
@@ -23,7 +24,6 @@ from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.domains.montezuma.emulator import SCREEN, SIDE, pixel
 from hypogoal.hypotheses.networks import folded
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
-from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.termination import Terminations
 
 Pictures = NDArray[np.uint8]  # (N, H, W, C): frames, the latest last
@@ -338,12 +338,12 @@ class Patience(Terminations):
         self._steps, self._executions, self._reaches = np.zeros((3, self.options), dtype=np.int64)
         self._highest = np.full(self.options, -np.inf, dtype=np.float32)
 
-    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
+    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
         self._best = np.where(age == 0, log_odds, np.maximum(self._best, log_odds))
         np.add.at(self._steps, options, 1)
         return self.positive(log_odds, options)
 
-    def finished(self, environments: Ids, options: Ids, reached: Flags) -> None:
+    def finished(self, environments: Ints, options: Ints, reached: Bools) -> None:
         np.add.at(self._executions, options, 1)
         np.add.at(self._reaches, options, reached)
         np.maximum.at(self._highest, options, self._best[environments])

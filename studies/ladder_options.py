@@ -87,7 +87,7 @@ def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> li
     trained = open_artefact(ensemble, "ensemble").config["steps"]
     rows = []
     for member in range(members):
-        of_member = executions.of(member)
+        of_member = executions.at(executions.option == member)
         numbers = option_numbers(of_member).iloc[0] if len(of_member) else dict.fromkeys(NUMBERS, float("nan"))
         place = dict(zip(KEYS, (groups, method, seed, ladder, STEPS, member), strict=True))
         rows.append(

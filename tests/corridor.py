@@ -48,10 +48,9 @@ class Corridor(Engine):
     def restore(self, snapshot: dict[str, Any]) -> None:
         self.ids, self.elapsed = snapshot["ids"], snapshot["elapsed"]
 
-    def images(self, ids: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8) if out is None else out
+    def images(self, ids: np.ndarray) -> np.ndarray:
+        images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8)
         for row, cell in enumerate(ids):
-            images[row] = 0
             images[row, :, 8 * cell : 8 * cell + 8] = 255
         return images
 
@@ -123,12 +122,11 @@ class LongCorridor(Corridor):
         self.cell = snapshot["cell"]
         self.n_states = len(self.cell)
 
-    def images(self, ids: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    def images(self, ids: np.ndarray) -> np.ndarray:
         if ((ids >= len(self.starts)) & (ids < self.oldest)).any():
             raise ValueError("a forgotten state")
-        images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8) if out is None else out
+        images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8)
         for row, identity in enumerate(ids):
-            images[row] = 0
             images[row, :, 14 * self.cell[identity] : 14 * self.cell[identity] + 14] = 255
         return images
 

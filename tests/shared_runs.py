@@ -13,7 +13,7 @@ from filelock import FileLock
 
 FEW = "--set members=2 --set workers=1 --set steps=20"
 GOALS = "--set sub_goals=collect-red-key,open-red-door"
-DOORKEY = "--set max_episode_steps=64 --set random_episodes=20 --set layout_seed=100"
+DOORKEY = "--set max_episode_steps=64 --set layout_seed=100"
 PLAY = f"--set steps=2048 {DOORKEY}"
 SHORT = "--set environments=4 --set warm_up=50 --set steps=400"
 VISITED = "--set save_visited=5"

@@ -18,9 +18,9 @@ DOCS = ROOT / "docs"
 SHORT = {
     "collect": ("heldout_layouts=1", "unlabelled_seeds=1"),
     "train-ensemble": ("steps=3", "workers=1"),
-    "train-options": ("steps=400", "warm_up=100", "max_episode_steps=60", "random_episodes=2"),
-    "train-meta": ("steps=400", "warm_up=100", "max_episode_steps=60", "random_episodes=2"),
-    "train-baseline": ("steps=640", "max_episode_steps=60", "random_episodes=2"),
+    "train-options": ("steps=400", "warm_up=100", "max_episode_steps=60"),
+    "train-meta": ("steps=400", "warm_up=100", "max_episode_steps=60"),
+    "train-baseline": ("steps=640", "max_episode_steps=60"),
 }
 NOT_OURS = (
     "python3",

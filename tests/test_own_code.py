@@ -34,13 +34,12 @@ def with_methods(**methods: Any) -> GymnasiumDomain:
     return GymnasiumDomain(type("Own", (CorridorEnv,), methods), SUB_GOALS)
 
 
-def giving(place: int, value: Any) -> GymnasiumDomain:
-    """A domain whose steps give something else at one place: observation, reward, terminated, truncated, info."""
+def giving(change: Callable[[Any], Any]) -> GymnasiumDomain:
+    """A domain whose steps give other observations."""
 
     def step(self: CorridorEnv, action: int) -> Any:
-        given = [*CorridorEnv.step(self, action)]
-        given[place] = value(given[place]) if callable(value) else value
-        return tuple(given)
+        observation, *rest = CorridorEnv.step(self, action)
+        return change(observation), *rest
 
     return with_methods(step=step)
 
@@ -49,17 +48,10 @@ def labelling(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "odd": lambda env: value})
 
 
-STEP = "the environment's step gave something else than Gymnasium says"
 FITS_NOT = "an observation that does not fit its space"
 MALFORMED: list[tuple[Any, str]] = [
-    *((giving(1, value), STEP) for value in (None, NAN, np.ones(2))),
-    *((giving(2, value), STEP) for value in ("False", 2)),
-    (giving(3, None), STEP),
-    (giving(4, None), STEP),
-    (with_methods(step=lambda self, action: CorridorEnv.step(self, action)[:4]), STEP),
-    (giving(0, lambda image: image[:-1]), FITS_NOT),
+    (giving(lambda image: image[:-1]), FITS_NOT),
     (with_methods(reset=lambda self, **_: (1, {})), FITS_NOT),
-    (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none of Gymnasium's: NoneType"),  # type: ignore[arg-type, return-value]
     *((labelling(value), "the label of odd is no truth value") for value in ("no", NAN)),
 ]
 
@@ -135,27 +127,14 @@ def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
     return Domain()
 
 
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        (lambda step: step._replace(rewards=step.rewards * NAN), "the engine's step gave the rewards [nan"),
-        (lambda step: step._replace(rewards=None), "the engine's step gave rewards array(None"),
-        (lambda step: step._replace(truncated=step.truncated[:1]), "the engine's step gave truncated"),
-        (lambda step: step._replace(succeeded=step.rewards), "the engine's step gave succeeded"),
-        (lambda step: tuple(step), "the engine's step gave "),
-        (lambda step: 1 // 0, "your code raised ZeroDivisionError"),
-    ],
-)
-def test_engines_without_gymnasium_too(change: Callable[[Step], Any], fault: str, told: Callable[..., str]) -> None:
+def test_engines_without_gymnasium_too(told: Callable[..., str]) -> None:
     """Spec B6, G2."""
-    told(own_engine(change), BASELINE, fault)
+    told(own_engine(raising(ZeroDivisionError())), BASELINE, "your code raised ZeroDivisionError")
 
 
 @pytest.mark.parametrize(
     ("objective", "fault"),
     [
-        (lambda a, b: 0.5, "the diversity objective gave float"),
-        (lambda a, b: (a - b).sum(-1), "the diversity objective gave torch.float32"),
         (lambda a, b: 1 // 0, "your code raised ZeroDivisionError"),
     ],
 )
@@ -176,9 +155,6 @@ class Raises(nn.Module):
 @pytest.mark.parametrize(
     ("layers", "fault"),
     [
-        (lambda channels: None, "the network gave None"),
-        (lambda channels: ([nn.Conv2d(channels, 4, 3, 2)], (0,)), "the network gave ("),
-        (lambda channels: (["layer"], (8,)), "the network gave ("),
         (lambda channels: ([nn.Conv2d(channels, 4, 3, 2).double()], (8,)), "does not take these observations"),
         (lambda channels: ([Raises()], (8,)), "your code raised ZeroDivisionError"),
     ],

@@ -38,7 +38,7 @@ def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str]) -> None:
 def test_ctrl_c_and_sigterm_say_how_to_continue(tmp_path: Path) -> None:
     """One line and 128 + the signal; then neither flag, or another seed, is refused in one line."""
     out = tmp_path / "ppo"
-    words = ["train-baseline", "doorkey", "--out", str(out), "--set", "random_episodes=5", "-q"]
+    words = ["train-baseline", "doorkey", "--out", str(out), "-q"]
     for number, resume in ((signal.SIGINT, []), (signal.SIGTERM, ["--resume"])):
         log = Draft(out).files / "metrics.jsonl"
         before = log.stat().st_size if log.exists() else 0

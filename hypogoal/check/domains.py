@@ -15,11 +15,11 @@ from hypogoal.core.config import resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Unmet, require_classes, write_dataset
-from hypogoal.domains.base import Domain, Engine, check_step
+from hypogoal.domains.base import Domain, Engine
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
-STATE_NOW = "A label is a function of the state now: count, keep and draw nothing in it."
-SEEDED = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."
+STEP_KINDS = {"next_ids": "iu", "rewards": "iuf", "terminated": "b", "truncated": "b", "succeeded": "b"}
+SEEDED = "All randomness must come from the seed: for a Gymnasium environment from self.np_random. Labels keep nothing."
 
 
 def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, seed: int = 0) -> Iterator[Verdict]:
@@ -49,7 +49,7 @@ class _Played:
         check_env(self.domain.make_env(), skip_render_check=True, skip_close_check=True)
 
     def steps(self) -> str:
-        """Observations, labels and ends of episodes are as the domain says, and the same when asked twice."""
+        """Observations, labels and ends of episodes are as the domain says."""
         domain, engine = self.domain, self.make_engine()
         elapsed = np.zeros(COUNT, int)
         seen = set()
@@ -57,12 +57,6 @@ class _Played:
             images, labels = engine.images(engine.ids), engine.labels(engine.ids)
             _require_array("images", images, domain.observation_dtype, COUNT, *domain.observation_shape)
             _require_array("labels", labels, np.bool_, COUNT, len(domain.sub_goals))
-            is_same = np.array_equal(engine.labels_now(), labels)
-            promise(
-                is_same,
-                "asked twice in the same state, labels differ",
-                STATE_NOW,
-            )
             elapsed += 1
             over = shown["terminated"] | shown["truncated"]
             promise(
@@ -73,13 +67,6 @@ class _Played:
             elapsed[over] = 0
             for image, row in zip(images, labels, strict=True):
                 seen.add((image.tobytes(), row.tobytes()))
-        out = np.zeros_like(images)
-        engine.images(engine.ids, out)
-        promise(
-            np.array_equal(images, out),
-            "images(ids, out) does not fill out",
-            "Write the images into it.",
-        )
         looks = {image for image, _ in seen}
         if len(looks) < len(seen):
             text = f"{len(looks)} observations have {len(seen)} different labels: no classifier can tell them apart"
@@ -138,10 +125,21 @@ class _Played:
         """What an engine shows in each step, by name; the actions are random, the same at every call."""
         for actions in rng_for(self.seed, "check").integers(engine.n_actions, size=(STEPS, COUNT)):
             step = engine.step(actions)
-            check_step(engine, step)
+            _require_step(step)
             shown = step._asdict()
             ids = shown.pop("next_ids")
             yield {**shown, "images": engine.images(ids), "labels": engine.labels(ids)}
+
+
+def _require_step(step: Any) -> None:
+    """Refuse a malformed step of an engine."""
+    for name, letters in STEP_KINDS.items():
+        values = np.asarray(getattr(step, name, None))
+        missing = name == "succeeded" and values.dtype == object  # None
+        is_right = values.shape == (COUNT,) and values.dtype.kind in letters
+        do = f"Give a Step of arrays of length {COUNT}, of the types in hypogoal.domains.base.Step."
+        promise(missing or is_right, f"the engine's step gave {name} {values!r}", do)
+    promise(np.isfinite(step.rewards).all(), f"the engine's step gave {step.rewards}", "Give finite rewards.")
 
 
 def require_same(first: Iterator[dict[str, Any]], second: Iterator[dict[str, Any]], do: str) -> None:

@@ -54,8 +54,8 @@ class _Trained:
 
     def trains(self) -> str:
         """Members can be trained, the same from the same seed."""
-        ensemble, again = self.ensemble(), self.ensemble().state()
-        for name, values in ensemble.state().items():
+        ensemble, again = self.ensemble(), self.ensemble().state_dict()
+        for name, values in ensemble.state_dict().items():
             promise(torch.equal(values, again[name]), f"{name} differs when trained again", SEEDED)
         return f"members see {ensemble.view.dtype} {ensemble.view.shape}"
 

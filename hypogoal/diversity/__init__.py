@@ -19,7 +19,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
@@ -65,20 +65,6 @@ class Objective:
     def acts(self, members: int) -> bool:
         """Whether it has an effect on an ensemble with this number of members: pairs need two."""
         return self.name != "none" and (members > 1 or self.ensemble_loss is not None)
-
-    def loss(self, *arguments: Any) -> Tensor:
-        """The loss of two members' logits, or of a :class:`Context`: a float (), else a ``UserError``.
-
-        That it is finite is checked every few steps, or a GPU would wait.
-        """
-        function: Any = self.ensemble_loss or self.pair_loss
-        loss = function(*arguments)
-        if getattr(loss, "shape", None) != () or not loss.is_floating_point():
-            received = f"{loss.dtype} {tuple(loss.shape)}" if hasattr(loss, "dtype") else type(loss).__name__
-            do = "Give a float (): a mean over the states, axis -2."
-            raise UserError(f"the diversity objective gave {received}", self.name, do)
-        checked: Tensor = loss
-        return checked
 
 
 def load_objective(name: str) -> Objective:

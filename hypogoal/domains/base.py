@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -28,7 +28,6 @@ BUILT_IN = {
     "rooms": "hypogoal.domains.rooms.domain:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
-STEP_KINDS = {"next_ids": "iu", "rewards": "iuf", "terminated": "b", "truncated": "b", "succeeded": "b"}
 REGISTERED: dict[str, Domain] = {}  # domains that the running program defined, by name
 IMPORTED = "imported"  # the domain of states that 'hypogoal import' got without --domain
 
@@ -84,7 +83,7 @@ class Layouts(Resumable):
         return seed
 
 
-class Engine(ABC):
+class Engine(Resumable, ABC):
     """Many environments, of one layout or several, stepped together; every distinct state has an integer id.
 
     Required members come first, then optional ones with their defaults.
@@ -101,8 +100,11 @@ class Engine(ABC):
         starts: its start states, with ids 0 .. S - 1, never forgotten; empty where all episodes begin alike.
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
-        restarts: whether it has :meth:`restart`; resumes: whether it has :meth:`snapshot` and :meth:`restore`.
+        restarts: whether it has :meth:`restart`.
+        resumes: whether :meth:`snapshot` has all that the next steps need.
     """
+
+    CHANGING: ClassVar[tuple[str, ...]] = ("ids", "elapsed", "layouts")
 
     n_actions: int
     count: int
@@ -134,39 +136,16 @@ class Engine(ABC):
         """Step every environment with actions (E,); where an episode ends, ``ids`` becomes a start state."""
 
     @abstractmethod
-    def images(self, ids: Ints, out: Any = None) -> Observations:
-        """Observations (n, *observation_shape), ``observation_dtype``, of known states, in ``out`` if passed."""
+    def images(self, ids: Ints) -> Observations:
+        """Observations (n, *observation_shape), ``observation_dtype``, of known states, in an array of their own."""
 
     @abstractmethod
     def labels(self, ids: Ints) -> Bools:
         """True sub-goal predicates, bool (n, G): an oracle, for evaluation and the upper bound only."""
 
-    def labels_now(self) -> Bools:
-        """The labels of the environments' current states, bool (E, G), computed again rather than looked up by id."""
-        return self.labels(self.ids)
-
-    def room_for(self, count: int, out: Observations | None) -> Observations:
-        """An array for ``count`` observations: ``out``, or a new one."""
-        if out is None:
-            return np.empty((count, *self.observation_shape), self.observation_dtype)
-        return out
-
     def restart(self, where: Bools) -> None:
         """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``."""
         raise NotImplementedError
-
-    def snapshot(self) -> dict[str, Any]:
-        """Its whole state as nested dicts of arrays and JSON values, to be extended; needs ``resumes``."""
-        state: dict[str, Any] = {"ids": self.ids.copy(), "elapsed": self.elapsed.copy()}
-        if self.layouts and self.layouts.many:
-            state["layouts"] = self.layouts.snapshot()
-        return state
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments, to be extended; needs ``resumes``."""
-        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
-        if self.layouts and self.layouts.many:
-            self.layouts.restore(snapshot["layouts"])
 
     @property
     def oldest(self) -> int:
@@ -244,8 +223,11 @@ class TurnEngine(Engine):
         kept = self.remembers(ids) & (ids >= 0) & (ids < self.n_states)
         if not kept.all():
             raise ValueError(f"state {ids[~kept][0]} is forgotten or unknown; the oldest kept is {self.oldest}")
-        kept_ids: list[int] = ids.tolist()
-        return kept_ids
+        return ids.tolist()
+
+    def _room_for(self, count: int) -> Observations:
+        """An array for ``count`` observations."""
+        return np.empty((count, *self.observation_shape), self.observation_dtype)
 
     @abstractmethod
     def _begin(self, number: int) -> int:
@@ -289,9 +271,7 @@ class Domain(ABC):
         engine_settings: the names of the settings that define the world; later stages play with them too.
         defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
         env_id: the id of its registered Gymnasium environment, if any.
-        kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin; ``make_engine`` takes one as ``start``.
-        many_starts: ``start`` may also be several names, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
         measures: it has :meth:`distance_to`; near: the distance up to which a state counts as near a true sub-goal.
         pictures: it has :meth:`picture` and :meth:`pixel`.
@@ -304,9 +284,7 @@ class Domain(ABC):
     defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
     sources: Mapping[str, str] = MappingProxyType({})
     env_id: str = ""
-    kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
-    many_starts: bool = False
     many_layouts = False
     measures = pictures = False
     near = 0
@@ -378,26 +356,6 @@ class Domain(ABC):
     def pixel(self, positions: Ints) -> NDArray[np.float64]:
         """The column and row of positions in that picture, (n, 2); needs ``pictures``."""
         raise NotImplementedError
-
-
-def check_step(engine: Engine, step: Any) -> None:
-    """Refuse (``UserError``) a malformed step of an engine; loops call it for the first one."""
-    where = type(engine).__name__
-    for name, letters in STEP_KINDS.items():
-        values = np.asarray(getattr(step, name, None))
-        missing = name == "succeeded" and values.dtype == object  # None
-        if not missing and (values.shape != (engine.count,) or values.dtype.kind not in letters):
-            do = f"Give a Step of arrays of length {engine.count}, of the types in hypogoal.domains.base.Step."
-            raise UserError(f"the engine's step gave {name} {values!r}", where, do)
-    if not np.isfinite(step.rewards).all():
-        raise UserError(f"the engine's step gave the rewards {step.rewards}", where, "Give finite numbers.")
-
-
-def require_one_kind(engine: Engine) -> None:
-    """Refuse (``UserError``) mixed observations: options and agents see pictures or numbers."""
-    if keys := engine.observation_dtype.names:
-        do = "Reward another library's agent by the members: hypogoal.SubgoalReward (docs/library.md)."
-        raise UserError("agents see pictures or numbers, not both", ", ".join(keys), do)
 
 
 def load_domain(name: str) -> Domain:

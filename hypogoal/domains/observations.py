@@ -3,8 +3,6 @@
 Environments and imported arrays share these rules. An ambiguous observation is refused.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from math import prod
 from typing import NamedTuple
@@ -83,7 +81,10 @@ def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
     pairs = list(pairwise(shape))
     # The longest two neighbours are height and width; among equals the second pair.
     shorter = [min(pair) for pair in pairs]
-    height = max(range(len(pairs)), key=lambda axis: (shorter[axis], axis == 1))
+    height = max(
+        range(len(pairs)),
+        key=lambda axis: (shorter[axis], axis == 1),
+    )
     width = height + 1
     sides_at = (height, width)
     others = [axis for axis in range(len(shape)) if axis not in sides_at]

@@ -23,7 +23,6 @@ from hypogoal.options.choosers import (
     RandomChooser,
 )
 from hypogoal.options.loop import NONE, OptionLoop
-from hypogoal.options.parts import Ids
 from hypogoal.options.recording import Recorder
 
 ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout: 512 episodes,
@@ -57,9 +56,9 @@ class _Listener(Chooser):
 
     def __init__(self, chooser: Chooser):
         self.chooser = chooser
-        self.decisions: list[tuple[Ids, Choices]] = []
+        self.decisions: list[tuple[Ints, Choices]] = []
 
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         chosen = self.chooser.choose(environments, ids, offered)
         self.decisions.append((environments.copy(), Choices(ids.copy(), chosen.copy(), offered.copy())))
         return chosen
@@ -77,7 +76,7 @@ class Always(Chooser):
     def __init__(self, option: int):
         self.option = option
 
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         return np.full(len(ids), self.option)
 
 
@@ -135,6 +134,6 @@ def _first_episodes(
 def begin_anew(loop: OptionLoop, chooser: Chooser) -> None:
     """Every environment at the beginning of an episode; of earlier episodes, options and choosers nothing is left."""
     chooser.begin_anew()
-    loop.chooser, loop.recorder = chooser, Recorder(loop.recorder.options, loop.engine, loop.recorder.window)
+    loop.chooser, loop.recorder = chooser, Recorder(loop.recorder.options, loop.engine)
     loop.option[:] = NONE
     loop.engine.reset()

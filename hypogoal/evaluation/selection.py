@@ -23,7 +23,7 @@ from hypogoal.evaluation.run import takes
 from hypogoal.hypotheses import scores
 from hypogoal.meta.config import layout_seeds
 from hypogoal.observations import PICTURE
-from hypogoal.options.tables import Choices
+from hypogoal.options.tables import ChoiceCounts
 
 TITLE = "Which hypotheses are chosen, and where they stop"
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
@@ -48,12 +48,12 @@ def rows(work):
         match, overlaid = judged(artefact.input("ensemble"), tuple(seeds))
         for option, picture in overlaid.items():
             work.arrays[f"terminations/{name}/{option}"] = picture
-        columns = numbers_of_choices(Choices.read(artefact.path / Choices.FILE), len(match))
+        columns = numbers_of_choices(ChoiceCounts.read(artefact.path / ChoiceCounts.FILE), len(match))
         columns["match"] = match
         yield of_options(columns, config, **work.place(artefact), scope=SCOPE)
 
 
-def numbers_of_choices(choices: Choices, options: int) -> dict[str, Doubles]:
+def numbers_of_choices(choices: ChoiceCounts, options: int) -> dict[str, Doubles]:
     """Spec F6: how often each option was offered, chosen, reached; its mean duration in steps; ``preference``, (O,).
 
     A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered

@@ -1,7 +1,5 @@
 """The states that an ensemble is trained on: drawn in batches and passed through the members."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import (
     chain,
@@ -28,7 +26,7 @@ from hypogoal.observations import Observations, values_in
 
 Numbers = Ints  # of states, (B,)
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
-NONE = np.zeros(0, dtype=np.int64)
+NONE = np.zeros(0, np.int64)
 
 
 class TrainingStates(Resumable):
@@ -68,7 +66,7 @@ class TrainingStates(Resumable):
         kept = self.view.to_change(observations), self.view.to_change(unlabelled)
         self._tables: patches.Tables | None = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
-            self._tables = patches.make_tables(kept[0], ensemble.networks[0], kept[1])
+            self._tables = patches.make_tables(ensemble.networks[0], *kept)
         self._states = kept if self._tables is None else ()
         size = values_in(observations.shape[1:], observations.dtype)
         self._at_once = at_once(EVALUATED_AT_ONCE, (size,))
@@ -97,8 +95,13 @@ class TrainingStates(Resumable):
         groups = (labelled, unlabelled)
         inputs = self._inputs(groups, changing=networks[0].training)
         sizes = [len(group) for group in groups]
-        logits = torch.stack([_forward(network, inputs, sizes, counted) for network in networks])
-        on_labelled, on_unlabelled = logits.split(sizes, dim=1)
+        logits = []
+        for network in networks:  # up to rounding the same for either kind of inputs (a test asserts it)
+            if isinstance(inputs, patches.PatchBatch):
+                logits.append(patches.forward(network, inputs, counted))
+            else:
+                logits.append(plain_forward(network, inputs, sizes, counted))
+        on_labelled, on_unlabelled = torch.stack(logits).split(sizes, dim=1)
         return on_labelled, on_unlabelled
 
     def frozen_logits(self, networks: Sequence[nn.Sequential]) -> Tensor:
@@ -180,18 +183,6 @@ def _draws(
     items = map(next, cycle(streams))
     while True:
         yield np.fromiter(islice(items, count), np.int64, count)
-
-
-def _forward(
-    network: nn.Sequential,
-    inputs: Tensor | patches.PatchBatch,
-    sizes: Sequence[int],
-    counted: bool,
-) -> Tensor:
-    """A network's outputs, up to rounding the same for either kind of inputs (a test asserts it)."""
-    if isinstance(inputs, patches.PatchBatch):
-        return patches.forward(network, inputs, counted)
-    return plain_forward(network, inputs, sizes, counted)
 
 
 def plain_forward(

@@ -1,7 +1,5 @@
 """The settings of ensemble training, without PyTorch, so that ``hypogoal config`` starts fast."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import model_validator

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.arrays import Doubles
-from hypogoal.hypotheses.networks import as_input, at_once, inputs_of
+from hypogoal.hypotheses.networks import at_once, inputs_of
 from hypogoal.observations import (
     NUMBERS,
     PICTURE,
@@ -46,15 +46,12 @@ class Attributions:
     values: Doubles  # (n, K, H, W, C), or (n, K, *shape), of mixed ones (n, K, D), in log-odds
     log_odds: Doubles  # (n, K)
     baseline_log_odds: Doubles  # (K,)
-    method: str = DEEP_LIFT
+    method: str
 
     def completeness_error(self) -> Doubles:
         """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
-        return np.abs(self.sums() - (self.log_odds - self.baseline_log_odds))
-
-    def sums(self) -> Doubles:
-        """The sum for each state and member, (n, K)."""
-        return np.asarray(self.values.reshape(*self.log_odds.shape, -1).sum(-1))
+        sums = self.values.reshape(*self.log_odds.shape, -1).sum(-1)
+        return np.abs(sums - (self.log_odds - self.baseline_log_odds))
 
 
 def mean_state(observations: Observations) -> Observations:
@@ -75,22 +72,19 @@ def mean_state(observations: Observations) -> Observations:
     return mean.astype(observations.dtype)
 
 
-def by_key(
-    values: NDArray[np.floating],
-    dtype: np.dtype[Any],
-) -> NDArray[Any]:
+def by_key(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Attributions (..., D) of mixed observations as float32 with a field for each key."""
     fields = fields_of((), dtype)
-    parts = np.empty(
-        values.shape[:-1],
-        [(key, NUMBERS, shape) for key, (_, shape) in fields.items()],
-    )
-    ends = np.cumsum([prod(shape) for _, shape in fields.values()])
-    of_keys = np.split(values, ends[:-1], axis=-1)
-    for (key, (_, shape)), of_key in zip(fields.items(), of_keys, strict=True):
-        sizes = as_input(torch.zeros(1, *shape)).shape[1:]
-        inputs = torch.from_numpy(of_key).reshape(-1, *sizes)
-        parts[key] = _as_observations(inputs).reshape(*values.shape[:-1], *shape)
+    states = values.shape[:-1]
+    parts = np.empty(states, [(key, NUMBERS, shape) for key, (_, shape) in fields.items()])
+    start = 0
+    for key, (_, shape) in fields.items():
+        end = start + prod(shape)
+        of_key, start = values[..., start:end], end
+        if len(shape) == 3:  # channels are first in what networks take
+            *sides, channels = shape
+            of_key = np.moveaxis(of_key.reshape(*states, channels, *sides), -3, -1)
+        parts[key] = of_key.reshape(*states, *shape)
     return parts
 
 
@@ -117,7 +111,9 @@ def attributed(
     values, log_odds, baselines = [], [], []
     for member in ensemble.members:
         network, of_member = explained(member, inputs, reference)
-        values.append(_as_observations(of_member))
+        if of_member.ndim == 4:  # back to the order of observations
+            of_member = of_member.permute(0, 2, 3, 1)
+        values.append(of_member)
         with torch.no_grad():
             precise = next(network.parameters()).dtype
             log_odds.append(network(inputs.to(precise))[:, 0])
@@ -157,17 +153,9 @@ def _deep_lift(
     network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
     parts = []
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore",
-            message="IProgress not found",
-        )  # from tqdm, about a bar that is never drawn
+        warnings.simplefilter("ignore")  # about tqdm's bar, which is never drawn, and about hooks
         from captum.attr import DeepLift
 
-        warnings.filterwarnings(
-            "ignore",
-            message=r"\s*Setting forward, backward hooks",
-            category=UserWarning,
-        )
         for part in inputs.split(at_once(AT_ONCE, (INSIDE, *inputs.shape[1:]))):
             values = DeepLift(network).attribute(
                 part.detach().requires_grad_(),
@@ -176,11 +164,6 @@ def _deep_lift(
             )
             parts.append(values.detach())
     return network, torch.cat(parts)
-
-
-def _as_observations(values: Tensor) -> Tensor:
-    """Reorder axes from those of :func:`as_input` to those of observations."""
-    return values.permute(0, 2, 3, 1) if values.ndim == 4 else values
 
 
 def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -113,10 +114,6 @@ class Ensemble(nn.Module):
         """The thresholds (K,) as log-odds, with the same predictions up to rounding."""
         return log_odds_of(self.thresholds.cpu().numpy()).astype(np.float32)
 
-    def set_thresholds(self, thresholds: Floats) -> None:
-        """Set the probabilities (K,) above which predictions are positive."""
-        self.thresholds.copy_(torch.from_numpy(thresholds))
-
     def see(self, observations: Observations) -> Any:
         """The members' view of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
 
@@ -142,7 +139,7 @@ class Ensemble(nn.Module):
 
         Within rounding of its threshold, some 1e-6, a prediction may depend on the other states of the call.
         """
-        return np.asarray(self.predict(observations) > self.thresholds.cpu().numpy())
+        return self.predict(observations) > self.thresholds.cpu().numpy()
 
     def predict(self, observations: Observations) -> Floats:
         """Every member's probability that the sub-goal holds.
@@ -163,23 +160,21 @@ class Ensemble(nn.Module):
     def log_odds(self, observations: Observations) -> Floats:
         """Every member's log-odds that the sub-goal holds: float32 (N, K); see :meth:`predict`."""
         both = self.logits(observations)
-        return np.asarray(both[..., 1] - both[..., 0])
+        return both[..., 1] - both[..., 0]
 
     def logits(self, observations: Observations) -> Floats:
         """Every member's logits of negative and positive: float32 (N, K, 2); see :meth:`predict`."""
         seen = self.see(observations)
         device = self.thresholds.device
         size = PATCH_CHUNK if device.type == "cpu" else IMAGES_AT_ONCE * 16
-        logits = np.empty((len(seen), len(self), 2), dtype=np.float32)
+        logits = np.empty((len(seen), len(self), 2), np.float32)
         was_training = self.training
-        if was_training:
-            self.eval()
+        self.eval()
         with predicting(device):
             for start in range(0, len(seen), size):
                 part = self._logits(seen[start : start + size])
                 logits[start : start + size] = part.transpose(0, 1).cpu().numpy()
-        if was_training:
-            self.train()
+        self.train(was_training)
         return logits
 
     def attributions(
@@ -191,34 +186,19 @@ class Ensemble(nn.Module):
 
         The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
         (N, K, *the shape of the view; (H, W, C) for pictures) in log-odds: a state's sum is its log-odds minus the
-        baseline's. Of mixed observations (N, K), with a field for each key. ``UserError`` as for :meth:`predict`, or
-        without states.
+        baseline's. Of mixed observations (N, K), with a field for each key. ``UserError`` as for :meth:`predict`.
         """
-        if not (len(observations) and len(against)):
-            raise UserError(
-                "attributions need states, and others to compare with",
-                None,
-                "Give one or more of each.",
-            )
         seen = self.see(observations)
         baseline = deep_lift.mean_state(self.see(against))
         fixed = copy.deepcopy(self).cpu().eval()
-        parts = []
-        for start in range(0, len(seen), deep_lift.AT_ONCE):
-            explained = deep_lift.attributed(
-                fixed,
-                seen[start : start + deep_lift.AT_ONCE],
-                baseline,
-            )
-            parts.append(explained.values.astype(np.float32))
-        values = np.concatenate(parts)
+        values = deep_lift.attributed(fixed, seen, baseline).values.astype(np.float32)
         return deep_lift.by_key(values, self.view.dtype) if self.view.dtype.names else values
 
     def _logits(self, observations: Observations) -> Tensor:
         """Logits (K, N, 2); computes each distinct patch once if that pays."""
         members, device = self.networks, self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables(observations, members[0])
+            tables = patches.make_tables(members[0], observations)
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
                 return torch.stack([patches.forward(member, batch) for member in members])
@@ -235,27 +215,6 @@ class Ensemble(nn.Module):
             inputs = networks.inputs_of(observations[start : start + size], device)
             logits.append(torch.stack([member(inputs) for member in members]))
         return torch.cat(logits, dim=1)
-
-    def state(self) -> dict[str, Tensor]:
-        """Weights and BatchNorm statistics by name, as contiguous CPU tensors for safetensors."""
-        return {name: tensor.cpu().clone().contiguous() for name, tensor in self.state_dict().items()}
-
-    @classmethod
-    def from_state(
-        cls,
-        network: str,
-        observation_shape: Shape,
-        members: int,
-        state: Mapping[str, Tensor],
-        view: View | None = None,
-    ) -> Ensemble:
-        """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit."""
-        where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
-
-        def make() -> Ensemble:
-            return cls(network, observation_shape, members, torch.Generator(), view)
-
-        return load_fitting(make, state, where).eval()
 
 
 def together(ensembles: Sequence[Ensemble]) -> Ensemble | None:
@@ -277,7 +236,7 @@ def write_ensemble(
     ensemble: Ensemble,
 ) -> None:
     """Write ``<sub-goal>.safetensors`` to ``folder``."""
-    save_tensors(folder / f"{sub_goal}.safetensors", ensemble.state())
+    save_tensors(folder / f"{sub_goal}.safetensors", ensemble.state_dict())
 
 
 def read_ensemble(
@@ -285,7 +244,7 @@ def read_ensemble(
     config: Mapping[str, Any],
     sub_goal: str,
 ) -> Ensemble:
-    """One sub-goal's ensemble, from an ensemble artefact's folder and its manifest's configuration.
+    """One sub-goal's ensemble, from an ensemble artefact's folder and its manifest's configuration; to predict with.
 
     An unknown sub-goal, or missing or damaged weights, are a ``UserError``.
     """
@@ -300,13 +259,8 @@ def read_ensemble(
     try:
         shape = tuple(config["observation_shape"])
         view = saved_view(shape, config)
-        return Ensemble.from_state(
-            config["network"],
-            shape,
-            config["members"],
-            state,
-            view,
-        )
+        make = partial(Ensemble, config["network"], shape, config["members"], torch.Generator(), view)
+        return load_fitting(make, state, str(path)).eval()
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):
         raise UserError(
             "the weights do not fit the manifest",

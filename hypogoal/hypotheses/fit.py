@@ -28,8 +28,6 @@ scores s of unlabelled states adds
 sum_i mean_u min(|s_i(u)|, 1) (-log p_i(s_i(u) > 0 | u)), without a weight of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
@@ -124,12 +122,13 @@ def disagreement_of(objective: Objective | None, context: Context) -> Tensor:
     if objective is None:
         return members.new_zeros(())
     if objective.ensemble_loss is not None:
-        return objective.loss(context)
-    losses = [2.0 * objective.loss(first, second) for first, second in combinations(members, 2)]
-    losses += [objective.loss(earlier, member) for member, earlier in product(members, context.frozen)]
+        return objective.ensemble_loss(context)
+    assert objective.pair_loss is not None
+    losses = [2.0 * objective.pair_loss(first, second) for first, second in combinations(members, 2)]
+    losses += [objective.pair_loss(earlier, member) for member, earlier in product(members, context.frozen)]
     if not losses:
         return members.new_zeros(())
-    return torch.stack(losses).sum()
+    return torch.stack(losses).sum(0)  # of a pair that gives more than one number, more than one: no loss
 
 
 def taught_losses(logits: Tensor, scores: Tensor) -> Tensor:

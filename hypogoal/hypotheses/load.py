@@ -32,7 +32,12 @@ class ByKey(torch.nn.Module):
         sizes = [torch.Size(shape).numel() for shape in self.shapes]
         parts = values.split(sizes, dim=1)
         encoded = []
-        for encoder, part, shape in zip(self.encoders, parts, self.shapes, strict=True):
+        for encoder, part, shape in zip(
+            self.encoders,
+            parts,
+            self.shapes,
+            strict=True,
+        ):
             encoded.append(encoder(part.reshape(-1, *shape)))
         return torch.cat(encoded, dim=1)
 
@@ -56,7 +61,10 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
     config = json.loads(text)
     state = load_file(HERE / f"{sub_goal}.safetensors")
     standard = [state[name].flatten() for name in ("view.mean", "view.deviation") if name in state]
-    weights = {name.removeprefix("members."): tensor for name, tensor in state.items() if name.startswith("members.")}
+    weights = {}
+    for name, tensor in state.items():
+        if name.startswith("members."):
+            weights[name.removeprefix("members.")] = tensor
     members = torch.nn.ModuleList(built(config["layers"]) for _ in range(config["members"]))
     members.load_state_dict(weights)
     members.eval()

@@ -6,8 +6,6 @@ frequency. Up to rounding, values, gradients and running statistics are those of
 on a CPU.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
@@ -19,10 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.arrays import Ints
+from hypogoal.observations import spread_rows
 
 Ids = NDArray[np.int32]  # of patches, rows or colours
 WORTHWHILE = 0.5  # of the plain network's work in convolutions; above, gathering patches costs more than it saves
-SAMPLE = 64  # images from which that is estimated,
+SAMPLE = 64  # images of each part from which that is estimated,
 SAMPLE_PIXELS = 2**19  # or fewer images, within this number of pixels: each takes some 250 bytes
 LOOKUP_PER_VALUE = 4  # table entries per value to rank; beyond, sorting is faster
 
@@ -84,34 +83,26 @@ def _plain(layer: Any) -> bool:
     return square and inside and not layer.ceil_mode
 
 
-def _side(size: Any) -> int:
+def _side(size: Any) -> Any:
     """The side of a square window; -1 if it is not square."""
-    if isinstance(size, int):
-        return size
-    height, width = size
-    return int(height) if height == width else -1
+    height, width = np.broadcast_to(size, 2).tolist()
+    return height if height == width else -1
 
 
-def make_tables(
-    observations: NDArray[Any], network: nn.Sequential, others: NDArray[Any] | None = None
-) -> Tables | None:
-    """The distinct patches of images, uint8 (N, H, W, C), and of ``others`` behind them, as ``network`` sees them.
+def make_tables(network: nn.Sequential, *parts: NDArray[Any]) -> Tables | None:
+    """The distinct patches of images, uint8 (N, H, W, C), part after part, as ``network`` sees them.
 
     None if too few repeat to be worthwhile, or if the network has unsupported layers.
     """
     windows = windows_of(network)
-    others = observations[:0] if others is None else others
-    total = len(observations) + len(others)
-    if windows is None or total == 0 or observations.dtype != np.uint8:
+    if windows is None or parts[0].dtype != np.uint8:
         return None
-    count = total if total <= 2 * SAMPLE else SAMPLE
-    count = max(1, min(count, SAMPLE_PIXELS // prod(observations.shape[1:3])))
-    spread = np.linspace(0, total - 1, count).astype(np.int64)
-    first = spread < len(observations)
-    some = np.concatenate([observations[spread[first]], others[spread[~first] - len(observations)]])
-    if not _worthwhile(_tables(some, windows), network):
+    pixels = prod(parts[0].shape[1:3])
+    count = max(1, min(SAMPLE, SAMPLE_PIXELS // pixels))
+    some = [part[spread_rows(len(part), count)] for part in parts]
+    if not _worthwhile(_tables(np.concatenate(some), windows), network):
         return None
-    return _tables(np.concatenate([observations, others]), windows)
+    return _tables(np.concatenate(parts), windows)
 
 
 def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
@@ -119,7 +110,9 @@ def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
     tabled = plain = 0
     layers = [layer for layer in network if isinstance(layer, nn.Conv2d | nn.MaxPool2d)]
     for level, layer in zip(sample.levels, layers, strict=True):
-        work = layer.weight.numel() if isinstance(layer, nn.Conv2d) else level.parts.shape[1]  # at one place
+        work = level.parts.shape[1]  # at one place
+        if isinstance(layer, nn.Conv2d):
+            work = layer.weight.numel()
         tabled += len(level.parts) * work
         plain += level.rows.shape[1] * level.lines.size * work
     return tabled < WORTHWHILE * plain
@@ -131,7 +124,12 @@ def _tables(
 ) -> Tables:
     """The distinct patches of images, level by level: strips of distinct rows, bands of rows, then strips in bands."""
     count, height, width, channels = observations.shape
-    lines, pixel_rows = _distinct_items(observations.reshape(count * height, width * channels))
+    lines, pixel_rows = _distinct_items(
+        observations.reshape(
+            count * height,
+            width * channels,
+        )
+    )
     lines = lines.reshape(count, height)
     rows, colours = _distinct_items(pixel_rows.reshape(-1, channels))
     rows = rows.reshape(-1, width)
@@ -173,8 +171,9 @@ def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
     """Values in 0..bound-1 -> (their ranks among the distinct values, the distinct values in order)."""
     if bound > LOOKUP_PER_VALUE * values.size:
         ordered, inverse = np.unique(values, return_inverse=True)
-        return inverse.reshape(values.shape).astype(np.int32), ordered.astype(np.int64)
-    occurs = np.zeros(bound, dtype=np.bool_)
+        whole = inverse.reshape(values.shape)
+        return whole.astype(np.int32), ordered.astype(np.int64)
+    occurs = np.zeros(bound, np.bool_)
     occurs[values] = True
     ranks = np.cumsum(occurs, dtype=np.int32) - 1
     return ranks[values], np.flatnonzero(occurs)
@@ -183,10 +182,16 @@ def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
 def _distinct_items(items: NDArray[np.uint8]) -> tuple[Ids, NDArray[np.uint8]]:
     """Items (N, bytes) -> (indices of distinct items (N,), the distinct items in order of appearance)."""
     size = items.shape[1]
-    whole: list[bytes] = np.ascontiguousarray(items).view(f"V{size}").ravel().tolist()
+    together = np.ascontiguousarray(items).view(f"V{size}")
+    whole: list[bytes] = together.ravel().tolist()
     index_of = {item: index for index, item in enumerate(dict.fromkeys(whole))}
-    index = np.fromiter(map(index_of.__getitem__, whole), np.int32, len(whole))
-    distinct = np.frombuffer(b"".join(index_of), np.uint8)
+    index = np.fromiter(
+        map(index_of.__getitem__, whole),
+        np.int32,
+        len(whole),
+    )
+    joined = b"".join(index_of)
+    distinct = np.frombuffer(joined, np.uint8)
     return index, distinct.reshape(-1, size)
 
 
@@ -203,11 +208,13 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
             ids = level.rows[level.lines[images]]
             ranks, occurring = _rank(ids, len(level.parts))
             share = np.bincount(ranks.ravel()) / ids.size
-            shares[number].append((torch.from_numpy(share.astype(np.float32))[None], ids.size))
+            of_group = torch.from_numpy(share.astype(np.float32))
+            shares[number].append((of_group[None], ids.size))
             parts[number].append(_positions(level.parts[occurring], used) + offset)
             used, offset = occurring, before[number]
             before[number] += len(occurring)
-        last.append(ranks.reshape(len(images), -1).astype(np.int64) + offset)
+        places = ranks.reshape(len(images), -1)
+        last.append(places.astype(np.int64) + offset)
     first, *above = [torch.from_numpy(np.concatenate(of_groups)) for of_groups in parts]
     patches = tables.colours[first]
     return PatchBatch(
@@ -220,7 +227,8 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
 
 def _positions(values: Ids, among: Ints) -> Ints:
     """The index of each value in the sorted ``among``, which has them all."""
-    position = np.empty(int(among[-1]) + 1, dtype=np.int64)
+    size = int(among[-1]) + 1
+    position = np.empty(size, np.int64)
     position[among] = np.arange(len(among))
     return position[values]
 
@@ -248,12 +256,20 @@ def forward(
                     size,
                     rows.shape[1],
                 )
-            rows = _convolved(layer, windows) if isinstance(layer, nn.Conv2d) else _pooled(windows)
+            rows = (
+                _convolved(layer, windows)
+                if isinstance(
+                    layer,
+                    nn.Conv2d,
+                )
+                else _pooled(windows)
+            )
         elif isinstance(layer, nn.BatchNorm2d):
             rows = _batch_norm(layer, rows, batch.shares[level], counted)
         elif isinstance(layer, nn.Flatten):
             images, places = batch.last.shape
-            grid = rows.index_select(0, batch.last.flatten()).view(images, places, -1)
+            placed = rows.index_select(0, batch.last.flatten())
+            grid = placed.view(images, places, -1)
             rows = grid.transpose(1, 2).flatten(start_dim=1)
         else:
             rows = layer(rows)
@@ -262,7 +278,8 @@ def forward(
 
 def _convolved(layer: nn.Conv2d, windows: Tensor) -> Tensor:
     """A convolution of windows (U, k * k, C) -> (U, features)."""
-    weight = layer.weight.permute(2, 3, 1, 0).reshape(-1, layer.out_channels)
+    ordered = layer.weight.permute(2, 3, 1, 0)
+    weight = ordered.reshape(-1, layer.out_channels)
     flat = windows.view(-1, len(weight))
     if layer.bias is None:
         return flat @ weight
@@ -304,5 +321,11 @@ def _batch_norm(
                     layer.momentum,
                 )
                 layer.num_batches_tracked.add_(1)
-        normed.append(torch.addcmul(layer.bias, centred, layer.weight * torch.rsqrt(variance + layer.eps)))
+        normed.append(
+            torch.addcmul(
+                layer.bias,
+                centred,
+                layer.weight * torch.rsqrt(variance + layer.eps),
+            )
+        )
     return torch.cat(normed)

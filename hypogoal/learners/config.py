@@ -9,8 +9,8 @@ class WorldConfig(Config):
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     start: str = setting(
         "",
-        "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
-        source="paper, policy learning; several: ours",
+        "where episodes begin, in a domain that names several places",
+        source="paper, policy learning",
     )
     max_episode_steps: int = setting(
         500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
@@ -26,4 +26,3 @@ class WorldConfig(Config):
         "changes to the world that the states were collected in: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
-    random_episodes: int = setting(200, "episodes of random play: how hard the layout is", source="ours", low=0)

@@ -30,7 +30,7 @@ class EpisodeRecorder(list[tuple[Any, ...]], Resumable):
     def __init__(self, environments: int):
         super().__init__()
         self.steps = 0
-        self.lengths = np.zeros(environments, dtype=np.int64)  # so far, of the episodes that run
+        self.lengths = np.zeros(environments, np.int64)  # so far, of the episodes that run
         self.rewards = np.zeros(environments)
 
     def see(self, step: Step) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Columns, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 
+ALPHA = 0.6  # 0 samples uniformly, 1 in full proportion to priority: Schaul et al. 2015
+BETA = 0.4  # strength of the importance weights that correct for it: the same source
 Rows = TypeVar("Rows", bound=Columns)
 
 
@@ -30,24 +32,14 @@ Joined = TypeVar("Joined", bound=Steps)
 class PrioritisedReplay(Resumable, Generic[Rows]):
     """A ring of transitions (Tables 2 and 4: 1e5), sampled in proportion to priority ** alpha.
 
-    What is stored is written into ``data``, rows of zeros, as many as there is room for. An ``alpha`` of 0 samples
-    uniformly, 1 in full proportion; ``beta`` is the strength of the importance weights that correct for it. Source of
-    both: Schaul et al. 2015.
+    What is stored is written into ``data``, rows of zeros, as many as there is room for.
     """
 
     CHANGING = ("data", "priorities", "size", "next", "largest")
 
-    def __init__(
-        self,
-        data: Rows,
-        *,
-        alpha: float = 0.6,
-        beta: float = 0.4,
-    ):
+    def __init__(self, data: Rows):
         self.data = data
         self.capacity = len(data)
-        self.alpha = alpha
-        self.beta = beta
         self.priorities = np.zeros(len(data))  # to the power alpha
         self.size = 0
         self.next = 0
@@ -58,7 +50,7 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         count = len(rows)
         indices = (self.next + np.arange(count)) % self.capacity
         self.data.put(indices, rows)
-        self.priorities[indices] = self.largest**self.alpha
+        self.priorities[indices] = self.largest**ALPHA
         self.next = (self.next + count) % self.capacity
         self.size = min(self.size + count, self.capacity)
 
@@ -76,7 +68,7 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
             side="right",
         )
         shares = priorities[indices] / total
-        weights = (self.size * shares) ** -self.beta
+        weights = (self.size * shares) ** -BETA
         weights /= weights.max()
         return indices, weights.astype(np.float32)
 
@@ -84,7 +76,7 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         """New priorities of sampled transitions: their absolute TD errors (n,)."""
         priorities = errors.astype(np.float64) + 1e-3
         self.largest = max(self.largest, float(priorities.max()))
-        self.priorities[indices] = priorities**self.alpha
+        self.priorities[indices] = priorities**ALPHA
 
 
 class StepsAhead(Resumable):
@@ -114,7 +106,7 @@ class StepsAhead(Resumable):
                 count = len(steps)
                 first = steps.pop(0)
                 complete.append((sequence, count, *first))
-        columns = np.array(complete, dtype=np.int64).reshape(-1, 4).T
+        columns = np.array(complete, np.int64).reshape(-1, 4).T
         sequences, counts, states, actions = columns
         return replace(
             rows.at(sequences),

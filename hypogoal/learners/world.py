@@ -9,8 +9,10 @@ from typing import Any
 from hypogoal.core.config import assigned
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Domain, Engine, require_one_kind
+from hypogoal.domains.base import Domain, Engine
 from hypogoal.learners.config import WorldConfig
+
+RANDOM_EPISODES = 200  # of random play, which say how hard a layout is
 
 
 def played_world(domain: Domain, collected: Mapping[str, Any], config: WorldConfig) -> dict[str, Any]:
@@ -32,7 +34,8 @@ def make_engine(
 ) -> Engine:
     """So many environments of a :func:`played_world`; ``begins`` are arguments that say where episodes begin.
 
-    A start that the domain does not name, and a cap where nobody knows the shortest path, are a ``UserError``.
+    A start that the domain does not name, a cap where nobody knows the shortest path, and observations of several keys
+    are a ``UserError``.
     """
     if config.start:
         check_start(domain, config.start)
@@ -44,7 +47,9 @@ def make_engine(
         config.max_episode_steps,
         **arguments,
     )
-    require_one_kind(engine)
+    if keys := engine.observation_dtype.names:
+        do = "Reward another library's agent by the members: hypogoal.SubgoalReward (docs/library.md)."
+        raise UserError("agents see pictures or numbers, not both", ", ".join(keys), do)
     if config.cap:
         shortest = engine.shortest_path()
         if shortest is None:
@@ -55,12 +60,9 @@ def make_engine(
 
 def check_start(domain: Domain, start: str) -> None:
     """Refuse (``UserError``) a start that the domain does not name."""
-    if not domain.starts:
-        raise UserError(f"{domain.name} has no named starts", f"start={start}", "Leave it out.")
-    for name in start.split(",") if domain.many_starts else [start]:
-        if name not in domain.starts:
-            fault = "unknown start" if name else "where are episodes to begin?"
-            raise UserError(fault, name or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
+    if start not in domain.starts:
+        fault = "unknown start" if start else "where are episodes to begin?"
+        raise UserError(fault, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
 
 
 def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
@@ -81,18 +83,15 @@ def write_layout(
 ) -> None:
     """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
-    Both are null where the engine does not know them; then no episode of random play is played. ``layouts`` are those
-    of many.
+    Both are null where the engine does not know them. ``layouts`` are those of many.
     """
-    success = None
-    if config.random_episodes:
-        success = engine.random_success(config.random_episodes, rng_for(seed, "random-play"))
+    success = engine.random_success(RANDOM_EPISODES, rng_for(seed, "random-play"))
     places = {"start": config.start, "layouts": layouts}
     facts: dict[str, Any] = {
         **{name: place for name, place in places.items() if place},
         "layout_seed": config.layout_seed,
         "shortest_path": engine.shortest_path(),
         "random_success": success,
-        "random_episodes": 0 if success is None else config.random_episodes,
+        "random_episodes": 0 if success is None else RANDOM_EPISODES,
     }
     (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")

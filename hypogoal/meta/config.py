@@ -33,7 +33,6 @@ class MetaConfig(Config):
     epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
     meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
     meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
-    entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
     advantage_floor: float = setting(
         0.1,
         "advantages are divided by their standard deviation, or by this if it is larger",

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from hypogoal.core.arrays import Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.config import known, resolve
 from hypogoal.core.tensors import load_tensors
@@ -17,7 +18,6 @@ from hypogoal.observations import Observations
 from hypogoal.options.choosers import FILE
 from hypogoal.options.learner import Transitions
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.parts import Ids
 
 REPLAY = 1_000  # nothing is learned: a small one
 SOLVED = "solved"  # why the last option of an episode ended
@@ -82,7 +82,7 @@ def play_episode(loop: OptionLoop, members: int) -> list[Frame]:
     return frames
 
 
-def _frame(loop: OptionLoop, members: int, option: int, ids: Ids, step: int, left: int, ended: str) -> Frame:
+def _frame(loop: OptionLoop, members: int, option: int, ids: Ints, step: int, left: int, ended: str) -> Frame:
     first = option - option % members
     predictions = loop.terminations.of(ids)[0, first : first + members]
     [picture] = loop.engine.images(ids)

@@ -7,11 +7,11 @@ from torch.nn import Conv2d, Linear, ReLU
 
 from hypogoal.hypotheses.networks import AUTO
 from hypogoal.observations import Standard
-from hypogoal.options.networks import WIDTH, CellEmbedding, Embedding, LightNetwork, embedding_for
+from hypogoal.options.networks import WIDTH, LightNetwork, embedding_for
 
 
 class LightMetaNetwork(LightNetwork):
-    """Cells, or numbers where there is a ``standard`` of them, or an own embedding; two dense layers, actor, critic."""
+    """An embedding, two dense layers, actor and critic."""
 
     def __init__(
         self,
@@ -20,16 +20,8 @@ class LightMetaNetwork(LightNetwork):
         standard: Standard | None = None,
         name: str = "light",
     ):
-        if name == "light" and standard is None:
-            embedding: Embedding = CellEmbedding(observation_shape)
-        else:
-            name = AUTO if name == "light" else name
-            embedding = embedding_for(
-                observation_shape,
-                standard,
-                name,
-            )
-        super().__init__(embedding)
+        embedding = AUTO if name == "light" else name
+        super().__init__(embedding_for(observation_shape, standard, embedding))
         self.outputs = _outputs(WIDTH, options)
 
     def head(self, features: Tensor) -> Tensor:
@@ -51,7 +43,8 @@ class PaperMetaNetwork(nn.Module):
             layers += [Conv2d(before, after, 3, stride=2), ReLU()]
         self.features = nn.Sequential(*layers, nn.Flatten())
         with torch.no_grad():
-            size = self.features(torch.zeros(1, depth, height, width)).numel()
+            blank = torch.zeros(1, depth, height, width)
+            size = self.features(blank).numel()
         self.dense = nn.Sequential(Linear(size, 256), ReLU())
         self.outputs = _outputs(256, options)
 
@@ -138,10 +131,14 @@ class GaussianHead(CategoricalHead):
         drawn: Tensor,
     ) -> tuple[Tensor, Tensor]:
         normal = Normal(scores, self._spread(scores).expand_as(scores))
-        return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
+        log = normal.log_prob(drawn)
+        return log.sum(1), normal.entropy().sum(1)
 
     def _spread(self, scores: Tensor) -> Tensor:
         return self.log_std.to(scores.device).exp()
 
 
-HEADS: dict[str, type[CategoricalHead]] = {"categorical": CategoricalHead, "gaussian": GaussianHead}
+HEADS: dict[str, type[CategoricalHead]] = {
+    "categorical": CategoricalHead,
+    "gaussian": GaussianHead,
+}

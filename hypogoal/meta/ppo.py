@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hypogoal.core import seeding
 from hypogoal.core.adam import Adam
-from hypogoal.core.arrays import Columns, tensor
+from hypogoal.core.arrays import Bools, Columns, Floats, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
-from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
@@ -21,19 +21,19 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Outcome
 from hypogoal.options.networks import apply_to_states
-from hypogoal.options.parts import Flags, Floats, Ids
 
 GRADIENT_NORM = 0.5
 CLIP = 0.2  # of the ratio of probabilities: Schulman et al. 2017
 VALUE_WEIGHT = 0.5  # of the value loss: Schulman et al. 2017
+ENTROPY_WEIGHT = 0.01  # of the entropy bonus: Table 5
 
 
 @dataclass(frozen=True)
 class Draws(Columns):
     """Choices of an option, arrays (n, ...)."""
 
-    state: Ids  # in which it was chosen
-    offered: Flags  # (n, O)
+    state: Ints  # in which it was chosen
+    offered: Bools  # (n, O)
     drawn: Floats  # what the head remembers of the draw, (n, R)
     log_prob: Floats
 
@@ -56,21 +56,16 @@ class MetaPolicy(Chooser):
     ):
         self.engine, self.config, self.device = engine, config, torch.device(device)
         shape, name = engine.observation_shape, config.meta_network
-        with DrawsFrom(torch_generator(seed, "meta-weights")):
+        with DrawsFrom(seeding.torch_generator(seed, "meta-weights")):
             if name == "paper":
                 self.network: nn.Module = networks.PaperMetaNetwork(shape, options)
             else:
-                self.network = networks.LightMetaNetwork(
-                    shape,
-                    options,
-                    engine.standard,
-                    name,
-                )
+                self.network = networks.LightMetaNetwork(shape, options, engine.standard, name)
             self.head = networks.HEADS[config.head](options)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head}).to(self.device)
         self.optimiser = Adam(self.policy.parameters(), config.meta_learning_rate, eps=1e-5)
-        self.generator = torch_generator(seed, "meta-draws")
-        self.rng = rng_for(seed, "meta-batches")
+        self.generator = seeding.torch_generator(seed, "meta-draws")
+        self.rng = seeding.rng_for(seed, "meta-batches")
         count = engine.count
         self.running = Draws(  # the last one of every environment
             state=np.zeros(count, np.int64),
@@ -104,7 +99,7 @@ class MetaPolicy(Chooser):
     ) -> Self:
         return cls(engine, options, config, seed, device)
 
-    def choose(self, environments: Ids, ids: Ids, offered: Flags) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Bools) -> Ints:
         mask = torch.from_numpy(offered)
         with torch.no_grad():
             scores = self._outputs(ids)[:, :-1].cpu()
@@ -136,7 +131,7 @@ class MetaPolicy(Chooser):
         order = np.argsort(outcomes.environments, kind="stable")
         return self.update(draws.at(order), outcomes.at(order))
 
-    def _outputs(self, ids: Ids) -> Tensor:
+    def _outputs(self, ids: Ints) -> Tensor:
         return apply_to_states(self.network, self.engine, ids)
 
     def update(self, draws: Draws, outcomes: Outcome) -> dict[str, float]:
@@ -174,7 +169,7 @@ class MetaPolicy(Chooser):
                 )
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], CLIP)
                 loss = loss + VALUE_WEIGHT * (out[:, -1] - goals[pick]).square().mean()
-                loss = loss - config.entropy * entropy.mean()
+                loss = loss - ENTROPY_WEIGHT * entropy.mean()
                 where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"
                 descend(
                     loss,

@@ -17,7 +17,7 @@ Where an option's time runs out in mid-episode (``timed_out`` in :meth:`.OptionL
 - reward: its policy's reward is 0, as at every step that does not reach the sub-goal; with ``experience=shared`` every
   other member has its own, by its own prediction of s'.
 - bootstrap: time is not part of a state, so its policy's target there is the Double-DQN value of s', as if it went on.
-  Only the sub-goal and the end of the task are terminal.
+  Only the sub-goal and the end of the task are terminal. A transition over several steps ends there, too.
 - SMDP return: R and gamma ** tau, as at any other end. The meta-policy's advantage (:mod:`.smdp`) takes
   R + gamma ** tau V(s') - V(s), and its trace runs on into the next decision, which is made in the same state s'. It
   sees s' and which options are offered there, no more: the same option may be chosen again.
@@ -25,12 +25,10 @@ Where an option's time runs out in mid-episode (``timed_out`` in :meth:`.OptionL
 With ``restart_options`` the end of an execution is that of its episode too: there the trace ends, V(s') stays.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Callable
 
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.checkpoints import Checkpoints, Resumable, State
+from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Engine, Layouts
@@ -57,7 +55,6 @@ def assemble(
     """
     config, seed, device = setup.config, setup.seed, setup.device
     engine = make_engine(setup, layouts)
-    load_learner(config.network).refuse(config, engine)
     load_chooser(config.chooser).refuse(config, engine)
     terminations = terminations_of(setup, engine)
     learner = load_learner(config.network)(engine, terminations, config, seed, device)
@@ -81,57 +78,39 @@ def train(
     It ends earlier once a share ``until`` of the last episodes has succeeded (0: never); returns whether it has.
     """
     recorder, begin = loop.recorder, loop.recorder.steps
-    training = TrainedLoop(loop, log, begin, {})
     checkpoints = checkpoints if loop.engine.resumes else Checkpoints(None)
-    if saved := checkpoints.load():
-        training.restore(saved)
+    logged = begin  # the steps at the last line of the log
+    numbers: dict[str, float] = {}  # of the last updates
+    saved = checkpoints.load()
+    if saved:
+        loop.restore(saved["loop"])
+        logged, numbers = saved["logged"], saved["numbers"]
         progress.resume(recorder.steps - begin)
-    else:
-        log.restore(0)
+    log.restore(saved["log"] if saved else 0)
+
+    def state() -> State:
+        return {"loop": loop.snapshot(), "logged": logged, "numbers": numbers, "log": log.snapshot()}
+
     solved = recorder.episodes.solved(until)
     while recorder.steps - begin < steps and not solved:
-        training.numbers |= loop.step()
+        numbers |= loop.step()
         done, solved = recorder.steps - begin, recorder.episodes.solved(until)
         shown = {}
-        if recorder.steps - training.logged >= LOG_INTERVAL or done >= steps or solved:
-            shown = training.write(**{"until_reached": solved} if until else {})
+        if recorder.steps - logged >= LOG_INTERVAL or done >= steps or solved:
+            logged = recorder.steps
+            shown = recorder.recent(restarted=loop.config.restart_options)
+            reached = {"until_reached": solved} if until else {}
+            counts = {"episodes": len(recorder.episodes), "states": loop.engine.n_states}
+            log.write(
+                step=logged,
+                **counts,
+                **shown,
+                **numbers,
+                **reached,
+            )
         progress.update(min(done, steps), **shown)
-        checkpoints.offer(training.snapshot)
+        checkpoints.offer(state)
     return solved
-
-
-@dataclass
-class TrainedLoop(Resumable):
-    """A loop in training and its log: all that a checkpoint keeps."""
-
-    CHANGING: ClassVar[tuple[str, ...]] = ("loop", "logged", "numbers")  # and the length of the log
-
-    loop: OptionLoop
-    log: MetricsLog
-    logged: int  # the steps at the last line of the log
-    numbers: dict[str, float]  # of the last updates
-
-    def write(self, **more: bool) -> dict[str, float]:
-        """A line of the log; returns its numbers that are worth showing."""
-        recorder = self.loop.recorder
-        self.logged = recorder.steps
-        shown = recorder.recent(restarted=self.loop.config.restart_options)
-        self.log.write(
-            step=self.logged,
-            episodes=len(recorder.episodes),
-            states=self.loop.engine.n_states,
-            **shown,
-            **self.numbers,
-            **more,
-        )
-        return shown
-
-    def snapshot(self) -> State:
-        return {**super().snapshot(), "log": self.log.snapshot()}
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        super().restore(snapshot)
-        self.log.restore(snapshot["log"])
 
 
 def continue_with(loop: OptionLoop, trained: Artefact) -> None:

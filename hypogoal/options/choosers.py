@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 
-from hypogoal.core.arrays import Columns, Doubles
+from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
 from hypogoal.core.seeding import rng_for
-from hypogoal.options.parts import Flags, Ids, Part, load_part
+from hypogoal.options.parts import Part, load_part
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,7 +24,7 @@ CHOOSERS = {
     "ppo": "hypogoal.meta.ppo:MetaPolicy",
 }
 
-Offered: TypeAlias = Flags  # (n, O), the options that may be chosen
+Offered: TypeAlias = Bools  # (n, O), the options that may be chosen
 FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
 
 
@@ -32,17 +32,17 @@ FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
 class Outcome(Columns):
     """Finished option executions, arrays of length n."""
 
-    environments: Ids  # in which they ran
-    options: Ids  # that they were of
-    began: Ids  # the states in which these were chosen
-    reached: Flags  # the options' own classifiers ended them
-    inside: Flags  # these were positive already where they began
+    environments: Ints  # in which they ran
+    options: Ints  # that they were of
+    began: Ints  # the states in which these were chosen
+    reached: Bools  # the options' own classifiers ended them
+    inside: Bools  # these were positive already where they began
     returns: Doubles  # the environment's rewards inside the option, discounted from its start
-    durations: Ids  # tau, the options' steps
+    durations: Ints  # tau, the options' steps
     discounts: Doubles  # gamma ** tau, for the state reached
-    next_ids: Ids  # the states reached
-    terminated: Flags  # the task is over, nothing follows
-    truncated: Flags  # the episode was cut, at its limit or because the next option begins at a start
+    next_ids: Ints  # the states reached
+    terminated: Bools  # the task is over, nothing follows
+    truncated: Bools  # the episode was cut, at its limit or because the next option begins at a start
 
 
 class Chooser(Part, ABC):
@@ -54,7 +54,7 @@ class Chooser(Part, ABC):
         return cls()
 
     @abstractmethod
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         """For each of n environments in states ``ids`` one of the options offered, bool (n, O): int64 (n,)."""
 
     def record(self, outcome: Outcome) -> None:
@@ -80,14 +80,15 @@ class RandomChooser(Chooser):
 
     CHANGING: ClassVar[tuple[str, ...]] = ("rng",)
 
-    def __init__(self, rng: np.random.Generator):
+    def __init__(self, rng: np.random.Generator, options: int = 0):
         self.rng = rng
+        self.steps = np.zeros(options, np.int64)  # of each option so far
 
     @classmethod
     def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
-        return cls(rng_for(seed, "random-choice"))
+        return cls(rng_for(seed, "random-choice"), options)
 
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
 
 
@@ -99,17 +100,9 @@ class EvenChooser(RandomChooser):
 
     CHANGING = ("rng", "steps")
 
-    def __init__(self, options: int, rng: np.random.Generator):
-        super().__init__(rng)
-        self.steps = np.zeros(options, dtype=np.int64)
-
-    @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
-        return cls(options, rng_for(seed, "random-choice"))
-
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         """For each environment in turn, int64 (n,); an option that runs counts as one step more."""
-        chosen = np.empty(len(environments), dtype=np.int64)
+        chosen = np.empty(len(environments), np.int64)
         for row in range(len(environments)):
             tied = self.steps + self.rng.random(len(self.steps))
             chosen[row] = np.where(offered[row], tied, np.inf).argmin()

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Self
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
-from hypogoal.core.arrays import Columns
+from hypogoal.core.arrays import Bools, Columns, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
@@ -30,7 +29,6 @@ from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import saved
 from hypogoal.options.config import STACK, PaperConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.parts import Flags, Ids
 
 
 class PaperQNetwork(nn.Module):
@@ -57,7 +55,8 @@ class PaperQNetwork(nn.Module):
             nn.Flatten(),
         )
         sides = [((side - 2) // 2 - 2) // 2 for side in (height, width)]
-        self.gru = nn.GRU(32 * math.prod(sides), self.HIDDEN, batch_first=True)
+        inputs = 32 * math.prod(sides)
+        self.gru = nn.GRU(inputs, self.HIDDEN, batch_first=True)
         self.values = nn.Sequential(
             nn.Linear(self.HIDDEN, 128),
             nn.ReLU(),
@@ -66,7 +65,8 @@ class PaperQNetwork(nn.Module):
 
     def see(self, images: Tensor) -> Tensor:
         """uint8 (N, H, W, C) -> features float32 (N, F)."""
-        return self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+        pixels = images.permute(0, 3, 1, 2).float() / 255.0
+        return self.features(pixels)
 
     def forward(
         self,
@@ -95,14 +95,9 @@ class Lived(Columns):
     """Steps of executions, arrays (n, ...)."""
 
     path: NDArray[np.int32]  # (n, recurrence + 1), ids: a window, then the state that came next, then any of these
-    length: Ids  # of the window
-    action: Ids
-    terminated: Flags  # the task is over
-
-    @classmethod
-    def empty(cls, rows: int, recurrence: int) -> Self:
-        """Rows of zeros."""
-        return replace(cls.zeros(rows), path=np.zeros((rows, recurrence + 1), np.int32))
+    length: Ints  # of the window
+    action: Ints
+    terminated: Bools  # the task is over
 
 
 class Member(DoubleDQN):
@@ -114,13 +109,45 @@ class Member(DoubleDQN):
 
     def __init__(self, online: PaperQNetwork, config: PaperConfig):
         super().__init__(online, config)
-        self.replay = PrioritisedReplay(Lived.empty(config.replay, config.recurrence))
+        path = np.zeros((config.replay, config.recurrence + 1), np.int32)
+        rows = replace(Lived.zeros(config.replay), path=path)
+        self.replay = PrioritisedReplay(rows)
         self.due = 0
+
+
+class PaperPolicies:
+    """Greedy policies of saved options that have a network each (Spec D2, D8)."""
+
+    def __init__(self, options: saved.SavedOptions):
+        self.recurrence = options.config["recurrence"]
+        actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
+        make = partial(PaperQNetwork, options.shape, actions)
+        self.networks = []
+        for option in range(options.count):
+            network = load_fitting(make, below(f"{option}.", options.weights), saved.FILE)
+            self.networks.append(network.eval())
+
+    def __call__(self, option: int) -> Callable[[Observations], int]:
+        """Start an execution."""
+        network = self.networks[option]
+        window: deque[Observations] = deque(maxlen=self.recurrence)
+
+        @torch.no_grad()
+        def act(observation: Observations) -> int:
+            window.append(observation)
+            features = network.see(torch.from_numpy(np.stack(window)))
+            count = len(window)
+            whole = torch.arange(count)[None]
+            values = network(features, whole, torch.tensor([count]))
+            return int(values.argmax())
+
+        return act
 
 
 class PaperLearner(Learner):
     """The intra-option policies of all O options, each on its own; arguments as of :class:`Learner`."""
 
+    policies = PaperPolicies
     CHANGING = (*Learner.CHANGING, "members", "windows", "lengths")
 
     @classmethod
@@ -136,10 +163,6 @@ class PaperLearner(Learner):
         if engine.observation_dtype != PICTURE:
             fault = "the paper's networks see pictures only"
             raise UserError(fault, "network=paper", "Give --set network=light.")
-
-    @classmethod
-    def policies(cls, options: saved.SavedOptions) -> saved.Policies:
-        return PaperPolicies(options)
 
     def build(self, config: PaperConfig, seed: int) -> None:
         self.members = []
@@ -163,10 +186,10 @@ class PaperLearner(Learner):
     @torch.no_grad()
     def greedy(
         self,
-        ids: Ids,
-        options: Ids,
-        age: Ids,
-    ) -> Ids:
+        ids: Ints,
+        options: Ints,
+        age: Ints,
+    ) -> Ints:
         """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
         begun, full = age == 0, age >= self.config.recurrence
         self.windows[begun] = ids[begun, None]
@@ -183,10 +206,11 @@ class PaperLearner(Learner):
             chosen[rows] = values.argmax(1).cpu().numpy()
         return chosen
 
-    def _seen(self, windows: Ids) -> tuple[Tensor, Tensor]:
+    def _seen(self, windows: Ints) -> tuple[Tensor, Tensor]:
         """The distinct images in windows, and which one each place has."""
         states, places = np.unique(windows, return_inverse=True)
-        return self.tensor(self.engine.images(states)), self.tensor(places.reshape(windows.shape))
+        images = tensor(self.engine.images(states), self.device)
+        return images, tensor(places.reshape(windows.shape), self.device)
 
     def observe(self, moved: Transitions) -> None:
         path = np.column_stack([self.windows, moved.next_ids])
@@ -226,7 +250,14 @@ class PaperLearner(Learner):
         following = np.where(length[:, None] < most, now, shifted)
         lengths = torch.from_numpy(length)
         later_lengths = torch.from_numpy(np.minimum(length + 1, most))
-        images, places = self._seen(np.stack([now, following]))  # each image once; BatchNorm counts it once (DEV-51)
+        images, places = self._seen(
+            np.stack(
+                [
+                    now,
+                    following,
+                ]
+            )
+        )  # each image once; BatchNorm counts it once (DEV-51)
         before, after = places
         online, target = member.online.train(), member.target
         features = online.see(images)
@@ -267,41 +298,3 @@ class PaperLearner(Learner):
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):
             member.load(below(f"{option}.", weights), f"option {option} of {saved.FILE}")
-
-
-class PaperPolicies:
-    """Greedy policies of saved options that have a network each (Spec D2, D8)."""
-
-    def __init__(self, options: saved.SavedOptions):
-        self.recurrence = options.config["recurrence"]
-        if not isinstance(self.recurrence, int):
-            fault = "these options remember their executions in another way than this version's"
-            raise UserError(
-                fault,
-                f"recurrence={self.recurrence}",
-                "Train them again with --set recurrence=N.",
-            )
-        make = partial(
-            PaperQNetwork,
-            options.shape,
-            options.actions("0.values.2.bias", 1),
-        )
-        self.networks = []
-        for option in range(options.count):
-            network = load_fitting(make, below(f"{option}.", options.weights), saved.FILE)
-            self.networks.append(network.eval())
-
-    def __call__(self, option: int) -> Callable[[Observations], int]:
-        """Start an execution."""
-        window: deque[Observations] = deque(maxlen=self.recurrence)
-        return partial(_act, self.networks[option], window)
-
-
-@torch.no_grad()
-def _act(network: PaperQNetwork, window: deque[Observations], observation: Observations) -> int:
-    """The action in the last state of an execution, of which ``window`` has those before."""
-    window.append(observation)
-    features = network.see(torch.from_numpy(np.stack(window)))
-    count = len(window)
-    values = network(features, torch.arange(count)[None], torch.tensor([count]))
-    return int(values.argmax())

@@ -10,12 +10,12 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
+from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.observations import Observations
 from hypogoal.options.loop import offered_options
-from hypogoal.options.parts import Flags, Floats
 from hypogoal.options.reward import require_observations
 from hypogoal.options.saved import Policies
 from hypogoal.options.termination import Terminations
@@ -77,10 +77,10 @@ class Options:
         ensemble = self.ensembles[option // self.members]
         return ensemble.log_odds(observation[None])[:, option % self.members]
 
-    def offered(self, observation: Observations) -> Flags:
+    def offered(self, observation: Observations) -> Bools:
         """Spec D6: which options may start in an observation (*obs): bool (G*K,)."""
         if not self.mask_reached:
-            return np.ones(self.count, dtype=np.bool_)
+            return np.ones(self.count, np.bool_)
         log_odds = [ensemble.log_odds(observation[None]) for ensemble in self.ensembles]
         return offered_options(self.ends.positive(np.concatenate(log_odds, axis=1)))[0]
 
@@ -131,7 +131,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._image: Observations | None = None
-        self._masks: Flags | None = None  # of the current observation, once they were asked for
+        self._masks: Bools | None = None  # of the current observation, once they were asked for
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Like the environment's own."""
@@ -139,7 +139,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._image, self._masks = self._look.read(observation), None
         return observation, info
 
-    def action_masks(self) -> Flags:
+    def action_masks(self) -> Bools:
         """Spec D6: which options may start here, bool (G*K,)."""
         if self._masks is None:
             self._masks = self.options.offered(self._current())

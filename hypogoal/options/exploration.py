@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from hypogoal.core.arrays import Doubles
+from hypogoal.core.arrays import Doubles, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.options.config import LearnerConfig
-from hypogoal.options.parts import Ids
 
 EXPONENT, LONGEST = 2.0, 10_000  # of how long a random action lasts, P(n) ~ n^-2, at most so many steps
 
@@ -30,15 +29,15 @@ class Exploration(Resumable):
     ):
         self.actions, self.rng = actions, rng
         self.persistent = config.exploration == "persistent"
-        self.kept = np.zeros(environments, dtype=np.int64)  # random actions
-        self.left = np.zeros(environments, dtype=np.int64)  # steps for which these still last
+        self.kept = np.zeros(environments, np.int64)  # random actions
+        self.left = np.zeros(environments, np.int64)  # steps for which these still last
 
     def mix(
         self,
-        policy: Ids,
+        policy: Ints,
         epsilon: Doubles,
-        age: Ids,
-    ) -> Ids:
+        age: Ints,
+    ) -> Ints:
         """Actions int64 (E,): the policy's (E,), or random ones, by ``epsilon`` (E,), ``age`` (E,) steps after
         executions began.
         """

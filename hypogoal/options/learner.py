@@ -7,17 +7,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.arrays import Columns, Doubles, tensor
+from hypogoal.core.arrays import Bools, Columns, Doubles, Floats, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
-from hypogoal.options.parts import Flags, Floats, Ids, Part, answer_of, load_part, saved_row
+from hypogoal.options.parts import Part, answer_of, load_part, saved_row
 from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.termination import ORACLE, Terminations
 
@@ -32,15 +31,15 @@ LEARNERS = {
 class Transitions(Columns):
     """One step of every environment, arrays (E,): what intra-option policies learn from."""
 
-    ids: Ids
-    actions: Ids
-    next_ids: Ids
+    ids: Ints
+    actions: Ints
+    next_ids: Ints
     rewards: Floats
-    options: Ids  # that were running
-    terminated: Flags  # the task is over
-    reached: Flags  # the option reached its sub-goal
-    timed_out: Flags  # its time was up without that
-    ended: Flags  # it stopped here for whatever reason
+    options: Ints  # that were running
+    terminated: Bools  # the task is over
+    reached: Bools  # the option reached its sub-goal
+    timed_out: Bools  # its time was up without that
+    ended: Bools  # it stopped here for whatever reason
 
 
 class Learner(Part, ABC):
@@ -72,7 +71,7 @@ class Learner(Part, ABC):
         self.rng = rng_for(seed, "options")
         if isinstance(config, LearnerConfig):
             self.exploration = Exploration(config, engine.count, engine.n_actions, self.rng)
-        self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), dtype=np.int64)
+        self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), np.int64)
         self.build(config, seed)
         reach = self.reach(config, self.options)
         if engine.memory is not None and reach > engine.memory:  # Spec D3
@@ -83,11 +82,11 @@ class Learner(Part, ABC):
             )
 
     @classmethod
-    def policies(cls, saved: SavedOptions) -> Policies:
+    def policies(cls, options: SavedOptions) -> Policies:
         """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
         fault = "these options need their domain's engine, which is not in the artefact"
         do = "Load options of the light or the paper's network."
-        raise UserError(fault, f"network={saved.config['network']}", do)
+        raise UserError(fault, f"network={options.config['network']}", do)
 
     @abstractmethod
     def build(self, config: Any, seed: int) -> None:
@@ -99,7 +98,7 @@ class Learner(Part, ABC):
         """How many states back the learner looks."""
 
     @abstractmethod
-    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+    def greedy(self, ids: Ints, options: Ints, age: Ints) -> Ints:
         """Which action each option's policy prefers, int64 (E,); arguments as of :meth:`act`."""
 
     @abstractmethod
@@ -122,7 +121,7 @@ class Learner(Part, ABC):
         steps = self.steps_since_positive if self.config.epsilon_from == "first-positive" else self.option_steps
         return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
 
-    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
+    def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
         chosen = self.greedy(ids, options.copy(), age.copy())
         chosen = answer_of(self, "greedy", chosen, np.int64, len(ids), self.engine.n_actions - 1)
@@ -130,15 +129,11 @@ class Learner(Part, ABC):
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen
 
-    def count(self, options: Ids) -> None:
+    def count(self, options: Ints) -> None:
         """Steps of these options (n,) were learned from, after those that reached their sub-goals are counted."""
         np.add.at(self.option_steps, options, 1)
         reached = (self.positives > 0) | (self.steps_since_positive > 0)
         np.add.at(self.steps_since_positive, options, reached[options])
-
-    def tensor(self, values: NDArray[Any]) -> Tensor:
-        """An array on the networks' device."""
-        return tensor(values, self.device)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""

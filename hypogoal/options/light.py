@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
@@ -22,7 +23,6 @@ from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options import networks, saved
 from hypogoal.options.config import STACK, LightConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.parts import Flags, Floats, Ids
 
 POSITIVES_KEPT = 512  # per member
 POSITIVE_SHARE = 0.25  # of a batch: steps that reached a sub-goal
@@ -33,13 +33,14 @@ GRADIENT_NORM = 10.0
 class Lessons(Steps):
     """Transitions to learn from, arrays (n,)."""
 
-    option: Ids  # that was running
-    terminated: Flags  # the task is over
+    option: Ints  # that was running
+    terminated: Bools  # the task is over
 
 
 class LightLearner(Learner):
     """The intra-option policies of all O options, acting and learning together; arguments as of :class:`Learner`."""
 
+    policies = saved.LightPolicies
     CHANGING = (*Learner.CHANGING, "networks", "replay", "ahead", "positive", "steps", "due")
 
     @classmethod
@@ -53,10 +54,6 @@ class LightLearner(Learner):
                 setting,
                 "Give --set experience=own or --set n_step=1.",
             )
-
-    @classmethod
-    def policies(cls, options: saved.SavedOptions) -> saved.Policies:
-        return saved.LightPolicies(options)
 
     def build(self, config: LightConfig, seed: int) -> None:
         self.running_only = config.experience == "own"
@@ -87,10 +84,10 @@ class LightLearner(Learner):
     @torch.no_grad()
     def greedy(
         self,
-        ids: Ids,
-        options: Ids,
-        age: Ids,
-    ) -> Ids:
+        ids: Ints,
+        options: Ints,
+        age: Ints,
+    ) -> Ints:
         values = networks.apply_to_states(self.networks.online, self.engine, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
@@ -114,7 +111,7 @@ class LightLearner(Learner):
         self.steps += len(moved.ids)
         self.due += len(moved.ids)
 
-    def _judged(self, rows: Lessons) -> tuple[Flags, Flags]:
+    def _judged(self, rows: Lessons) -> tuple[Bools, Bools]:
         """Which options' sub-goals hold in ``state`` and in ``next_state`` of transitions, bool (m, O) each.
 
         With own experience, False for all options but the one that was running.
@@ -166,7 +163,7 @@ class LightLearner(Learner):
         self.replay.set_priorities(indices, errors[: len(indices)])
         return loss
 
-    def _batch(self) -> tuple[Lessons, Ids, Floats]:
+    def _batch(self) -> tuple[Lessons, Ints, Floats]:
         """Transitions, the first of them drawn from the replay at indices int64 (m,), and weights float32 (n,)."""
         kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
         if self.engine.memory is not None:

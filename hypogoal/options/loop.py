@@ -6,15 +6,14 @@ one step and its termination is tested on the state it arrives at; it ends when 
 D4), the end of an option is also that of its episode.
 """
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from hypogoal.core.arrays import Bools
-from hypogoal.core.checkpoints import Resumable, State
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine, Step, check_step
+from hypogoal.domains.base import Engine, Step
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
@@ -33,6 +32,7 @@ def offered_options(predictions: Bools) -> Bools:
     return offered
 
 
+@dataclass(eq=False, repr=False)
 class OptionLoop(Resumable):
     """Steps every environment once per call of :meth:`step`.
 
@@ -42,36 +42,32 @@ class OptionLoop(Resumable):
     """
 
     CHANGING = (
-        *("terminations", "learner", "chooser", "recorder", "visited"),
+        *("engine", "terminations", "learner", "chooser", "recorder", "visited"),
         *("option", "began", "age", "inside", "returns"),
     )
 
-    def __init__(
-        self,
-        engine: Engine,
-        terminations: Terminations,
-        learner: Learner,
-        chooser: Chooser,
-        recorder: Recorder,
-        config: OptionConfig,
-        gamma: float,
-        visited: Visited | None = None,
-    ):
-        self.visited = visited
-        self.engine, self.terminations, self.learner, self.chooser = engine, terminations, learner, chooser
-        self.recorder, self.config, self.gamma = recorder, config, gamma
-        if config.restart_options and not engine.restarts:
+    engine: Engine
+    terminations: Terminations
+    learner: Learner
+    chooser: Chooser
+    recorder: Recorder
+    config: OptionConfig
+    gamma: float
+    visited: Visited | None = None
+
+    def __post_init__(self) -> None:
+        if self.config.restart_options and not self.engine.restarts:
             raise UserError(
                 "this domain's engine cannot begin an episode on request",
                 "restart_options=true",
                 "Give --set restart_options=false.",
             )
-        count = engine.count
+        count = self.engine.count
         self.option = np.full(count, NONE)
-        self.began, self.age = np.zeros((2, count), dtype=np.int64)  # states in which options were chosen; steps since
-        self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
+        self.began, self.age = np.zeros((2, count), np.int64)  # states in which options were chosen; steps since
+        self.inside = np.zeros(count, np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
-        engine.reset()
+        self.engine.reset()
 
     def step(self) -> dict[str, float]:
         """One step of every environment, then the updates that are due; returns numbers to log."""
@@ -83,13 +79,10 @@ class OptionLoop(Resumable):
 
         Without ``learning`` the agent is frozen: options are greedy, and nothing is kept that could be learned from.
         """
-        first = (self.option == NONE).all()
         self._choose(learning)
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=learning)
         step = self.engine.step(actions)
-        if first:
-            check_step(self.engine, step)
         log_odds = self.terminations.log_odds(step.next_ids, option)
         reached = self.terminations.reached(log_odds, option.copy(), self.age.copy())
         reached = answer_of(self.terminations, "reached", reached, np.bool_, len(option))
@@ -125,7 +118,7 @@ class OptionLoop(Resumable):
         if not len(free):
             return
         ids = self.engine.ids[free]
-        offered = np.ones((len(free), self.terminations.options), dtype=np.bool_)
+        offered = np.ones((len(free), self.terminations.options), np.bool_)
         if self.config.mask_reached:
             offered = offered_options(self.terminations.of(ids))
         chosen = self.chooser.choose(free, ids, offered.copy())
@@ -161,10 +154,3 @@ class OptionLoop(Resumable):
         self.recorder.finished(outcome)
         self.chooser.record(outcome)
         self.option[done] = NONE
-
-    def snapshot(self) -> State:
-        return {"engine": self.engine.snapshot(), **super().snapshot()}
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        self.engine.restore(snapshot["engine"])
-        super().restore(snapshot)

@@ -22,7 +22,7 @@ class CellEmbedding(nn.Module):
     """A convolution whose kernel and stride are one cell (8 pixels), to ``CHANNELS`` features each, then ReLU.
 
     Images made of few distinct tiles are looked up: each tile is convolved once, its features gathered by tile code.
-    The values and gradients are the same. An image that whole cells do not fill is continued in black.
+    The values and gradients are the same.
     """
 
     CHANNELS = 8
@@ -36,8 +36,7 @@ class CellEmbedding(nn.Module):
             CELL,
             stride=CELL,
         )
-        self._more = (0, 0, 0, -width % CELL, 0, -height % CELL)  # no channels; columns and rows behind the last
-        self.features = self.CHANNELS * -(-height // CELL) * -(-width // CELL)
+        self.features = self.CHANNELS * (height // CELL) * (width // CELL)
         self._tiles: Bytes | None = None
         self._pixels = torch.empty(0)
 
@@ -48,8 +47,6 @@ class CellEmbedding(nn.Module):
         """
         if tiles is not None:
             return self._looked_up(images, tiles)
-        if any(self._more):
-            images = nn.functional.pad(images, self._more)
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
         return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 

@@ -1,10 +1,10 @@
-"""Parts of an agent that a setting names: choosers, learners, termination rules; and the arrays that they share."""
+"""Parts of an agent that a setting names: choosers, learners, termination rules."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from hypogoal.domains.base import Engine
-
-Ids: TypeAlias = NDArray[np.int64]  # (n,), of environments, states or options
-Flags: TypeAlias = NDArray[np.bool_]
-Floats: TypeAlias = NDArray[np.float32]
 
 
 class Part(Resumable):

@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.parts import Flags, Ids
 from hypogoal.options.termination import Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
@@ -47,10 +47,10 @@ class PlannedLearner(Learner):
 
     def greedy(
         self,
-        ids: Ids,
-        options: Ids,
-        age: Ids,
-    ) -> Ids:
+        ids: Ints,
+        options: Ints,
+        age: Ints,
+    ) -> Ints:
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
         nearest = ahead.argmin(axis=1)
         return self.actions[nearest]
@@ -66,27 +66,27 @@ def plan_of(
     engine: Engine,
     terminations: Terminations,
     config: OptionConfig,
-    starts: Ids | None = None,
+    starts: Ints | None = None,
 ) -> Plan:
     """The engine's plan, from these states or where episodes begin; a ``UserError`` where options cannot be planned."""
     if type(terminations) is not Terminations:
         fault = "only options that end at a single positive prediction can be planned"
         raise UserError(fault, f"termination={config.termination}", "Give termination=learned.")
-    plan = engine.plan() if starts is None else engine.plan(starts)  # a user's engine may take none
+    plan = engine.plan(starts)
     if plan is None:
         fault = "this domain does not know what each action leads to"
         raise UserError(fault, f"network={config.network}", "Give --set network=light.")
     return plan
 
 
-def places_of(plan: Plan, engine: Engine) -> Ids:
+def places_of(plan: Plan, engine: Engine) -> Ints:
     """Where in a plan each of the engine's states is, int64 (n_states,); -1 of those that are not in it."""
     places = np.full(engine.n_states, -1, np.int64)
     places[plan.ids] = np.arange(len(plan.ids))
     return places
 
 
-def distances(reached: Flags, after: Ids, final: Flags) -> NDArray[np.int32]:
+def distances(reached: Bools, after: Ints, final: Bools) -> NDArray[np.int32]:
     """Breadth-first search from all sub-goals at once, against the direction of time: steps to them, int32 (N, O).
 
     0 where an option's sub-goal is ``reached`` (N, O), ``FAR`` where no way leads there; states ``after`` each action

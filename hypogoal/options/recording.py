@@ -9,16 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.data import create_hdf5
 from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import Outcome
-from hypogoal.options.parts import Flags, Floats, Ids
-from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
+from hypogoal.options.tables import ChoiceCounts, Episodes, Executions, Exploits
 
 STOPS_KEPT = 128  # per option
+WINDOW = 5_000  # steps in which choices are counted together
 
 
 class Execution(NamedTuple):
@@ -35,20 +36,15 @@ class Execution(NamedTuple):
 
 
 class Recorder(Resumable):
-    """Counts choices per ``window`` of steps, lists episodes, keeps the last executions and stops of each of O options.
+    """Counts choices per ``WINDOW`` of steps, lists episodes, keeps the last executions and stops of each of O options.
 
     Of an engine that forgets states, stops are kept as pictures.
     """
 
     CHANGING = ("episodes", "choices", "stops", "executions", "pictures", "paths", "counts", "counted_from")
 
-    def __init__(
-        self,
-        options: int,
-        engine: Engine,
-        window: int = 5_000,
-    ):
-        self.options, self.engine, self.window = options, engine, window
+    def __init__(self, options: int, engine: Engine):
+        self.options, self.engine = options, engine
         self.episodes = EpisodeRecorder(engine.count)
         self.choices: list[tuple[float, ...]] = []
         self.stops: list[deque[int]] = latest(options, STOPS_KEPT)
@@ -73,9 +69,9 @@ class Recorder(Resumable):
         for path, state in zip(self.paths, step.next_ids.tolist(), strict=True):
             path.append(state)
 
-    def chose(self, options: Ids, offered: Flags) -> None:
+    def chose(self, options: Ints, offered: Bools) -> None:
         """Decisions: the options chosen (n,) among those offered, bool (n, O)."""
-        if self.steps - self.counted_from >= self.window:
+        if self.steps - self.counted_from >= WINDOW:
             self.flush()
         self.counts[:, 0] += offered.sum(0)
         np.add.at(
@@ -83,7 +79,8 @@ class Recorder(Resumable):
             options,
             1,
         )
-        self.counts[:, 2] += (offered / offered.sum(1, keepdims=True)).sum(0)
+        shares = offered / offered.sum(1, keepdims=True)
+        self.counts[:, 2] += shares.sum(0)
 
     def finished(self, outcome: Outcome) -> None:
         """Executions that ended."""
@@ -120,14 +117,12 @@ class Recorder(Resumable):
 
     def recent(self, *, restarted: bool) -> dict[str, float]:
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
-        if not restarted and self.episodes:
-            return self.episodes.recent()
+        if not restarted:
+            return self.episodes.recent() if self.episodes else {}
         numbers: dict[str, float] = {}
-        runs = self._executions()
-        if not restarted or not runs:
-            return numbers
-        for name in ("reached", "terminated", "duration"):
-            numbers[name] = fmean(getattr(run, name) for run in runs)
+        if runs := self._executions():
+            for name in ("reached", "terminated", "duration"):
+                numbers[name] = fmean(getattr(run, name) for run in runs)
         return numbers
 
     def _executions(self) -> list[Execution]:
@@ -151,7 +146,7 @@ class Recorder(Resumable):
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
         self.flush()
         Episodes.of_rows(self.episodes).write(folder)
-        Choices.of_rows(self.choices).write(folder)
+        ChoiceCounts.of_rows(self.choices).write(folder)
         with create_hdf5(folder / "terminations.h5") as file:
             for option, stops in enumerate(self.stops):
                 if stops:
@@ -164,14 +159,25 @@ class Recorder(Resumable):
                         compression_opts=1,
                     )
 
-    def write_executions(self, folder: Path, distances: Callable[[Ids, Ids], Ids]) -> None:
+    def write_executions(
+        self,
+        folder: Path,
+        distances: Callable[
+            [
+                Ints,
+                Ints,
+            ],
+            Ints,
+        ],
+    ) -> None:
         """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
 
         ``distances`` are of positions (n, 3) from where the sub-goals of their options (n,) truly hold, int (n,).
         """
         runs = self._executions()
-        stops = np.array([run.states[-1] for run in runs], dtype=np.int64)
-        options = np.array([run.option for run in runs], dtype=np.int64)
+        stopped = [run.states[-1] for run in runs]
+        stops = np.array(stopped, np.int64)
+        options = np.array([run.option for run in runs], np.int64)
         places = self.engine.positions(stops)
         aways = distances(places, options)
         rows = []
@@ -182,8 +188,8 @@ class Recorder(Resumable):
     def write_exploits(
         self,
         folder: Path,
-        near: Callable[[Ids, Ids], Flags],
-        log_odds: Callable[[Ids, Ids], Floats],
+        near: Callable[[Ints, Ints], Bools],
+        log_odds: Callable[[Ints, Ints], Floats],
     ) -> None:
         """Spec H5: ``exploits.csv`` into ``folder``, of the same executions: how sure its own classifier was at most.
 
@@ -192,12 +198,13 @@ class Recorder(Resumable):
         """
         rows = []
         for run in self._executions():
-            states = np.array(run.states, dtype=np.int64)
+            states = np.array(run.states, np.int64)
             options = np.full_like(states, run.option)
             is_near, sure = near(states, options), log_odds(states, options)
             best_near = np.fmax.reduce(sure[is_near], initial=np.nan)  # NaN of none
             best_far = np.fmax.reduce(sure[~is_near], initial=np.nan)
-            rows.append((run.step, run.option, run.reached, is_near[-1], best_near, best_far))
+            row = (run.step, run.option, run.reached, is_near[-1], best_near, best_far)
+            rows.append(row)
         Exploits.of_rows(rows).write(folder)
 
 

@@ -12,11 +12,11 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
+from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.options.parts import Flags, Floats
 from hypogoal.options.termination import load_rule
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -29,7 +29,7 @@ MEANINGS = {
 
 def require_observations(env: Env, ensemble: Ensemble) -> Reader:
     """A reader of an environment's observations; a ``UserError`` if the ensemble was trained on others."""
-    reader, dtype, shape = reader_of(env), ensemble.view.dtype, ensemble.observation_shape
+    reader, dtype, shape = reader_of(env.observation_space), ensemble.view.dtype, ensemble.observation_shape
     if (reader.shape, reader.dtype) != (shape, dtype):
         mismatch = f"{reader.dtype} {reader.shape}, not {dtype} {shape}"
         do = "Use the environment they were trained on, with its wrappers."
@@ -91,32 +91,28 @@ class SubgoalReward:
         """The rewards (N,) of observations."""
         return self.holds(observations).astype(np.float32)
 
-    def holds(self, observations: Any) -> Flags:
+    def holds(self, observations: Any) -> Bools:
         """Whether the sub-goal holds in observations: bool (N,)."""
         return self.decide(self.ends.positive(self.ensemble.log_odds(observations)))
 
-    def decide(self, members: Flags) -> Flags:
+    def decide(self, members: Bools) -> Bools:
         """Whether the sub-goal holds where members say so: bool (N, K) to (N,)."""
         if self.by in self.least:
-            return np.asarray(members.sum(1) >= self.least[self.by])
+            return members.sum(1) >= self.least[self.by]
         return members[:, int(self.by)]
 
     def wrap(
         self,
         env: Env,
         *,
-        scale: float = 1.0,
-        add: bool = False,
         ends: bool = True,
         start: str = "unpaid",
         away: int = 1,
     ) -> RewardedEnv:
-        """An environment that pays ``scale`` where the sub-goal holds, else 0.
+        """An environment that pays 1 where the sub-goal holds, else 0, in place of its own reward.
 
         Args:
             env: one whose observations are those of training.
-            scale: what it pays.
-            add: that is added to its own reward instead of replacing it.
             ends: its episode terminates where it pays; else an agent can stay where it is rewarded.
             start: of an episode that begins where the prediction is positive, so that doing nothing would be paid:
                 ``unpaid`` until the prediction has been negative, ``paid``, or ``refuse``, a ``UserError`` by
@@ -127,9 +123,9 @@ class SubgoalReward:
         ``info["subgoal"]`` is ``{"predicted": bool, "paid": float}``, of ``reset`` and of every step.
 
         Raises:
-            UserError: other observations than those of training; an unknown ``start``; ``away`` below 1.
+            UserError: other observations than those of training; an unknown ``start``.
         """
-        return RewardedEnv(env, self, scale, add, ends, start, away)
+        return RewardedEnv(env, self, ends, start, away)
 
 
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -139,22 +135,17 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self,
         env: Env,
         reward: SubgoalReward,
-        scale: float,
-        add: bool,
         ends: bool,
         start: str,
         away: int,
     ):
-        kept = {"reward": reward, "scale": scale, "add": add, "ends": ends, "start": start, "away": away}
+        kept = {"reward": reward, "ends": ends, "start": start, "away": away}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
         gymnasium.Wrapper.__init__(self, env)
         if start not in STARTS:
             raise UserError("unknown way with starts inside", f"start={start!r}", f"Choose one of {', '.join(STARTS)}.")
-        if away < 1:
-            raise UserError("a prediction is negative for at least one step", f"away={away}", "Give 1 or more.")
         self._reader = require_observations(env, reward.ensemble)
-        self.reward, self.scale, self.add, self.ends = reward, scale, add, ends
-        self.start, self.away = start, away
+        self.reward, self.ends, self.start, self.away = reward, ends, start, away
         self._rule = copy.deepcopy(reward.ends)
         self._age = 0
         self._negatives = 0  # steps in a row
@@ -173,7 +164,7 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step with reward and end changed."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, _reward, terminated, truncated, info = self.env.step(action)
         log_odds = self._log_odds(observation)
         members = np.arange(len(log_odds))
         reached = self._rule.reached(log_odds, members, np.full_like(members, self._age))
@@ -183,10 +174,9 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._negatives = 0 if self._positive(log_odds) else self._negatives + 1
             self._pays = self._negatives >= self.away
         holds = predicted and self._pays
-        of_sub_goal = self.scale if holds else 0.0
-        paid = of_sub_goal + float(reward) if self.add else of_sub_goal
+        paid = float(holds)
         terminated = bool(terminated) or (holds and self.ends)
-        shown = {"predicted": predicted, "paid": of_sub_goal}
+        shown = {"predicted": predicted, "paid": paid}
         return observation, paid, terminated, truncated, info | {"subgoal": shown}
 
     def _log_odds(self, observation: Any) -> Floats:

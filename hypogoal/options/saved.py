@@ -31,27 +31,16 @@ class SavedOptions:
         """How many options there are."""
         return len(self.config["sub_goals"]) * self.config["members"]
 
-    def actions(self, layer: str, heads: int) -> int:
-        """How many actions there are, A, if the weights' last ``layer`` has so many heads of A outputs; else any."""
-        return len(self.weights.get(layer, ())) // heads or 1
-
 
 class LightPolicies:
     """Those of options that share a light network."""
 
-    def __init__(self, saved: SavedOptions):
-        weights = below("online.", saved.weights)
-        embedding = saved.config["embedding"]
-        actions = saved.actions("online.heads.weight", saved.count)
-        standard = standard_of(saved.shape) if "cells.mean" in weights else None  # the weights' own replaces it
-        make = partial(
-            LightQNetwork,
-            saved.shape,
-            saved.count,
-            actions,
-            standard,
-            embedding,
-        )
+    def __init__(self, options: SavedOptions):
+        weights = below("online.", options.weights)
+        embedding = options.config["embedding"]
+        actions = len(weights.get("heads.weight", ())) // options.count or 1  # any, where weights are missing
+        standard = standard_of(options.shape) if "cells.mean" in weights else None  # the weights' own replaces it
+        make = partial(LightQNetwork, options.shape, options.count, actions, standard, embedding)
         self.network = load_fitting(make, weights, FILE)
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

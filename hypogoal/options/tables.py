@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from hypogoal.core.arrays import Columns, Doubles
+from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, replacing
 from hypogoal.learners.episodes import LAST
-from hypogoal.options.parts import Flags, Ids
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -67,12 +66,12 @@ class Episodes(Table):
 
     FILE = "episodes.csv"
 
-    step: Ids  # environment steps when it ended, summed over parallel environments and stages
-    length: Ids  # steps
+    step: Ints  # environment steps when it ended, summed over parallel environments and stages
+    length: Ints  # steps
     reward: Doubles  # undiscounted
-    terminated: Flags  # it reached a terminal state; else it was cut at the cap
+    terminated: Bools  # it reached a terminal state; else it was cut at the cap
     # Spec F5: as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
-    succeeded: Flags
+    succeeded: Bools
 
     def last(self, count: int = LAST) -> Episodes:
         """The last ``count`` episodes, or all where there are fewer."""
@@ -80,18 +79,18 @@ class Episodes(Table):
 
 
 @dataclass(frozen=True)
-class Choices(Table):
+class ChoiceCounts(Table):
     """Choices of options: one row per option and window of steps that ends at ``step``."""
 
     FILE = "choices.csv"
 
-    step: Ids
-    option: Ids  # g*K + k
-    offered: Ids  # decisions in which it was offered
-    chosen: Ids  # decisions for it
+    step: Ints
+    option: Ints  # g*K + k
+    offered: Ints  # decisions in which it was offered
+    chosen: Ints  # decisions for it
     expected: Doubles  # decisions for it under uniform-random choice
-    reached: Ids  # executions that reached its sub-goal
-    duration: Ids  # steps of its executions
+    reached: Ints  # executions that reached its sub-goal
+    duration: Ints  # steps of its executions
 
     def total(self, name: str, options: int) -> Doubles:
         """The sum of column ``name`` over all windows, (O,)."""
@@ -104,24 +103,16 @@ class Executions(Table):
 
     FILE = "executions.csv"
 
-    step: Ids  # environment steps when it ended
-    option: Ids  # g*K + k
-    duration: Ids  # steps
-    reached: Flags  # its own termination classifier ended it
-    inside_at_start: Flags  # that classifier's prediction was positive where it began
-    terminated: Flags  # the episode ended in a terminal state: the agent died
-    room: Ids  # where it stopped; x and y too
-    x: Ids
-    y: Ids
-    distance: Ids  # from there to the nearest true sub-goal, in the domain's units
-
-    def of(self, option: int, last: int = LAST) -> Executions:
-        """The last executions of one option."""
-        return self.at(np.flatnonzero(self.option == option)[-last:])
-
-    def positions(self) -> Ids:
-        """Where they stopped, (n, 3)."""
-        return np.stack([self.room, self.x, self.y], axis=1)
+    step: Ints  # environment steps when it ended
+    option: Ints  # g*K + k
+    duration: Ints  # steps
+    reached: Bools  # its own termination classifier ended it
+    inside_at_start: Bools  # that classifier's prediction was positive where it began
+    terminated: Bools  # the episode ended in a terminal state: the agent died
+    room: Ints  # where it stopped; x and y too
+    x: Ints
+    y: Ints
+    distance: Ints  # from there to the nearest true sub-goal, in the domain's units
 
 
 @dataclass(frozen=True)
@@ -130,10 +121,10 @@ class Exploits(Table):
 
     FILE = "exploits.csv"
 
-    step: Ids  # environment steps when it ended
-    option: Ids  # g*K + k
-    reached: Flags  # its own termination classifier ended it
-    near: Flags  # that was near its true sub-goal
+    step: Ints  # environment steps when it ended
+    option: Ints  # g*K + k
+    reached: Bools  # its own termination classifier ended it
+    near: Bools  # that was near its true sub-goal
     best_near: Doubles  # highest log-odds near the true sub-goal; NaN where it did not come near
     best_far: Doubles  # highest log-odds far from it; NaN where it always was near
 

@@ -17,16 +17,15 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from hypogoal.core.arrays import tensor
+from hypogoal.core.arrays import Bools, Floats, Ints, tensor
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import as_input, folded
+from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.options.parts import Flags, Floats, Ids, Part, load_part, saved_row
+from hypogoal.options.parts import Part, load_part, saved_row
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
 ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
-MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
 
 
 class Terminations(Part):
@@ -47,25 +46,35 @@ class Terminations(Part):
 
     def __init__(
         self,
-        classify: Callable[[Ids], Any] | None,
+        classify: Callable[[Ints], Any] | None,
         options: int,
-        classify_one: Callable[[Ids, int], Floats] | None = None,
+        classify_one: Callable[[Ints, int], Floats] | None = None,
         thresholds: Floats | None = None,
         environments: int = 1,
     ):
         self.classify = classify
         self.classify_one = classify_one
         self.options = options
-        self.thresholds = np.zeros(options, dtype=np.float32) if thresholds is None else thresholds
+        self.thresholds = (
+            np.zeros(
+                options,
+                np.float32,
+            )
+            if thresholds is None
+            else thresholds
+        )
         self.environments = environments
-        self.judged = np.zeros((0, options), dtype=np.float32)  # log-odds of states by id; NaN: not judged yet
+        self.judged = np.zeros(
+            (0, options),
+            np.float32,
+        )  # log-odds of states by id; NaN: not judged yet
 
     def reached(
         self,
         log_odds: Floats,
-        options: Ids,
-        age: Ids,
-    ) -> Flags:
+        options: Ints,
+        age: Ints,
+    ) -> Bools:
         """Whether executions reach their sub-goals in the states they come to: bool (E,), called once a step.
 
         ``log_odds`` float32 (E,) are how sure the running ``options`` (E,) are of these states, ``age`` (E,) their
@@ -75,25 +84,25 @@ class Terminations(Part):
 
     def finished(
         self,
-        environments: Ids,
-        options: Ids,
-        reached: Flags,
+        environments: Ints,
+        options: Ints,
+        reached: Bools,
     ) -> None:
         """Executions (n,) that ended in training, and which of them reached their sub-goals."""
 
-    def positive(self, log_odds: Floats, options: Ids | slice = slice(None)) -> Flags:
+    def positive(self, log_odds: Floats, options: Ints | slice = slice(None)) -> Bools:
         """Predictions by today's thresholds, of options (n,), or of all where the log-odds are (n, O)."""
-        return np.asarray(log_odds > self.thresholds[options])
+        return log_odds > self.thresholds[options]
 
-    def of(self, ids: Ids) -> Flags:
+    def of(self, ids: Ints) -> Bools:
         """Whether each option's sub-goal holds: bool (n, O) for states (n,)."""
         return self.positive(self._all(ids))
 
-    def of_running(self, ids: Ids, options: Ids) -> Flags:
+    def of_running(self, ids: Ints, options: Ints) -> Bools:
         """Whether the sub-goals of the options that run hold: bool (n,), of states (n,)."""
         return self.positive(self.log_odds(ids, options), options)
 
-    def log_odds(self, ids: Ids, options: Ids) -> Floats:
+    def log_odds(self, ids: Ints, options: Ints) -> Floats:
         """How sure the options that run are that their sub-goals hold: float32 (n,)."""
         if self.classify_one is None:
             return self._all(ids)[np.arange(len(ids)), options]
@@ -110,9 +119,9 @@ class Terminations(Part):
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
         """Go on with what an artefact kept."""
-        self.thresholds = thresholds_in(state, self.options)
+        self.thresholds = saved_row(state, THRESHOLDS, self.options, torch.float32)
 
-    def _all(self, ids: Ids) -> Floats:
+    def _all(self, ids: Ints) -> Floats:
         """Log-odds (n, O)."""
         self._grow(ids)
         judged = self.judged[ids]
@@ -123,14 +132,10 @@ class Terminations(Part):
         fresh = np.unique(ids[unknown])
         before = self.judged[fresh]
         new = np.isnan(before)
-        self.judged[fresh] = np.where(
-            new,
-            self.classify(fresh),
-            before,
-        )
+        self.judged[fresh] = np.where(new, self.classify(fresh), before)
         return self.judged[ids]
 
-    def _grow(self, ids: Ids) -> None:
+    def _grow(self, ids: Ints) -> None:
         """Room for these states, twice as much as before at least."""
         size = len(self.judged)
         missing = ids.max(initial=-1) + 1 - size
@@ -141,11 +146,6 @@ class Terminations(Part):
                 ((0, more), (0, 0)),
                 constant_values=np.nan,
             )
-
-
-def thresholds_in(state: Mapping[str, torch.Tensor], options: int) -> Floats:
-    """The log-odds float32 (O,) that an artefact keeps; a ``UserError`` where they are missing or damaged."""
-    return saved_row(state, THRESHOLDS, options, torch.float32)
 
 
 RULES = {"learned": f"{__name__}:Terminations"}
@@ -169,7 +169,11 @@ def oracle_terminations(engine: Engine, columns: Sequence[int]) -> Terminations:
 
 
 def learned_terminations(
-    engine: Engine, ensembles: Sequence[Ensemble], *, running_only: bool = False, rule: str = "learned"
+    engine: Engine,
+    ensembles: Sequence[Ensemble],
+    *,
+    running_only: bool = False,
+    rule: str = "learned",
 ) -> Terminations:
     """Spec D1: option g*K + k ends at a positive prediction of member k of sub-goal g's ensemble, of G with K members.
 
@@ -177,29 +181,22 @@ def learned_terminations(
     ``rule``: see :func:`load_rule`.
     """
     stacked = StackedMembers(ensembles)
-    networks: list[torch.nn.Module] = []
-    for ensemble in ensembles:
-        networks.extend(map(folded, ensemble.eval().networks))
     members = len(ensembles[0])
 
-    def classify(ids: Ids) -> Floats:
-        states = engine.images(ids)
-        if len(ids) < MANY:
-            return stacked.log_odds(states)
-        return np.concatenate([ensemble.log_odds(states) for ensemble in ensembles], axis=1)
+    def classify(ids: Ints) -> Floats:
+        return stacked.log_odds(engine.images(ids))
 
-    def classify_one(ids: Ids, option: int) -> Floats:
+    def classify_one(ids: Ints, option: int) -> Floats:
         ensemble = ensembles[option // members]
         views = ensemble.see(engine.images(ids))
         with torch.inference_mode():
-            logits = networks[option](as_input(tensor(views, ensemble.thresholds.device)))
-            log_odds: Floats = (logits[:, 1] - logits[:, 0]).cpu().numpy()
-        return log_odds
+            logits = stacked.networks[option](as_input(tensor(views, stacked.device)))
+            return (logits[:, 1] - logits[:, 0]).cpu().numpy()
 
     thresholds = [ensemble.thresholds_as_log_odds() for ensemble in ensembles]
     return load_rule(rule)(
         classify,
-        len(networks),
+        len(stacked.networks),
         classify_one if running_only else None,
         np.concatenate(thresholds),
         engine.count,

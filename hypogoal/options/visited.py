@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from hypogoal.core.arrays import Ints
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected, Dataset, States, open_dataset, write_dataset
-from hypogoal.domains.base import Domain, Engine
+from hypogoal.domains.base import Engine
 from hypogoal.observations import Observations
-from hypogoal.options.parts import Ids
 
 VISITED = "visited.h5"
 
@@ -33,7 +33,7 @@ class Visited(Resumable):
         self.key = seed_for(seed, "visited").to_bytes(16, "little")
         self.kept: dict[str, Observations] = {}  # pictures by their hashes, some of them surplus
 
-    def see(self, ids: Ids) -> None:
+    def see(self, ids: Ints) -> None:
         """States (E,)."""
         for picture in self.engine.images(ids):
             digest = blake2b(picture.tobytes(), digest_size=7, key=self.key).digest()
@@ -45,29 +45,25 @@ class Visited(Resumable):
         """Those that are kept, in the order of their hashes, without surplus."""
         return {digest: self.kept[digest] for digest in sorted(self.kept)[: self.most]}
 
-    def states(self) -> States:
-        """The states kept; their labels are not known."""
-        smallest = self._smallest()
-        pictures = self.engine.room_for(len(smallest), None)
-        for row, picture in enumerate(smallest.values()):
-            pictures[row] = picture
-        return States(pictures, np.zeros((len(pictures), 0), np.bool_))
+    def states(self) -> Observations:
+        """The states kept, (n, *obs)."""
+        return np.stack([*self._smallest().values()])
 
     def write(
         self,
         folder: Path,
-        domain: Domain,
         ensemble_config: Mapping[str, Any],
         seed: int,
     ) -> None:
         """``visited.h5`` into ``folder``: a data file of unlabelled states, of the ensemble's domain."""
-        sub_goals = domain.usual_sub_goals
-        none = States(self.engine.room_for(0, None), np.zeros((0, len(sub_goals)), np.bool_))
+        sub_goals = tuple(ensemble_config["sub_goals"])
+        visited = States(self.states(), np.zeros((0, 0), np.bool_))
+        none = States(visited.observations[:0], np.zeros((0, len(sub_goals)), np.bool_))
         collected = Collected(
             self.engine.observation_shape,
             sub_goals,
             none,
-            self.states(),
+            visited,
             none,
         )
         write_dataset(

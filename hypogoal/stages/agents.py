@@ -86,7 +86,7 @@ def _write(folder: Path, setup: Setup, loop: OptionLoop, near: Near | None) -> N
     if near:
         loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
-        loop.visited.write(folder, setup.domain, setup.source, setup.seed)
+        loop.visited.write(folder, setup.source, setup.seed)
     save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
     weights = loop.chooser.state()
     if weights:

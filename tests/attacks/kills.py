@@ -26,7 +26,7 @@ from hypogoal.core.artefacts import Artefact, Draft
 from hypogoal.core.checkpoints import PACE
 
 PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
-QUICK = "--set warm_up=100 --set max_episode_steps=60 --set random_episodes=5 --set environments=8"
+QUICK = "--set warm_up=100 --set max_episode_steps=60 --set environments=8"
 TOY = """
 format = 1
 evaluate = false
@@ -48,8 +48,7 @@ COMMANDS = {
     "run/options": f"train-options run/ensemble --set steps=1000 --set save_visited=50 {QUICK} --out run/options",
     "run/meta": f"train-meta run/ensemble --options run/options --set steps=1000 --set decisions=32 {QUICK}"
     " --out run/meta",
-    "run/ppo": "train-baseline doorkey --set agent=ppo --set steps=2560 --set max_episode_steps=60"
-    " --set random_episodes=5 --out run/ppo",
+    "run/ppo": "train-baseline doorkey --set agent=ppo --set steps=2560 --set max_episode_steps=60 --out run/ppo",
     "run/evaluation": "evaluate run",
     "run/report": "report run",
 }

@@ -15,7 +15,7 @@ from hypogoal.stages import LISTED, load_stage
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = cli.commands()
-TRAIN = ["train-baseline", "doorkey", "--set", "max_episode_steps=20", "--set", "random_episodes=1", "-q"]
+TRAIN = ["train-baseline", "doorkey", "--set", "max_episode_steps=20", "-q"]
 
 
 @pytest.fixture(autouse=True)

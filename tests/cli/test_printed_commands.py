@@ -22,7 +22,7 @@ from hypogoal import GymnasiumDomain
 from margin import pair_loss
 from wide_network import wide
 
-PLAY = {"steps": 200, "environments": 4, "warm_up": 50, "max_episode_steps": 20, "random_episodes": 1}
+PLAY = {"steps": 200, "environments": 4, "warm_up": 50, "max_episode_steps": 20}
 FEW = {
     "collect": {"steps": 150, "heldout_seeds": (4, 5)},
     "train-ensemble": {"steps": 2, "members": 2, "workers": 1},

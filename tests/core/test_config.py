@@ -195,7 +195,7 @@ def test_the_paper_preset_has_the_papers_tables() -> None:
     assert (meta.replay, meta.update_interval, meta.target_interval) == (100_000, 4, 10)
     assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
     assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
-    assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.01, 0.97, 64, 10)
+    assert (meta.decisions, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.97, 64, 10)
     assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
     assert (meta.meta_network, meta.head) == ("paper", "gaussian")
     run: Any = resolve(config_class_of("run"), preset("paper", "run"), stage="run")

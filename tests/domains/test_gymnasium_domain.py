@@ -90,15 +90,13 @@ def test_policies_share_the_steps() -> None:
     counts["climb"] = 0
     collected(GymnasiumDomain(Stairs, STEPS_UP, policy={"top": counted, "half-way": None}), FEW)
     assert counts["climb"] == 3 * 30
-    with pytest.raises(UserError, match=r"policies are given by sub-goal: half-way, moon\. These are half-way, top\."):
-        GymnasiumDomain(Stairs, STEPS_UP, policy={"half-way": climb, "moon": stay})
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("WORDY", "observations must be images, uint8 .* or numbers"),
-        ("MIXED", "observations mix pictures with other values: 0, 1. Give a Dict with each picture under a key"),
+        ("MIXED", "observations mix pictures with other values: 0. Give a Dict with each picture under a key"),
         ("STEERED", "actions must be Discrete"),
         ("LYING", "an observation that does not fit its space"),
         ("NEVER", "on-the-moon has no positives"),

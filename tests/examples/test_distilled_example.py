@@ -18,6 +18,7 @@ import hypogoal
 from examples import distilled
 from examples.distilled import Learner
 from hypogoal.cli import main
+from hypogoal.core.arrays import Ints
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
@@ -29,7 +30,6 @@ from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.parts import Ids
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
 
@@ -42,8 +42,8 @@ QUICK: dict[str, Any] = {
 SHORT = {  # appended to the page's commands, so that they end in seconds
     "collect": settings("heldout_layouts=1", "unlabelled_seeds=1"),
     "train-ensemble": settings("steps=2", "members=2", "workers=1"),
-    "train-options": settings("steps=640", "layouts=1000-1002", "random_episodes=0"),
-    "train-meta": settings("steps=320", "random_episodes=0"),
+    "train-options": settings("steps=640", "layouts=1000-1002"),
+    "train-meta": settings("steps=320"),
     "evaluate": ["--layouts", "6000-6001"],
 }
 
@@ -61,7 +61,7 @@ def layouts(*seeds: int) -> Layouts:
 class Aimless(Learner):
     """Random actions, of those that plans know."""
 
-    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
+    def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
         return self.rng.choice(self.actions, len(ids))
 
 

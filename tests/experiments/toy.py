@@ -4,7 +4,7 @@ from pathlib import Path
 
 DATA = "collect rooms"
 SMALL = "--set steps=20 --set members=2"
-PLAY = "--layout-seed 990 --set steps=200 --set random_episodes=2"
+PLAY = "--layout-seed 990 --set steps=200"
 
 
 def write_toy(path: Path, seeds: str = "0-1", more: str = "", *, evaluate: bool = False) -> Path:

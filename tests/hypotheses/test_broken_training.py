@@ -54,7 +54,7 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
                 break
     finished = EnsembleTraining(*toy(), config, 0, saved=checkpoints.load())
     assert list(finished.steps()) == []
-    assert_same(finished.ensemble.state(), unbroken.ensemble.state())
+    assert_same(finished.ensemble.state_dict(), unbroken.ensemble.state_dict())
 
 
 def test_a_broken_stage_ends_with_the_same_log(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble
+from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
 
@@ -60,30 +60,26 @@ def test_autocast_around_changes_nothing() -> None:
         np.testing.assert_array_equal(stacked.log_odds(observations), expected[1])
 
 
-def test_an_ensemble_comes_back_from_its_state(tmp_path: Path) -> None:
+def config_of(members: int = 3) -> dict[str, object]:
+    """Of an artefact."""
+    kind = {"network": "doorkey", "observation_shape": SHAPE, "observation_dtype": "uint8"}
+    return {"sub_goals": ["goal"], "members": members, **kind}
+
+
+def test_an_ensemble_comes_back_from_its_file(tmp_path: Path) -> None:
     """Spec A8, G2: through safetensors, bit for bit."""
     ensemble = ensemble_of()
     observations = images_of("noise", 6)
-    save_file(ensemble.state(), tmp_path / "goal.safetensors")
-    back = Ensemble.from_state("doorkey", SHAPE, 3, load_file(tmp_path / "goal.safetensors"))
+    write_ensemble(tmp_path, "goal", ensemble)
+    back = read_ensemble(tmp_path, config_of(), "goal")
     assert len(back) == 3
     assert not back.training
     np.testing.assert_array_equal(back.predict(observations), ensemble.predict(observations))
 
 
-def test_the_state_is_a_copy() -> None:
-    """Spec G1: a state that was taken does not move when training goes on."""
-    ensemble = ensemble_of(1)
-    state = ensemble.state()
-    with torch.no_grad():
-        for weight in ensemble.parameters():
-            weight.add_(1.0)
-    assert not torch.equal(state["members.0.0.weight"], ensemble.state()["members.0.0.weight"])
-
-
-def test_foreign_weights_are_one_clear_line() -> None:
+def test_foreign_weights_are_one_clear_line(tmp_path: Path) -> None:
     """Spec G2: too few members, another size, a missing tensor."""
-    state = ensemble_of().state()
+    state = ensemble_of().state_dict()
     name = "members.0.13.weight"
     cases = [
         (2, state),
@@ -93,8 +89,9 @@ def test_foreign_weights_are_one_clear_line() -> None:
         (3, state | {"extra": torch.zeros(1)}),
     ]
     for members, foreign in cases:
+        save_file(foreign, tmp_path / "goal.safetensors")
         with pytest.raises(UserError, match="the weights do not fit the"):
-            Ensemble.from_state("doorkey", SHAPE, members, foreign)
+            read_ensemble(tmp_path, config_of(members), "goal")
 
 
 def test_foreign_observations_are_one_clear_line() -> None:
@@ -112,7 +109,7 @@ def test_verdicts_are_above_each_members_threshold() -> None:
     probabilities = ensemble.predict(observations)
     np.testing.assert_array_equal(ensemble.predictions(observations), probabilities > 0.5)
     chosen = np.median(probabilities, axis=0)
-    ensemble.set_thresholds(chosen)
+    ensemble.thresholds.copy_(torch.from_numpy(chosen))
     np.testing.assert_array_equal(ensemble.predictions(observations), probabilities > chosen)
     assert (ensemble.predictions(observations).sum(axis=0) == 10).all()
     stacked = StackedMembers([ensemble, ensemble_of(1)])

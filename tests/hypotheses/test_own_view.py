@@ -38,7 +38,7 @@ def test_it_learns_and_comes_back_from_disk(tmp_path: Path, monkeypatch: pytest.
     shade = int(observations.mean())
     assert seen.shape == (64, 42, 42, 3)
     np.testing.assert_array_equal(seen, np.maximum(observations[:, 3:-3, 3:-3], shade) - shade)
-    ensemble.set_thresholds(np.array([0.25, 0.75], dtype=np.float32))
+    ensemble.thresholds.copy_(torch.from_numpy(np.array([0.25, 0.75], dtype=np.float32)))
     write_ensemble(tmp_path, "goal", ensemble)
     config = OWN.model_dump(mode="json") | {"sub_goals": ["goal"]}
     config |= {"observation_shape": [48, 48, 3], "observation_dtype": "uint8"}

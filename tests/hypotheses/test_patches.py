@@ -106,10 +106,9 @@ def test_only_what_repeats_is_tabled() -> None:
     windows = patches.windows_of(network)
     assert windows == [(5, 2), (3, 2), (3, 2), (4, 2)]
     noise = np.random.default_rng(0).integers(256, size=(8, 48, 48, 3), dtype=np.uint8)
-    assert patches.make_tables(noise, network) is None
-    assert patches.make_tables(grid_world(80, 6), network) is not None
-    assert patches.make_tables(grid_world(80, 6)[:0], network) is None
-    assert patches.make_tables(grid_world(80, 6), nn.Sequential(nn.Dropout())) is None
+    assert patches.make_tables(network, noise) is None
+    assert patches.make_tables(network, grid_world(80, 6)) is not None
+    assert patches.make_tables(nn.Sequential(nn.Dropout()), grid_world(80, 6)) is None
     for layer in (
         nn.Conv2d(3, 4, 3, padding=1),
         nn.Conv2d(3, 3, 3, groups=3),

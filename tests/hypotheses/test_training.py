@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -83,12 +85,12 @@ def test_the_same_seed_gives_the_same_bytes(schedule: str) -> None:
     observations, labels, unlabelled = toy()
     config = TOY.model_copy(update={"steps": 3, "schedule": schedule})
     torch.manual_seed(1)
-    first = train(observations, labels, unlabelled, config, seed=3).state()
+    first = train(observations, labels, unlabelled, config, seed=3).state_dict()
     drawn = torch.rand(1)
     torch.manual_seed(1)
     assert torch.equal(drawn, torch.rand(1))
-    second = train(observations, labels, unlabelled, config, seed=3).state()
-    other = train(observations, labels, unlabelled, config, seed=4).state()
+    second = train(observations, labels, unlabelled, config, seed=3).state_dict()
+    other = train(observations, labels, unlabelled, config, seed=4).state_dict()
     assert_same(first, second)
     assert not torch.equal(first["members.0.0.weight"], other["members.0.0.weight"])
 
@@ -142,11 +144,11 @@ def test_a_look_leaves_no_trace(schedule: str) -> None:
     looked = []
     for _ in training.steps():
         training.ensemble.predict(unlabelled)
-        looked.append(training.ensemble.state())
-    assert_same(looked[-1], train(observations, labels, unlabelled, config, 0).state())
+        looked.append(copy.deepcopy(training.ensemble.state_dict()))
+    assert_same(looked[-1], train(observations, labels, unlabelled, config, 0).state_dict())
     if schedule == "simultaneous":
         assert_same(
-            looked[3], train(observations, labels, unlabelled, config.model_copy(update={"steps": 4}), 0).state()
+            looked[3], train(observations, labels, unlabelled, config.model_copy(update={"steps": 4}), 0).state_dict()
         )
         return
     for name, last in looked[-1].items():
@@ -176,7 +178,9 @@ def test_batchnorm_sees_unlabelled_states_whatever_the_diversity(
             "unlabelled_bn": unlabelled_bn,
         }
     )
-    states = [train(observations, labels, others, config, seed=0).state() for others in (unlabelled, 255 - unlabelled)]
+    states = [
+        train(observations, labels, others, config, seed=0).state_dict() for others in (unlabelled, 255 - unlabelled)
+    ]
     for name in ("members.0.1", "members.1.5"):
         assert torch.equal(*(state[f"{name}.running_mean"] for state in states)) != unlabelled_bn
         assert states[0][f"{name}.num_batches_tracked"] == (4 if unlabelled_bn else 2)
@@ -298,8 +302,6 @@ def test_nan_stops_the_run_and_names_the_member() -> None:
     config = TOY.model_copy(update={"learning_rate": 1e30})
     with pytest.raises(NumericalError, match=r"^the labelled loss of member 0 is (nan|inf) at step [23]$"):
         train(observations, labels, unlabelled, config, seed=0)
-    with pytest.raises(NumericalError, match=r"of member [01] is NaN or Inf after step 1$"):
-        train(observations, labels, unlabelled, config.model_copy(update={"learning_rate": 1e39, "steps": 1}), seed=0)
 
 
 def test_an_objective_that_gives_nan_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,9 +21,11 @@ class Numbers(Columns):
     x: NDArray[np.int32]
 
 
-def test_sampling_follows_priorities_and_weights_correct_for_it() -> None:
+def test_sampling_follows_priorities_and_weights_correct_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2 (Schaul et al. 2015): with alpha 1 a transition is drawn in proportion to its priority."""
-    replay = PrioritisedReplay(Numbers.zeros(4), alpha=1.0, beta=1.0)
+    monkeypatch.setattr("hypogoal.learners.replay.ALPHA", 1.0)
+    monkeypatch.setattr("hypogoal.learners.replay.BETA", 1.0)
+    replay = PrioritisedReplay(Numbers.zeros(4))
     replay.add(Numbers(np.arange(4)))
     replay.set_priorities(np.arange(4), np.array([1.0, 2.0, 3.0, 4.0]))
     rng = np.random.default_rng(0)
@@ -35,9 +37,10 @@ def test_sampling_follows_priorities_and_weights_correct_for_it() -> None:
     assert weights.max() == 1.0
 
 
-def test_what_is_new_has_the_largest_priority_seen() -> None:
+def test_what_is_new_has_the_largest_priority_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2: to the power alpha, as those that were learned from."""
-    replay = PrioritisedReplay(Numbers.zeros(4), alpha=0.5, beta=0.4)
+    monkeypatch.setattr("hypogoal.learners.replay.ALPHA", 0.5)
+    replay = PrioritisedReplay(Numbers.zeros(4))
     replay.add(Numbers(np.arange(2)))
     replay.set_priorities(np.arange(2), np.array([1.0, 9.0]))
     replay.add(Numbers(np.array([2])))
@@ -46,7 +49,7 @@ def test_what_is_new_has_the_largest_priority_seen() -> None:
 
 def test_the_ring_forgets_the_oldest() -> None:
     """Spec D3: capacity transitions are kept."""
-    replay = PrioritisedReplay(Numbers.zeros(3), alpha=0.6, beta=0.4)
+    replay = PrioritisedReplay(Numbers.zeros(3))
     replay.add(Numbers(np.array([1, 2])))
     replay.add(Numbers(np.array([3, 4])))
     assert sorted(replay.data.x) == [2, 3, 4]

@@ -27,7 +27,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run("collect", "doorkey", "--out", data, "-q", *layouts)
     few = settings("steps=2", "workers=1")
     run("train-ensemble", data, "--out", made / "ensemble", "-q", *few)
-    play = settings("steps=320", "warm_up=100", "max_episode_steps=60", "random_episodes=2")
+    play = settings("steps=320", "warm_up=100", "max_episode_steps=60")
     run("train-meta", made / "ensemble", "--out", made / "meta", "-q", *play)
     return folder
 

@@ -64,9 +64,9 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     learner = load_learner(network)(engine, verdicts, config, seed=1, device=device)
     chooser: Chooser = RandomChooser(rng_for(0, "choice"))
     if chooser_name == "even":
-        chooser = EvenChooser(2, rng_for(0, "choice"))
+        chooser = EvenChooser(rng_for(0, "choice"), 2)
     elif chooser_name != "random":
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=16, meta_batch=8)
         chooser = MetaPolicy(engine, 2, meta, 2, device)
-    return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, engine, 100), config, gamma=0.9)
+    return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, engine), config, gamma=0.9)

@@ -13,10 +13,10 @@ import torch
 from corridor import Corridor
 from loops import CASES, loop_of
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.options.choosers import CHOOSERS
 from hypogoal.options.learner import LEARNERS
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.termination import Terminations
 
 STEPS = 60
@@ -31,11 +31,11 @@ class Twice(Terminations):
         super().__init__(*arguments, **more)
         self.row = np.zeros(self.environments, dtype=np.int64)
 
-    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
+    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
         self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
         return self.row >= 2
 
-    def finished(self, environments: Ids, options: Ids, reached: Flags) -> None:
+    def finished(self, environments: Ints, options: Ints, reached: Bools) -> None:
         self.thresholds = self.thresholds - np.float32(0.001)
 
 

@@ -62,7 +62,7 @@ def ensemble(tiny_run: Path) -> Path:
 @pytest.mark.usefixtures("small_gru")
 def test_the_papers_preset_plays_and_learns(ensemble: Path, tmp_path: Path) -> None:
     """Spec E1, E2, Tables 3 to 5: its networks on the real engine, options and meta-policy updated."""
-    few = ["steps=120", "decisions=8", "warm_up=8", "random_episodes=2", "option_batch=4"]
+    few = ["steps=120", "decisions=8", "warm_up=8", "option_batch=4"]
     out = tmp_path / "meta"
     changes = settings(*few)
     run("train-meta", ensemble, "--out", out, "--preset", "paper", *changes, "-q")
@@ -72,7 +72,7 @@ def test_the_papers_preset_plays_and_learns(ensemble: Path, tmp_path: Path) -> N
 
 def test_options_go_on_with_the_time_they_learned_for(ensemble: Path, tmp_path: Path) -> None:
     """Spec D1: the timeout is part of an option: it is taken over, and another one is refused."""
-    few = ["--set", "steps=64", "--set", "random_episodes=2", "-q"]
+    few = ["--set", "steps=64", "-q"]
     options, out = str(tmp_path / "options"), str(tmp_path / "meta")
     run("train-options", ensemble, "--out", options, "--set", "option_timeout=40", *few)
     meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
@@ -83,7 +83,7 @@ def test_options_go_on_with_the_time_they_learned_for(ensemble: Path, tmp_path: 
 
 def test_an_embedding_by_name_goes_through_both_stages(ensemble: Path, tmp_path: Path) -> None:
     """Spec D2, D8, H6: where an engine has tiles, too; it is part of the options, and of the light network alone."""
-    few = ["--set", "steps=64", "--set", "random_episodes=2", "--set", "warm_up=20", "-q"]
+    few = ["--set", "steps=64", "--set", "warm_up=20", "-q"]
     options, out, named = str(tmp_path / "options"), str(tmp_path / "meta"), ["--set", "embedding=tiles"]
     run("train-options", ensemble, "--out", options, *named, *few)
     meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
@@ -147,7 +147,7 @@ def test_replays_keep_any_action() -> None:
         assert data.action[0] == 300
 
 
-@pytest.mark.parametrize("shape", [(84, 84, 4), (45, 45, 3), (60, 60, 3), (7, 7, 3)])
+@pytest.mark.parametrize("shape", [(84, 84, 4), (45, 45, 3), (60, 60, 3)])
 def test_the_light_meta_policy_sees_the_whole_picture(shape: tuple[int, ...]) -> None:
     """Spec E2: rows and columns that no whole cells fill count too."""
     torch.manual_seed(0)

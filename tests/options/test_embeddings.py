@@ -15,7 +15,7 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import make_policies
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.networks import CellEmbedding, LightQNetwork, OwnEmbedding, PictureEmbedding, embedding_for
+from hypogoal.options.networks import LightQNetwork, OwnEmbedding, PictureEmbedding, embedding_for
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
 
@@ -41,19 +41,6 @@ class Small(nn.Module):
 def dense(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
     """Layers for numbers: their last axis says how many there are."""
     return [nn.Linear(channels, 6), nn.ReLU()], (5,)
-
-
-@pytest.mark.parametrize("shape", [(10, 13, 2), (16, 10, 3), (9, 30, 1)])
-def test_a_picture_that_cells_do_not_fill_is_continued_in_black(shape: tuple[int, ...]) -> None:
-    """Spec D8: rows below, columns on the right."""
-    picture = torch.randint(256, (2, *shape), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    height, width = (-(-side // 8) * 8 for side in shape[:2])
-    whole = torch.zeros(2, height, width, shape[2], dtype=torch.uint8)
-    whole[:, : shape[0], : shape[1]] = picture
-    embedding, filled = CellEmbedding(shape), CellEmbedding((height, width, shape[2]))
-    filled.load_state_dict(embedding.state_dict())
-    assert embedding.features == filled.features
-    torch.testing.assert_close(embedding(picture), filled(whole))
 
 
 @pytest.mark.parametrize("shape", [(84, 84, 4), *((side, 103 - side, 2) for side in range(20, 52))])

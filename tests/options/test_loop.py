@@ -64,7 +64,7 @@ class FirstOption:
 def loop_of(engine, learner, chooser, **changes):
     verdicts = oracle_terminations(engine, (0, 1))
     config = OptionConfig.of(**{"option_timeout": 10, **changes})
-    recorder = Recorder(2, engine, window=50)
+    recorder = Recorder(2, engine)
     return OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=0.9), recorder
 
 
@@ -132,8 +132,9 @@ def test_random_choice_is_uniform_over_what_is_offered() -> None:
     np.testing.assert_allclose(shares, [1 / 3, 0, 1 / 3, 1 / 3], atol=0.03)
 
 
-def test_choices_are_counted_per_window(tmp_path: Path) -> None:
+def test_choices_are_counted_per_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec E5: offered, chosen, expected under uniform choice, reached and duration add up."""
+    monkeypatch.setattr("hypogoal.options.recording.WINDOW", 50)
     engine = Corridor(4)
     loop, recorder = loop_of(engine, Scripted(0), RandomChooser(np.random.default_rng(0)))
     for _ in range(100):

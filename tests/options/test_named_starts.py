@@ -140,7 +140,7 @@ def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
     from hypogoal.domains.doorkey.domain import DOMAIN as doorkey
 
     ensemble = ensemble_of(tmp_path / "ensemble", doorkey, 1, "doorkey")
-    with pytest.raises(UserError, match="doorkey has no named starts"):
+    with pytest.raises(UserError, match="unknown start: 1L"):
         train_options(ensemble, tmp_path / "options", steps=10, start="1L", quiet=True)
 
 

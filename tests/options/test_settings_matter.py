@@ -42,7 +42,7 @@ def learned(network: str, **changes: Any) -> tuple[OptionLoop, dict[str, torch.T
     never = Terminations(lambda ids: np.zeros((len(ids), 2), np.bool_), 2)
     learner = load_learner(network)(engine, never, config, seed=1, device="cpu")
     loop = OptionLoop(
-        engine, never, learner, RandomChooser(rng_for(0, "choice")), Recorder(2, engine, 100), config, gamma=0.9
+        engine, never, learner, RandomChooser(rng_for(0, "choice")), Recorder(2, engine), config, gamma=0.9
     )
     for _ in range(40):
         loop.step()

@@ -227,7 +227,7 @@ def test_even_choice_gives_every_option_as_many_steps() -> None:
     recorder = Recorder(2, engine)
     config = OptionConfig.of(**(BEGIN | {"option_timeout": 10}))
     verdicts = oracle_terminations(engine, (0, 1))
-    chooser = EvenChooser(2, np.random.default_rng(0))
+    chooser = EvenChooser(np.random.default_rng(0), 2)
     loop = OptionLoop(engine, verdicts, Script([LEFT] * 1000), chooser, recorder, config, 1.0)
     for _ in range(1000):
         loop.step()

@@ -63,7 +63,9 @@ def test_running_members_are_judged_alone_and_once() -> None:
     for ensemble in ensembles:  # each member says yes in some of the states, in none within rounding of its threshold
         chances = np.sort(ensemble.predict(engine.images(everything)), axis=0)
         widest = np.diff(chances, axis=0).argmax(0)
-        ensemble.set_thresholds(np.take_along_axis(chances, widest + np.array([[0], [1]]), 0).mean(0))
+        ensemble.thresholds.copy_(
+            torch.from_numpy(np.take_along_axis(chances, widest + np.array([[0], [1]]), 0).mean(0))
+        )
     wanted = np.concatenate([ensemble.predictions(engine.images(everything)) for ensemble in ensembles], axis=1)
     assert (wanted.any(0) & ~wanted.all(0)).all()
     verdicts = learned_terminations(engine, ensembles, running_only=True)
@@ -112,7 +114,7 @@ def test_what_was_said_stands(asked: str, monkeypatch: pytest.MonkeyPatch) -> No
             for member in ensemble.members:
                 nn.init.ones_(member[-1].bias)
                 member[-1].weight.data *= 1e-6
-            ensemble.set_thresholds(np.median(ensemble.predict(engine.images(everything)), axis=0))
+            ensemble.thresholds.copy_(torch.from_numpy(np.median(ensemble.predict(engine.images(everything)), axis=0)))
 
         def fresh() -> Terminations:
             if asked == "the running ones":

@@ -24,7 +24,7 @@ def walk(visited: Visited, engine: Corridor, steps: int, seed: int = 0) -> None:
 def cells(visited: Visited) -> list[int]:
     """Which cell each kept image shows."""
     wide = 14 if isinstance(visited.engine, LongCorridor) else 8
-    return (visited.states().observations[:, 0, :, 0].argmax(axis=1) // wide).tolist()
+    return (visited.states()[:, 0, :, 0].argmax(axis=1) // wide).tolist()
 
 
 def test_distinct_states_are_kept_once() -> None:
@@ -61,7 +61,7 @@ def test_an_engine_may_have_any_number_of_states() -> None:
         visited.see(step.next_ids)
         seen.append(step.next_ids)
     pictures = {picture.tobytes() for picture in engine.images(np.unique(seen))}
-    assert engine.n_states > 1_200 and {picture.tobytes() for picture in visited.states().observations} == pictures
+    assert engine.n_states > 1_200 and {picture.tobytes() for picture in visited.states()} == pictures
 
 
 def test_it_goes_on_where_it_was() -> None:
@@ -74,7 +74,7 @@ def test_it_goes_on_where_it_was() -> None:
         fresh = LongCorridor(3)
         visited.engine = fresh
         walk(visited, fresh, 30, seed=1)
-    np.testing.assert_array_equal(whole.states().observations, other.states().observations)
+    np.testing.assert_array_equal(whole.states(), other.states())
 
 
 def test_an_ensemble_learns_from_what_was_visited(corridor_run: Path, tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def light_options(work: Path) -> Path:
 
 def short(steps: int) -> list[str]:
     """Settings of so many steps on the layout."""
-    return settings(steps=steps, layout_seed=LAYOUT, max_episode_steps=EPISODE, random_episodes=0)
+    return settings(steps=steps, layout_seed=LAYOUT, max_episode_steps=EPISODE)
 
 
 # Tables.
@@ -361,7 +361,7 @@ def paper_network(work: Path, recurrence: int) -> Table:
         *settings(sub_goals="collect-red-key", members=1, diversity="none", steps=20, batch_size=16, workers=1),
     )
     learning = {"experience": "own", "option_batch": 32, "environments": 4, "update_interval": 4, "warm_up": 100}
-    words = settings(network="paper", recurrence=recurrence, steps=300, random_episodes=0, **learning)
+    words = settings(network="paper", recurrence=recurrence, steps=300, **learning)
     options = made(work / f"paper-{recurrence}", "train-options", str(ensemble), *words)
     return [("line", "column", "value"), *log_of(options), *weights_of(options / "options.safetensors")]
 
@@ -388,7 +388,7 @@ def planned_options(work: Path) -> Table:
     """Where planned options stop on three layouts: each execution, and the pictures of the stops."""
     rows: Table = [("line", "column", "value")]
     for layout in (102, 107, 109):
-        words = settings(network="planned", layout_seed=layout, steps=480, random_episodes=0)
+        words = settings(network="planned", layout_seed=layout, steps=480)
         options = made(work / f"planned-{layout}", "train-options", str(doorkey_ensemble(work)), *words)
         for line, column, text in whole(options / "exploits.csv"):
             rows.append((f"layout {layout} {line}", column, text))
@@ -432,7 +432,7 @@ def train_meta(work: Path) -> Table:
 def train_options_ladder(work: Path) -> Table:
     few = settings(members=2, steps=40, batch_size=16, workers=1)
     ensemble = made(work / "montezuma-ensemble", "train-ensemble", str(montezuma_data(work)), *few)
-    words = settings(start="1L", steps=1_000, random_episodes=0)  # of each option
+    words = settings(start="1L", steps=1_000)  # of each option
     return trace(made(work / "ladder-options", "train-options", str(ensemble), *words))
 
 

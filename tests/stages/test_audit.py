@@ -191,7 +191,7 @@ def test_a_member_is_audited_at_its_own_threshold(ensemble: Path, tmp_path: Path
     """Spec H5: in the world of its data; the states that fooled it can be kept, to label them."""
     source = open_artefact(ensemble)
     wanted = read_ensemble(ensemble, source.config, "open-red-door").thresholds[1].item()
-    few = settings("steps=640", "warm_up=100", "random_episodes=2", "save_visited=20", "mend=0.999999")
+    few = settings("steps=640", "warm_up=100", "save_visited=20", "mend=0.999999")
     words = ["--domain", "doorkey", "--sub-goal", "open-red-door", "--member", "1", *few]
     report, _ = audited(tmp_path / "audit", str(ensemble), *words)
     assert report["before"]["threshold"] == pytest.approx(wanted) and wanted != 0.5

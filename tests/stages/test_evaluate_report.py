@@ -66,7 +66,7 @@ def test_agents_are_grouped_and_counted_whole(tiny_run, results):
 
 def test_an_agent_without_a_whole_episode_is_said_to_be_one(tiny_run, tmp_path):
     """Spec F5: there is no success to speak of, neither 0 nor a dash."""
-    train_meta(tiny_run / "ensemble", tmp_path / "meta", steps=512, max_episode_steps=100, random_episodes=2)
+    train_meta(tiny_run / "ensemble", tmp_path / "meta", steps=512, max_episode_steps=100)
     numbers = evaluate(tmp_path).metrics
     assert "success" not in {*numbers[numbers["scope"] == ""]["quantity"]}
     page = page_of(tmp_path)

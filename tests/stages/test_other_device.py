@@ -16,7 +16,7 @@ from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_meta import train_meta
 from hypogoal.stages.train_options import train_options
 
-FEW = {"max_episode_steps": 30, "random_episodes": 1}
+FEW = {"max_episode_steps": 30}
 SHORT = FEW | {"steps": 192, "option_timeout": 7, "warm_up": 32, "replay": 200}
 ENSEMBLE = {"steps": 3, "members": 2, "workers": 1, "sub_goals": ("open-red-door",)}
 CASES: dict[str, tuple[Callable[..., Any], str, dict[str, Any]]] = {

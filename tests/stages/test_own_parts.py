@@ -16,6 +16,7 @@ from command_line import refuses, run, settings
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
@@ -27,20 +28,19 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.learner import Learner, Transitions, load_learner, make_policies
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.parts import Flags, Floats, Ids
 from hypogoal.options.recording import Recorder
 from hypogoal.options.reward import SubgoalReward
 from hypogoal.options.saved import Policies, SavedOptions
-from hypogoal.options.tables import Choices
+from hypogoal.options.tables import ChoiceCounts
 from hypogoal.options.termination import Terminations, learned_terminations, saved_terminations
 
-FEW = [*settings("steps=300", "environments=4", "random_episodes=5"), "-q"]
+FEW = [*settings("steps=300", "environments=4"), "-q"]
 
 
 class FirstOffered(Chooser):
     """It takes the first option offered."""
 
-    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         return offered.argmax(1)
 
 
@@ -68,7 +68,7 @@ class Straight(Learner):
     def reach(config: Any, options: int) -> int:
         return 0
 
-    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+    def greedy(self, ids: Ints, options: Ints, age: Ints) -> Ints:
         pairs = zip(self.engine.images(ids), options.tolist(), strict=True)
         return np.array([preferred(picture, option, self.actions) for picture, option in pairs])
 
@@ -94,7 +94,7 @@ class AtLeast(Terminations):
         super().__init__(*arguments, **more)
         self.row = np.zeros(self.environments, dtype=np.int64)
 
-    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
+    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
         self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
         return (self.row >= 2) & (age >= 2)
 
@@ -102,7 +102,7 @@ class AtLeast(Terminations):
 class Never(Terminations):
     """No execution reaches anything."""
 
-    def reached(self, log_odds: Floats, options: Ids, age: Ids) -> Flags:
+    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
         return np.zeros(len(options), np.bool_)
 
 
@@ -122,7 +122,7 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
     name = f"{__name__}:{OWN[setting]}"
     assert train(stage, corridor_run, tmp_path / "made", f"{setting}={name}")[setting] == name
     if setting == "chooser":
-        choices = Choices.read(tmp_path / "made" / "choices.csv")
+        choices = ChoiceCounts.read(tmp_path / "made" / "choices.csv")
         np.testing.assert_array_equal(choices.total("chosen", 1)[0], choices.total("offered", 1)[0])
     if stage == "train-meta":
         assert len(play_episode(agent_of(open_artefact(tmp_path / "made"), seed=0), 2)) > 1
@@ -163,7 +163,9 @@ def ensembles_on(engine: DoorKeyEngine) -> list[Ensemble]:
         chances = np.sort(ensemble.predict(pictures), axis=0)
         middle = chances[len(chances) // 4 : 3 * len(chances) // 4]
         widest = np.diff(middle, axis=0).argmax(0)
-        ensemble.set_thresholds(np.take_along_axis(middle, widest + np.array([[0], [1]]), 0).mean(0))
+        ensemble.thresholds.copy_(
+            torch.from_numpy(np.take_along_axis(middle, widest + np.array([[0], [1]]), 0).mean(0))
+        )
         ensembles.append(ensemble)
     return ensembles
 

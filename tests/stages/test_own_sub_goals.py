@@ -18,7 +18,7 @@ from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import assemble
 
-FEW = [*settings("steps=600", "environments=4", "random_episodes=5"), "-q"]
+FEW = [*settings("steps=600", "environments=4"), "-q"]
 
 
 def walked(layout_seed: int, steps: int) -> np.ndarray:

@@ -43,7 +43,7 @@ class DoorKeyConfig(Config):
     )
 
 
-def _grid_of(layout_seed: int) -> env.Layout:
+def _grid_of(layout_seed: int) -> env.GridLayout:
     """A layout without its agent: those with the same grid have the same states."""
     return replace(env.layout_of(layout_seed), start=0, direction=0)
 

@@ -1,12 +1,11 @@
-"""The fast DoorKey engine for training; tests compare it with ``DoorKeyEnv`` step by step.
+"""The fast DoorKey engine for training. Read ``env`` first, which has the rules; tests compare the two step by step.
 
 Drawing is 99 % of MiniGrid's cost. Here a step is a few table look-ups for all environments together, and an image is
 eight strips, rows of cells, of which few differ: each is drawn once.
 
 A state is a *configuration* (the layout, its door and where its three keys are) and a *pose* (the agent's cell and
 direction). Turning and walking change the pose only and are table look-ups in NumPy. Picking up, dropping and
-toggling change the configuration; they are rare, so plain Python computes each change once and remembers it. Every
-state reached gets an id.
+toggling change the configuration; they are rare, so plain Python computes them. Every state reached gets an id.
 """
 
 from collections.abc import Mapping, Sequence
@@ -76,8 +75,6 @@ MAY_CHANGE[PICKUP, KEY : KEY + 3] = True
 MAY_CHANGE[DROP, EMPTY] = True
 MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
 STRIP = SIZE * TILE * TILE * 3  # bytes of a row of cells in an image, one after another
-_AHEAD = AHEAD.tolist()  # one look-up in a list is faster than in an array
-_AGENT_ON = AGENT_ON.tolist()
 # The engine's tables that grow: a row for each state, or for each configuration.
 PER_STATE = (
     "_site",
@@ -135,7 +132,6 @@ class DoorKeyEngine(Engine):
         self.door_label = door_label
         self.harsh = wrong_key == "ends"
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
-        self.changes: dict[int, int] = {}  # computed next configurations, by configuration, cell, action
         # For each configuration: its layout's seed; the door's cell; its state and the keys' places; its cell codes
         # without the agent; ids by pose.
         self._numbers: dict[Configuration, int] = {}
@@ -152,7 +148,6 @@ class DoorKeyEngine(Engine):
         self._strips = np.full((256, SIZE), UNKNOWN)
         self._on_goal = np.zeros(256, np.bool_)
         self._final = np.zeros(256, np.bool_)
-        self._code_bytes = self._codes.data.cast("B")  # writes a row several times faster than NumPy
         self._drawn = np.zeros((256, STRIP), np.uint8)
         self._strip_of: dict[int, int] = {}  # by the row's codes as one number
         self.reset()
@@ -162,9 +157,12 @@ class DoorKeyEngine(Engine):
         return tiles()
 
     def restart(self, where: Bools) -> None:
+        (numbers,) = where.nonzero()
+        if not len(numbers):  # in most steps
+            return
         self.ids = self.ids.copy()
         self.elapsed = np.where(where, 0, self.elapsed)
-        for number in where.nonzero()[0].tolist():
+        for number in numbers.tolist():
             seed = self.layouts.begin(number)
             self.ids[number] = self._start(seed)
 
@@ -211,11 +209,7 @@ class DoorKeyEngine(Engine):
     def _changed(self, site: int, action: int) -> int:
         """The configuration after ``pickup``, ``drop`` or ``toggle``, possibly unchanged."""
         configuration, pose = divmod(site, POSES)
-        front = _AHEAD[pose]
-        key = (configuration * CELLS + front) * N_ACTIONS + action
-        changed = self.changes.get(key)
-        if changed is not None:
-            return changed
+        front = AHEAD.item(pose)
         door, *keys = self._places[configuration].tolist()
         seed = self._seeds[configuration]
         held = sum(place >= HELD for place in keys)
@@ -229,20 +223,16 @@ class DoorKeyEngine(Engine):
                 door = CLOSED
             elif door == CLOSED or has_red_key:  # once unlocked it never locks again
                 door = OPEN
-        changed = self._number_of((seed, door, *keys))
-        self.changes[key] = changed
-        return changed
+        return self._number_of((seed, door, *keys))
 
-    def images(self, ids: Ints, out: Bytes | None = None) -> Bytes:
-        out = self.room_for(len(ids), out)
+    def images(self, ids: Ints) -> Bytes:
         strips = self._strips.take(ids, axis=0)
         undrawn = strips[:, 0] == UNKNOWN
         if undrawn.any():
             self._draw(np.unique(ids[undrawn]))
             strips = self._strips.take(ids, axis=0)
-        rows = out.reshape(len(out), SIZE, STRIP)
-        self._drawn.take(strips, axis=0, out=rows, mode="clip")  # unbuffered
-        return out
+        rows = self._drawn.take(strips, axis=0)
+        return rows.reshape(-1, *OBSERVATION_SHAPE)
 
     def _draw(self, ids: Ints) -> None:
         """Find these states' strips among those that were drawn, and draw the others."""
@@ -347,7 +337,13 @@ class DoorKeyEngine(Engine):
             actions = np.full(len(going_on), action)
             following[~final, column] = self.follow(going_on, actions)
         solved = self.at_goal(ids)
-        return Plan(ids, SEARCHED, following, final, solved)
+        return Plan(
+            ids,
+            SEARCHED,
+            following,
+            final,
+            solved,
+        )
 
     def shortest_path(self) -> int | None:
         """The fewest primitive steps to the goal; None with several layouts, or if only a wrong key clears the way."""
@@ -397,17 +393,18 @@ class DoorKeyEngine(Engine):
         new = self.n_states
         if new == len(self._site):
             self._double(PER_STATE)
-            self._code_bytes = self._codes.data.cast("B")
         configuration, pose = divmod(site, POSES)
         cell, direction = divmod(pose, 4)
-        row = bytearray(self._bare_codes[configuration])
-        row[cell] = _AGENT_ON[row[cell]] + direction
-        self._code_bytes[new * CELLS : (new + 1) * CELLS] = row
+        codes = self._codes[new]
+        codes[:] = self._bare_codes[configuration]
+        codes[cell] = AGENT_ON.item(codes.item(cell)) + direction
         self._site[new] = site
-        self._ahead[new] = configuration * CELLS + _AHEAD[pose]
+        self._ahead[new] = configuration * CELLS + AHEAD.item(pose)
         at_goal = cell == layout_of(self._seeds[configuration]).goal
         self._on_goal[new] = at_goal
-        self._final[new] = at_goal or (self.harsh and self._places[configuration, 1:3].max() >= HELD)
+        blue, green = self._places[configuration, 1:3].tolist()
+        is_wrong = self.harsh and max(blue, green) >= HELD
+        self._final[new] = at_goal or is_wrong
         self._id_at[configuration, pose] = new
         self.n_states += 1
         return new

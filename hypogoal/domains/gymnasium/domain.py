@@ -1,9 +1,6 @@
 """A domain made of any Gymnasium environment and a label function for each sub-goal (Spec B6, B7)."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +9,6 @@ from gymnasium import spaces
 
 from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
-from hypogoal.data import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium.engine import MEMORY, GymnasiumEngine, Label, Success
 from hypogoal.domains.gymnasium.play import Policy, collect
@@ -59,7 +55,6 @@ class GymnasiumDomain(Domain):
             example one that reaches each rare sub-goal, share the steps evenly.
         defaults: by stage, settings that suit this domain: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: the number of distinct states whose observations training keeps, see ``GymnasiumEngine``.
-        features: names of the numbers in observations other than pictures; default: those of a ``Dict``, or x0, x1, ...
         name: for messages; artefacts use the name that the user passed to ``collect``.
         config_class: a class derived from ``GymnasiumConfig`` that adds settings; ``make`` gets them in collection,
             training, baselines and evaluation.
@@ -70,6 +65,7 @@ class GymnasiumDomain(Domain):
     """
 
     many_layouts = True
+    collect = collect
 
     def __init__(
         self,
@@ -80,33 +76,24 @@ class GymnasiumDomain(Domain):
         policy: Policy | Mapping[str, Policy | None] | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = MEMORY,
-        features: Sequence[str] = (),
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
         self.make, self.success, self.memory, self.name = make, success, memory, name
         self.label_functions, self.sub_goals = sub_goals, tuple(sub_goals)
         self.defaults = defaults or {}
-        self._features = tuple(features)
         self.config_class = config_class
-        own = config_class.model_fields.keys() - GymnasiumConfig.model_fields
-        self.engine_settings = tuple(name for name in config_class.model_fields if name in own)
-        policies = policy if isinstance(policy, Mapping) else {"": policy}
-        self.policies = tuple(policies.values())
-        if isinstance(policy, Mapping) and not policy.keys() <= sub_goals.keys():
-            do = f"These are {', '.join(sub_goals)}."
-            raise UserError("policies are given by sub-goal", ", ".join(policy), do)
+        usual = GymnasiumConfig.model_fields
+        self.engine_settings = tuple(name for name in config_class.model_fields if name not in usual)
+        self.policies = tuple(policy.values()) if isinstance(policy, Mapping) else (policy,)
 
     @cached_property
     def reader(self) -> Reader:
         """Reads its observations."""
         env = self.make_env()
-        reader = reader_of(env)
+        reader = reader_of(env.observation_space)
         env.close()
-        if self._features and len(self._features) != len(reader.features):
-            counts = f"{len(self._features)} for {len(reader.features)}"
-            raise UserError("the number of feature names is wrong", counts, "Give one for each.")
-        return replace(reader, features=self._features or reader.features)
+        return reader
 
     @property
     def observation_shape(self) -> Shape:
@@ -123,14 +110,11 @@ class GymnasiumDomain(Domain):
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: the domain's own settings, defaults for those left out.
 
-        One that is none of Gymnasium's, or whose actions are not ``Discrete``, is a ``UserError``.
+        One whose actions are not ``Discrete`` is a ``UserError``.
         """
         fields = self.config_class.model_fields
         defaults = {name: fields[name].default for name in self.engine_settings}
         env: Any = self.make(**{**defaults, **arguments})
-        if not isinstance(env, gymnasium.Env):
-            do = "Give a function that returns a gymnasium.Env."
-            raise UserError("the environment is none of Gymnasium's", type(env).__name__, do)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0:
             raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
@@ -140,6 +124,3 @@ class GymnasiumDomain(Domain):
         """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory`` and the domain's own settings."""
         layouts = arguments.pop("layouts", layout_seed)
         return GymnasiumEngine(self, layouts, count, max_steps=max_steps, **{"memory": self.memory, **arguments})
-
-    def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
-        return collect(self, config, seed, progress)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -24,36 +23,17 @@ Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
 MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 
-def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """The result of ``env.step``; a malformed one is a ``UserError``."""
-    result = env.step(action)
-    try:
-        observation, reward, terminated, truncated, info = result
-        earned = float(reward)
-        fits = math.isfinite(earned)
-        fits = fits and is_truth(terminated)
-        fits = fits and is_truth(truncated)
-        fits = fits and isinstance(info, dict)
-    except (TypeError, ValueError):
-        fits = False
-    if not fits:
-        do = "Give (observation, reward, terminated, truncated, info): a finite number, True or False twice, a dict."
-        raise UserError("the environment's step gave something else than Gymnasium says", f"{result!r:.200}", do)
-    return observation, earned, bool(terminated), bool(truncated), info
-
-
-def is_truth(value: Any) -> bool:
-    """Whether this is a single truth value, or 0 or 1."""
-    return not np.ndim(value) and value in (0, 1)
-
-
 def labels_of(env: gymnasium.Env, functions: Mapping[str, Label]) -> Bools:
     """Which sub-goals hold in an environment's state, bool (G,), by a function each; ``UserError`` if one is unsure."""
     labels = []
     for name, function in functions.items():
         holds = function(env)
-        if not is_truth(holds):
-            raise UserError(f"the label of {name} is no truth value", f"{holds!r:.200}", "Give True or False.")
+        if np.ndim(holds) or holds not in (0, 1):
+            raise UserError(
+                f"the label of {name} is no truth value",
+                f"{holds!r:.200}",
+                "Give True or False.",
+            )
         labels.append(bool(holds))
     return np.array(labels, np.bool_)
 
@@ -68,6 +48,8 @@ class GymnasiumEngine(TurnEngine):
     Episodes are truncated after ``max_steps`` steps, or earlier by the environment. ``success`` is called at the end of
     each, see ``GymnasiumDomain``.
     """
+
+    CHANGING = (*TurnEngine.CHANGING, "_played")
 
     def __init__(
         self,
@@ -101,21 +83,25 @@ class GymnasiumEngine(TurnEngine):
 
     def _begin(self, number: int) -> int:
         env = self._envs[number]
-        observation, _info = env.reset(seed=self.layouts.begin(number))
+        seed = self.layouts.begin(number)
+        observation, _info = env.reset(seed=seed)
         self._played[number], self._earned[number] = [], 0.0
         return self._remember(env, observation)
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         env = self._envs[number]
-        observation, reward, terminated, truncated, info = stepped(env, action)
-        truncated = (truncated or elapsed >= self.max_steps) and not terminated
+        observation, reward, terminated, cut, info = env.step(action)
+        earned, terminated = float(reward), bool(terminated)
+        truncated = (bool(cut) or elapsed >= self.max_steps) and not terminated
         self._played[number].append(action)
-        self._earned[number] += reward
+        self._earned[number] += earned
         success = self.domain.success
         if success:
             over = terminated or truncated
-            self._succeeded[number] = over and bool(success(env, info, self._earned[number], terminated))
-        return self._remember(env, observation), reward, terminated, truncated
+            so_far = self._earned[number]
+            self._succeeded[number] = over and bool(success(env, info, so_far, terminated))
+        state = self._remember(env, observation)
+        return state, earned, terminated, truncated
 
     def step(self, actions: Ints) -> Step:
         step = super().step(actions)
@@ -145,18 +131,16 @@ class GymnasiumEngine(TurnEngine):
         if self._ids[oldest_look] < self.oldest:
             del self._ids[oldest_look]
 
-    def images(self, ids: Ints, out: Observations | None = None) -> Observations:
-        out = self.room_for(len(ids), out)
+    def images(self, ids: Ints) -> Observations:
+        images = self._room_for(len(ids))
         for row, state in enumerate(self._kept(ids)):
-            out[row] = self._ring[self._place(state)]
-        return out
+            images[row] = self._ring[self._place(state)]
+        return images
 
     def labels(self, ids: Ints) -> Bools:
         every = np.frombuffer(self._labels, np.bool_)
-        return every.reshape(-1, len(self.domain.sub_goals))[ids]
-
-    def labels_now(self) -> Bools:
-        return np.stack([labels_of(env, self.domain.label_functions) for env in self._envs])
+        rows = every.reshape(-1, len(self.domain.sub_goals))
+        return rows[ids]
 
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
@@ -164,7 +148,6 @@ class GymnasiumEngine(TurnEngine):
             **super().snapshot(),
             "images": np.stack(self._ring),
             "labels": np.frombuffer(self._labels, np.uint8).copy(),
-            "played": [list(actions) for actions in self._played],
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -175,10 +158,10 @@ class GymnasiumEngine(TurnEngine):
         super().restore(snapshot)
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
-        self._played = [list(actions) for actions in snapshot["played"]]
         self._ids.clear()
         states = np.arange(self.oldest, self.n_states)
-        for state, labels in zip(states.tolist(), self.labels(states), strict=True):
+        of_states = self.labels(states)
+        for state, labels in zip(states.tolist(), of_states, strict=True):
             image = self._ring[self._place(state)]
             self._file(digest(image, labels.tobytes()), state)
         for number in range(self.count):
@@ -191,9 +174,13 @@ class GymnasiumEngine(TurnEngine):
         observation, _info = env.reset(seed=seed)
         self._earned[number] = 0.0
         for action in self._played[number]:
-            observation, reward, *_ = stepped(env, action)
-            self._earned[number] += reward
+            observation, reward, *_ = env.step(action)
+            self._earned[number] += float(reward)
         [kept] = self.images(self.ids[number : number + 1])
         if not np.array_equal(self.domain.reader.read(observation), kept):
             fault = "the environment does not repeat itself for the same seed, so this cannot be resumed"
-            raise UserError(fault, f"layout_seed={seed}", ANEW)
+            raise UserError(
+                fault,
+                f"layout_seed={seed}",
+                ANEW,
+            )

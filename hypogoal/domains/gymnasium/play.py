@@ -13,7 +13,7 @@ from numpy.random import Generator
 from hypogoal.core.arrays import Bools
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
-from hypogoal.domains.gymnasium.engine import labels_of, stepped
+from hypogoal.domains.gymnasium.engine import labels_of
 from hypogoal.observations import Observations, digest
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def played(
                 action = int(rng.integers(env.action_space.n))
             else:
                 action = int(policy(env, observation, rng))
-            observation, _reward, terminated, truncated, _info = stepped(env, action)
+            observation, _reward, terminated, truncated, _info = env.step(action)
             elapsed += 1
             yield observation, (layout_seed, episode, elapsed)
             over = terminated or truncated or elapsed >= config.max_episode_steps
@@ -126,11 +126,16 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
             progress.advance()
         if not met:
             do = "Give other seeds, or more steps: states that look like training states do not count."
-            raise Unmet(f"there are no states for {name}", f"steps={config.steps}", do)
+            raise Unmet(
+                f"there are no states for {name}",
+                f"steps={config.steps}",
+                do,
+            )
         observations = np.array([state.observation for state in met], domain.reader.dtype)
         labels = np.array([state.labels for state in met])
         origins = np.array([state.origin for state in met])
-        sets.append(States(observations, labels, dict(zip(ORIGINS, origins.T, strict=True))))
+        named = dict(zip(ORIGINS, origins.T, strict=True))
+        sets.append(States(observations, labels, named))
         training.update(map(digest, observations))
     env.close()
     labelled, unlabelled, heldout = sets

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 
@@ -62,13 +61,25 @@ class Reader:
         return values.reshape(self.shape)
 
 
-def reader_of(env: gymnasium.Env) -> Reader:
-    """A reader of an environment's observations; a ``UserError`` if they are neither pictures nor numbers.
+def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
+    """A reader of an observation space, or of what a ``Dict`` has under ``key``.
 
     A ``Dict`` of pictures and others, each under a key of its own, is read by key, without its text. Other spaces that
-    Gymnasium's ``flatten`` accepts become float32 (D,) in its order.
+    Gymnasium's ``flatten`` accepts become float32 (D,) in its order. Observations that are neither pictures nor numbers
+    are a ``UserError``.
     """
-    return _reader(_without_text(env.observation_space))
+    space = _without_text(space)
+    if isinstance(space, spaces.Dict) and any(map(_is_picture, space.values())):
+        return _by_key(space)
+    if not isinstance(space, spaces.Box):
+        return _numbers(space)
+    reading = reading_of(space.shape, space.dtype)
+    if reading.fault:
+        where = f"{key} {space.dtype} {space.shape}".strip()
+        raise UserError(f"observations {reading.fault}", where, CLEARLY)
+    if reading.dtype == PICTURE:
+        return Reader(space, reading.shape, PICTURE)
+    return _numbers(space)
 
 
 def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
@@ -82,22 +93,6 @@ def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
     return spaces.Dict({key: part for key, part in space.items() if key not in texts})
 
 
-def _reader(space: spaces.Space[Any], key: str = "") -> Reader:
-    """A reader of a space, or of what a ``Dict`` has under ``key``."""
-    if isinstance(space, spaces.Dict) and any(map(_is_picture, space.values())):
-        return _by_key(space)
-    if not isinstance(space, spaces.Box):
-        return _numbers(space)
-    reading = reading_of(space.shape, space.dtype)
-    if reading.fault:
-        received = f"{space.dtype} {space.shape}"
-        where = f"{key}, {received}" if key else received
-        raise UserError(f"observations {reading.fault}", where, CLEARLY)
-    if reading.dtype == PICTURE:
-        return Reader(space, reading.shape, PICTURE)
-    return _numbers(space)
-
-
 def _is_picture(space: spaces.Space[Any]) -> bool:
     """Whether this is a picture, or refused because it may be."""
     if not isinstance(space, spaces.Box):
@@ -108,7 +103,7 @@ def _is_picture(space: spaces.Space[Any]) -> bool:
 
 def _by_key(space: spaces.Dict) -> Reader:
     """A reader of a ``Dict`` with pictures; of one alone it is that picture."""
-    parts = {key: _reader(part, str(key)) for key, part in space.items()}
+    parts = {key: reader_of(part, str(key)) for key, part in space.items()}
     if len(parts) == 1:
         [(key, part)] = parts.items()
         return replace(part, key=key)
@@ -124,11 +119,10 @@ def _by_key(space: spaces.Dict) -> Reader:
 def _numbers(space: spaces.Space[Any]) -> Reader:
     """A reader of a space without pictures, which Gymnasium flattens."""
     features: list[str] = []
-    leaves = list(_leaves(space))
-    for name, part in leaves:
+    for name, part in _leaves(space):
         if _is_picture(part):
             do = "Give a Dict with each picture under a key of its own, beside those of numbers."
-            raise UserError(MIXED, ", ".join(name for name, _ in leaves), do)
+            raise UserError(MIXED, name, do)
         features += _names(name, part)
     shape: Shape = (len(features),)
     if isinstance(space, spaces.Box) and space.shape:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from typing import Annotated, Any
 
 import numpy as np
@@ -38,7 +38,6 @@ class MontezumaConfig(Config):
     heldout_per_room: int = setting(
         300, "held-out states of each of the 24 rooms", unit="states", source="own choice", low=1, high=100_000
     )
-    heldout_seed: int = setting(0, "another number draws other held-out states and changes nothing else", low=0)
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
 
 
@@ -87,23 +86,9 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         "unlabelled": (unlabelled, config.unlabelled_per_room),
         "heldout": (range(game.ROOMS), config.heldout_per_room),
     }
-    jobs: dict[tuple[str, int], Callable[[], States]] = {}  # by set and room
-    for name, (rooms, wanted) in sets.items():
-        held_out = name == "heldout"
-        stream: tuple[str | int, ...] = ("montezuma", name)
-        if held_out:
-            stream = (*stream, config.heldout_seed)
-        for room in rooms:
-            jobs[name, room] = partial(
-                gather,
-                room,
-                wanted,
-                seed,
-                stream,
-                sub_goals=sub_goals,
-                held_out=held_out,
-                unclear=name == "unlabelled",
-            )
+    jobs: list[Callable[[], States]] = []
+    for split, (rooms, wanted) in sets.items():
+        jobs += [partial(gather, split, room, wanted, seed, sub_goals) for room in rooms]
     progress.total = sum(wanted * len(rooms) for rooms, wanted in sets.values())
     gathered: dict[int, States] = {}
 
@@ -111,11 +96,10 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         gathered[number] = states
         progress.advance(len(states.labels))
 
-    in_processes([*jobs.values()], allowed(config.workers), done)
-    by_set: dict[str, list[States]] = {name: [] for name in sets}
-    for number, (name, _) in enumerate(jobs):
-        by_set[name].append(gathered.pop(number))
-    for_labels, without_labels, heldout = map(joined, by_set.values())
+    in_processes(jobs, allowed(config.workers), done)
+    in_order = map(gathered.pop, range(len(jobs)))
+    each = [[*islice(in_order, len(rooms))] for rooms, _ in sets.values()]
+    for_labels, without_labels, heldout = map(joined, each)
     room_numbers = heldout.origins["room"]
     seen = np.full(len(room_numbers), SEEN_NOWHERE)
     seen[np.isin(room_numbers, unlabelled)] = SEEN_UNLABELLED

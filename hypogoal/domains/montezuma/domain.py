@@ -10,14 +10,13 @@ from types import MappingProxyType
 from typing import Any
 
 from hypogoal.core.arrays import Bytes, Ints
-from hypogoal.data import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.collect import MontezumaConfig, collect
 from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MAX_STEPS, beginning_named
 from hypogoal.domains.montezuma.ladders import distance_to
-from hypogoal.domains.montezuma.states import KINDS, emulator_of_process
+from hypogoal.domains.montezuma.states import emulator_of_process
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, SUB_GOALS
 
 TABLE_1: Mapping[str, Any] = {
@@ -40,7 +39,6 @@ LEARNING: Mapping[str, Any] = {
     "update_interval": 16,
     "epsilon_steps": 10_000,
     "epsilon_final": 0.01,
-    "random_episodes": 0,
 }
 # Options learned alone, ladder by ladder.
 ALONE: Mapping[str, Any] = {
@@ -63,10 +61,9 @@ class MontezumaDomain(Domain):
     config_class = MontezumaConfig
     env_id = "hypogoal.envs:hypogoal/MontezumaLadder-v0"
     starts = tuple(BEGINNINGS)
-    many_starts = True
-    kinds = KINDS
     measures = pictures = True
     near = 12
+    collect = staticmethod(collect)
     pixel = staticmethod(game.pixel)
     sources = MappingProxyType({"train-ensemble": "paper, appendix (Table 1)"})
     defaults = MappingProxyType(
@@ -77,9 +74,6 @@ class MontezumaDomain(Domain):
             "audit": {name: value for name, value in ALONE.items() if name != "steps"},
         }
     )
-
-    def collect(self, config: MontezumaConfig, seed: int, progress: Any) -> Collected:
-        return collect(config, seed, progress)
 
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, *, start: str = "1L", **arguments: Any

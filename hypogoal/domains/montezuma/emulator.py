@@ -94,7 +94,7 @@ def row_of(rooms: Any) -> Any:
     return np.searchsorted(FIRST_ROOM_OF_ROW, rooms, side="right") - 1
 
 
-def load_ale(seed: int) -> Any:
+def load_ale() -> Any:
     """A raw, deterministic emulator with the game's ROM, one frame per act; ``UserError`` if not installed."""
     try:
         import cv2  # noqa: F401
@@ -103,14 +103,12 @@ def load_ale(seed: int) -> Any:
     except ImportError as error:
         fault = f"Montezuma's Revenge cannot be played ({error})"
         raise UserError(fault, GAME, "pip install 'hypogoal[montezuma]'.") from None
-    rom = get_rom_path(GAME)
-    if rom is None or not rom.is_file():
-        raise UserError("the emulator has no ROM of the game", GAME, "Install ale-py 0.11 or newer: its wheel has it.")
     ALEInterface.setLoggerMode(LoggerMode.Error)
     ale = ALEInterface()
-    ale.setInt("random_seed", seed % 2**31)
+    ale.setInt("random_seed", 0)  # without sticky actions nothing depends on it
     ale.setFloat("repeat_action_probability", 0.0)
     ale.setInt("frame_skip", 1)
+    rom: Any = get_rom_path(GAME)
     ale.loadROM(rom)
     return ale
 
@@ -122,8 +120,8 @@ class Emulator:
         seen, screen: as in ``Snapshot``; never modified: each step makes new ones.
     """
 
-    def __init__(self, seed: int = 0):
-        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed; refuses if cv2 is missing
+    def __init__(self) -> None:
+        self.ale = load_ale()  # refuses if cv2 is missing
         import cv2
 
         self._cv2 = cv2
@@ -243,8 +241,6 @@ class Emulator:
 
     def _enter(self, room: int) -> Any:
         """The emulator's state right after the agent entered a room."""
-        if not 0 <= room < ROOMS:
-            raise UserError("no such room", room, f"Rooms are 0 to {ROOMS - 1}.")
         entries = (room - 1, RIGHT_EDGE, RIGHT), (room + 1, LEFT_EDGE, LEFT)
         for neighbour, x, action in entries:
             if not 0 <= neighbour < ROOMS:

@@ -30,11 +30,12 @@ class MontezumaEngine(TurnEngine):
     Ids 0 .. S-1 always are the S start states; every step of every environment gets a new id. Images are available for
     the newest ``memory`` of these, at least one for each environment; positions and labels for all.
 
-    Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``start`` may also be several,
-    comma-separated, with ``start_states`` each; ``seed`` also draws the one each episode begins with. A frame is 7 kB,
-    allocated on first use. An unknown start, too few start states, or no emulator is a ``UserError``.
+    Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``seed`` also draws the start
+    state each episode begins with. A frame is 7 kB, allocated on first use. An unknown start, too few start states, or
+    no emulator is a ``UserError``.
     """
 
+    CHANGING = (*TurnEngine.CHANGING, "_rng")
     n_actions = game.N_ACTIONS
     observation_shape = game.OBSERVATION_SHAPE
     position_names = ("room", "x", "y")
@@ -52,11 +53,8 @@ class MontezumaEngine(TurnEngine):
         self.count, self.max_steps = count, max_steps
         self.memory: int = memory
         self.room = memory
-        self._emulators = [game.Emulator(seed + number) for number in range(count)]
-        emulator = game.Emulator(seed)
-        self.starts: list[Start] = []
-        for name in start.split(","):
-            self.starts += make_starts(emulator, beginning_named(name), start_states, seed)
+        self._emulators = [game.Emulator() for _ in range(count)]
+        self.starts: list[Start] = make_starts(game.Emulator(), beginning_named(start), start_states, seed)
         self._rng = rng_for(seed, "start-of-episode")
         self._ring: list[game.Frames] = []  # four states' stacks share a frame in memory
         self._known_bytes = bytearray()  # ``KNOWN`` of each state
@@ -84,16 +82,16 @@ class MontezumaEngine(TurnEngine):
         self._known_bytes += bytes((*facts_in(ram), alive))
         return state, reward, not alive, elapsed >= self.max_steps
 
-    def images(self, ids: Ints, out: Bytes | None = None) -> Bytes:
+    def images(self, ids: Ints) -> Bytes:
         """Observations uint8 (n, 84, 84, 4) of states (n,); ``ValueError`` if one is unknown or forgotten."""
-        out = self.room_for(len(ids), out)
-        for image, state in zip(out, self._kept(ids), strict=True):
+        images = self._room_for(len(ids))
+        for image, state in zip(images, self._kept(ids), strict=True):
             if state < len(self.starts):
                 seen = self.starts[state].snapshot.seen
             else:
                 seen = self._ring[self._place(state)]
             game.stack_frames(seen, image)
-        return out
+        return images
 
     def _facts(self, ids: Ints) -> Ints:
         """``KNOWN`` of states, int64 (n, KNOWN), position first and life last, also of forgotten ones."""
@@ -116,7 +114,6 @@ class MontezumaEngine(TurnEngine):
         rows = [row[id(frame)] for frame in chain.from_iterable(stacks)]
         return {
             **super().snapshot(),
-            "rng": self._rng.bit_generator.state,
             "known": np.frombuffer(self._known_bytes, np.uint8).copy(),
             "frames": np.stack(list(frames.values())),
             "stacks": np.array(rows, np.int32).reshape(-1, game.STACK),
@@ -129,7 +126,6 @@ class MontezumaEngine(TurnEngine):
         from ale_py import ALEState
 
         super().restore(snapshot)
-        self._rng.bit_generator.state = snapshot["rng"]
         self._known_bytes = bytearray(snapshot["known"].tobytes())
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
         stacks = [itemgetter(*rows)(frames) for rows in snapshot["stacks"].tolist()]

@@ -67,12 +67,6 @@ class Start:
 
     snapshot: game.Snapshot
     facts: tuple[int, ...]  # the bytes that labels follow from, see ``FACTS``
-    picture: Bytes  # the console's, (210, 160, 3): a restored emulator has none until its first step
-
-    @property
-    def look(self) -> bytes:
-        """All that it shows."""
-        return self.snapshot.stack.tobytes()
 
 
 def make_starts(emulator: game.Emulator, beginning: Beginning, count: int, seed: int) -> list[Start]:
@@ -91,7 +85,7 @@ def make_starts(emulator: game.Emulator, beginning: Beginning, count: int, seed:
         start = _start(emulator, beginning, phase)
         if start is None:
             continue
-        look = start.look
+        look = start.snapshot.stack.tobytes()
         if look in by_look:
             alike.append(start)
         else:
@@ -113,8 +107,7 @@ def _start(emulator: game.Emulator, beginning: Beginning, phase: int) -> Start |
         snapshot = emulator.place(*beginning.at, phase=phase)
     if snapshot is None or emulator.position() != beginning.at:
         return None
-    facts = tuple(emulator.ram()[FACT_BYTES].tolist())
-    start = Start(snapshot, facts, emulator.screen_rgb())
+    start = Start(snapshot, tuple(emulator.ram()[FACT_BYTES].tolist()))
     return start if arrives(emulator, beginning) else None
 
 
@@ -138,29 +131,17 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
     Args:
         start: a ladder or another of ``BEGINNINGS``.
         max_steps: agent steps after which an episode is truncated.
-        render_mode: None, or ``rgb_array``: the console's picture, uint8 (210, 160, 3).
-        start_states: the number of start states, see ``make_starts``.
-        start_seed: draws those states. ``reset(seed)`` draws one of them, ``reset(options={"start_state": n})`` takes
-            the n-th.
+        start_states: the number of start states, see ``make_starts``. ``reset(seed)`` draws one of them,
+            ``reset(options={"start_state": n})`` takes the n-th.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 60 // game.FRAME_SKIP}  # noqa: RUF012
-
-    def __init__(
-        self,
-        start: str = "1L",
-        max_steps: int = MAX_STEPS,
-        render_mode: str | None = None,
-        start_states: int = START_STATES,
-        start_seed: int = 0,
-    ):
-        self.max_steps, self.render_mode = max_steps, render_mode
+    def __init__(self, start: str = "1L", max_steps: int = MAX_STEPS, start_states: int = START_STATES):
+        self.max_steps = max_steps
         self.observation_space = spaces.Box(0, 255, game.OBSERVATION_SHAPE, np.uint8)
         self.action_space = spaces.Discrete(game.N_ACTIONS)
         self.emulator = game.Emulator()
-        self.starts = make_starts(self.emulator, beginning_named(start), start_states, start_seed)
+        self.starts = make_starts(self.emulator, beginning_named(start), start_states, 0)
         self.elapsed = 0
-        self._picture: Bytes | None = None  # of the start state, before the first step
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Bytes, dict[str, Any]]:
         """Begin an episode with one of the start states."""
@@ -168,16 +149,13 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
         number = (options or {}).get("start_state")
         if number is None:
             number = int(self.np_random.integers(len(self.starts)))
-        start = self.starts[number]
-        self.emulator.restore(start.snapshot)
-        self._picture = start.picture
+        self.emulator.restore(self.starts[number].snapshot)
         self.elapsed = 0
         return self.emulator.stack, self._info()
 
     def step(self, action: Any) -> tuple[Bytes, float, bool, bool, dict[str, Any]]:
         """Four frames of an action."""
         reward = self.emulator.step(int(action))
-        self._picture = None
         self.elapsed += 1
         info = self._info()
         truncated = self.elapsed >= self.max_steps
@@ -189,11 +167,3 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
         [labels] = labels_of(facts, np.array([alive]), SUB_GOALS.values())
         named = dict(zip(SUB_GOALS, labels.tolist(), strict=True))
         return {"labels": named, "position": self.emulator.position(), "alive": alive}
-
-    def render(self) -> Any:
-        """The console's picture, uint8 (210, 160, 3); None without a render mode."""
-        if self.render_mode is None:
-            return None
-        if self._picture is None:
-            return self.emulator.screen_rgb()
-        return self._picture.copy()

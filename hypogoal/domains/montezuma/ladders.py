@@ -60,7 +60,7 @@ def within(positions: Ints, places: Sequence[Position], reach: int) -> Bools:
     differences = positions[:, None] - np.array(places)
     apart = np.abs(differences)
     same_room = apart[..., 0] == 0
-    close: Bools = (apart[..., 1:] <= reach).all(-1)
+    close = (apart[..., 1:] <= reach).all(-1)
     return close & same_room
 
 

@@ -97,23 +97,15 @@ def emulator_of_process() -> Emulator:
     return Emulator()
 
 
-def gather(
-    room: int,
-    wanted: int,
-    seed: int,
-    stream: tuple[str | int, ...],
-    *,
-    sub_goals: Sequence[SubGoal],
-    held_out: bool,
-    unclear: bool,
-) -> States:
+def gather(split: str, room: int, wanted: int, seed: int, sub_goals: Sequence[SubGoal]) -> States:
     """``wanted`` different states of a room: rollouts until there are enough, then a choice among them.
 
-    ``seed`` and ``stream`` determine all randomness, see ``rng_for``; ``held_out``, the side of ``may_be_held_out``;
-    ``unclear``, whether to keep states at unclear places, such as bases of ladders that continue through the floor. A
-    room with too few different states is a ``UserError``.
+    Only the ``unlabelled`` ones are also at unclear places, such as bases of ladders that continue through the floor.
+    A room with too few different states is a ``UserError``.
     """
-    rng = rng_for(seed, *stream, room)
+    held_out, unclear = split == "heldout", split == "unlabelled"
+    stream = (split, 0) if held_out else (split,)
+    rng = rng_for(seed, "montezuma", *stream, room)
     left_out, sought = set(), set()  # a sub-goal's name and the index of its place
     for goal in sub_goals:
         for index, place in enumerate(goal.places):
@@ -160,16 +152,12 @@ def gather(
 
 def choose(kinds: Ints, positions: Ints, wanted: int, rng: Generator) -> Ints:
     """Ordered indices of ``wanted`` of n states: each kind's share, spread over positions; the others at random."""
+    from pandas import DataFrame  # takes longer to import than most stages need it
+
     order = rng.permutation(len(kinds))
-    # Each state's rank within its kind and position: the first of each come before the second of any.
-    counts: Counter[bytes] = Counter()
-    ranks = np.empty(len(kinds), np.int64)
-    alike = np.column_stack([kinds, positions])
-    for index in order.tolist():
-        same = alike[index].tobytes()
-        ranks[index] = counts[same]
-        counts[same] += 1
-    spread = order[np.argsort(ranks[order], kind="stable")]
+    alike = DataFrame(np.column_stack([kinds, positions])[order])
+    ranks = alike.groupby([*alike]).cumcount()  # the first of a kind and position come before the second of any
+    spread = order[np.argsort(ranks, kind="stable")]
     first = np.zeros(0, np.int64)
     for kind, share in KIND_SHARES.items():
         of_kind = spread[kinds[spread] == kind]

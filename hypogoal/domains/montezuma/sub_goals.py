@@ -1,8 +1,8 @@
 """The sub-goals on Montezuma's Revenge (Spec I4): where each holds, by the console's memory, and rooms that label it.
 
-The paper has the first; the others are in its authors' repository (``monte_terminations.py``). One more is one more
-entry of ``SUB_GOALS``. Where enemies and lasers are is in ``measured.toml``; where the authors' code differs, in
-docs/deviations.md.
+The paper has the first, ``CLIMB_DOWN``: the agent lives and is within ``REACH`` of a ladder's base, in x and in y. The
+others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``SUB_GOALS``. Where
+enemies and lasers are is in ``measured.toml``; where the authors' code differs, in docs/deviations.md.
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -37,7 +37,11 @@ class RoomsConfig(Config):
         if twice or self.truth not in self.factors:
             where = f"factors={','.join(self.factors)}, truth={self.truth}"
             do = f"Choose from {', '.join(FACTORS)}."
-            raise UserError("each feature is planted once, the true one among them", where, do)
+            raise UserError(
+                "each feature is planted once, the true one among them",
+                where,
+                do,
+            )
         return self
 
 
@@ -87,9 +91,8 @@ class RoomsEngine(Engine):
         rewards = self._right[following].astype(np.float32)
         return Step(following, rewards, over, ~over)
 
-    def images(self, ids: Ints, out: Bytes | None = None) -> Bytes:
-        out = self.room_for(len(ids), out)
-        return np.take(self._pictures, ids, axis=0, out=out)
+    def images(self, ids: Ints) -> Bytes:
+        return self._pictures[ids]
 
     def labels(self, ids: Ints) -> Bools:
         return self._right[ids][:, None]
@@ -102,7 +105,13 @@ class RoomsEngine(Engine):
         final = ids >= DECKS
         following = np.repeat(ids[:, None], self.n_actions, axis=1)
         following[:DECKS] = ids[final].reshape(DECKS, -1)
-        return Plan(ids, np.arange(self.n_actions), following, final, self._right)
+        return Plan(
+            ids,
+            np.arange(self.n_actions),
+            following,
+            final,
+            self._right,
+        )
 
     def shortest_path(self) -> int:
         return 1

@@ -134,6 +134,13 @@ def image_of(ids: Ints) -> Bytes:
 def tiles() -> Bytes:
     """Every kind of tile, uint8 (kinds, 8, 8, 3)."""
     boxes = [Box(colour) for colour in BOX_COLOURS]
-    objects = [Key("red"), Key("blue"), Ball("red"), Ball("blue"), *boxes, Goal()]
+    objects = [
+        Key("red"),
+        Key("blue"),
+        Ball("red"),
+        Ball("blue"),
+        *boxes,
+        Goal(),
+    ]
     agents = product([None], range(4))
     return drawn_tiles([(None, None), (Wall(), None), *agents, *product(objects, [None])])

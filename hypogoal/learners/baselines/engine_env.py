@@ -1,7 +1,6 @@
 """An engine as a stable-baselines3 vectorised environment, and the list of episodes played in it."""
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,14 +9,15 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from hypogoal.core.arrays import Bools, Floats, Ints
-from hypogoal.domains.base import Engine, check_step
+from hypogoal.core.checkpoints import Resumable
+from hypogoal.domains.base import Engine
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
 
 FIXED = "an engine's attributes are fixed, and it has no methods for single environments"
 
 
-class EngineEnv(VecEnv):
+class EngineEnv(VecEnv, Resumable):
     """All environments of an engine, with its primitive actions and images.
 
     Observations are the engine's images, uint8 (C, H, W), or its numbers, float32, by its ``standard`` if there is one;
@@ -25,6 +25,8 @@ class EngineEnv(VecEnv):
     ``networks.CellNetwork``). An episode cut at its step limit is marked as truncated: its last state is not a terminal
     one. ``episodes`` are those that ended.
     """
+
+    CHANGING = ("engine", "episodes")
 
     def __init__(self, engine: Engine):
         self.engine = engine
@@ -46,8 +48,7 @@ class EngineEnv(VecEnv):
             actions,
         )
         self.episodes = EpisodeRecorder(engine.count)
-        self._actions = np.zeros(engine.count, dtype=np.int64)
-        self._checked = False  # the engine's first step
+        self._actions = np.zeros(engine.count, np.int64)
 
     def _observe(self, ids: Ints) -> Observations:
         if self.tiles is not None:
@@ -65,14 +66,11 @@ class EngineEnv(VecEnv):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take note of the actions (count,) of the next step."""
-        self._actions = np.asarray(actions, dtype=np.int64)
+        self._actions = np.asarray(actions, np.int64)
 
     def step_wait(self) -> tuple[Observations, Floats, Bools, list[dict[str, Any]]]:
         """Step every environment; where an episode ended, the observation is that of the next one's start."""
         step = self.engine.step(self._actions)
-        if not self._checked:
-            check_step(self.engine, step)
-            self._checked = True
         self.episodes.see(step)
         done = step.terminated | step.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -82,18 +80,6 @@ class EngineEnv(VecEnv):
             infos[index]["TimeLimit.truncated"] = bool(not step.terminated[index])
         observations = self._observe(self.engine.ids)
         return observations, step.rewards, done, infos
-
-    def snapshot(self) -> dict[str, Any]:
-        """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
-        return {
-            "engine": self.engine.snapshot(),
-            "episodes": self.episodes.snapshot(),
-        }
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of environments made with the same arguments."""
-        self.engine.restore(snapshot["engine"])
-        self.episodes.restore(snapshot["episodes"])
 
     def close(self) -> None:
         """Nothing to close."""
