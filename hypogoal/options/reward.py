@@ -98,21 +98,25 @@ class SubgoalReward:
     def decide(self, members: Bools) -> Bools:
         """Whether the sub-goal holds where members say so: bool (N, K) to (N,)."""
         if self.by in self.least:
-            return members.sum(1) >= self.least[self.by]
+            return np.asarray(members.sum(1) >= self.least[self.by])
         return members[:, int(self.by)]
 
     def wrap(
         self,
         env: Env,
         *,
+        scale: float = 1.0,
+        add: bool = False,
         ends: bool = True,
         start: str = "unpaid",
         away: int = 1,
     ) -> RewardedEnv:
-        """An environment that pays 1 where the sub-goal holds, else 0, in place of its own reward.
+        """An environment that pays ``scale`` where the sub-goal holds, else 0.
 
         Args:
             env: one whose observations are those of training.
+            scale: what it pays.
+            add: that is added to its own reward instead of replacing it.
             ends: its episode terminates where it pays; else an agent can stay where it is rewarded.
             start: of an episode that begins where the prediction is positive, so that doing nothing would be paid:
                 ``unpaid`` until the prediction has been negative, ``paid``, or ``refuse``, a ``UserError`` by
@@ -123,9 +127,9 @@ class SubgoalReward:
         ``info["subgoal"]`` is ``{"predicted": bool, "paid": float}``, of ``reset`` and of every step.
 
         Raises:
-            UserError: other observations than those of training; an unknown ``start``.
+            UserError: other observations than those of training; an unknown ``start``; ``away`` below 1.
         """
-        return RewardedEnv(env, self, ends, start, away)
+        return RewardedEnv(env, self, scale, add, ends, start, away)
 
 
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -135,17 +139,22 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self,
         env: Env,
         reward: SubgoalReward,
+        scale: float,
+        add: bool,
         ends: bool,
         start: str,
         away: int,
     ):
-        kept = {"reward": reward, "ends": ends, "start": start, "away": away}
+        kept = {"reward": reward, "scale": scale, "add": add, "ends": ends, "start": start, "away": away}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
         gymnasium.Wrapper.__init__(self, env)
         if start not in STARTS:
             raise UserError("unknown way with starts inside", f"start={start!r}", f"Choose one of {', '.join(STARTS)}.")
+        if away < 1:
+            raise UserError("a prediction is negative for at least one step", f"away={away}", "Give 1 or more.")
         self._reader = require_observations(env, reward.ensemble)
-        self.reward, self.ends, self.start, self.away = reward, ends, start, away
+        self.reward, self.scale, self.add, self.ends = reward, scale, add, ends
+        self.start, self.away = start, away
         self._rule = copy.deepcopy(reward.ends)
         self._age = 0
         self._negatives = 0  # steps in a row
@@ -164,7 +173,7 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step with reward and end changed."""
-        observation, _reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
         log_odds = self._log_odds(observation)
         members = np.arange(len(log_odds))
         reached = self._rule.reached(log_odds, members, np.full_like(members, self._age))
@@ -174,9 +183,10 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._negatives = 0 if self._positive(log_odds) else self._negatives + 1
             self._pays = self._negatives >= self.away
         holds = predicted and self._pays
-        paid = float(holds)
+        of_sub_goal = self.scale if holds else 0.0
+        paid = of_sub_goal + float(reward) if self.add else of_sub_goal
         terminated = bool(terminated) or (holds and self.ends)
-        shown = {"predicted": predicted, "paid": paid}
+        shown = {"predicted": predicted, "paid": of_sub_goal}
         return observation, paid, terminated, truncated, info | {"subgoal": shown}
 
     def _log_odds(self, observation: Any) -> Floats:

@@ -285,7 +285,7 @@ def test_options_in_a_vector_of_environments(options: Options) -> None:
 
 @pytest.mark.parametrize("by", ["any", "vote", "all", 0, np.int64(1)])
 def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) -> None:
-    """Spec D1: reward 1 where the classifier fires, else 0."""
+    """Spec D1: reward 1 where the classifier fires, else 0; with ``add`` the environment's own too."""
     reward = hypogoal.SubgoalReward(ensemble, by=by)
     env = reward.wrap(corridor())
     env.reset(seed=0)
@@ -295,6 +295,9 @@ def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) 
     assert [info["subgoal"]["paid"] for *_, info in told] == [0, 0, 0, 0, 1]
     rewards = reward(np.stack([observation for observation, *_ in told]))
     assert rewards.dtype == np.float32 and rewards.tolist() == [0, 0, 0, 0, 1]
+    both = reward.wrap(corridor(), scale=0.5, add=True)
+    both.reset(seed=0)
+    assert [both.step(1)[1] for _ in range(3)] == [0, 0, 1.5]
 
 
 def test_a_classifier_ends_an_episode(made: Path) -> None:
@@ -363,6 +366,8 @@ def test_an_episode_that_begins_inside_can_be_refused(made: Path) -> None:
         env.reset(seed=0)
     with pytest.raises(UserError, match="Choose one of unpaid, paid, refuse"):
         reward.wrap(corridor(), start="free")
+    with pytest.raises(UserError, match="Give 1 or more"):
+        reward.wrap(corridor(), away=0)
 
 
 def test_mistakes_are_one_line(made: Path, options: Options, ensemble: Ensemble) -> None:
