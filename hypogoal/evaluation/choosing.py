@@ -186,6 +186,8 @@ def is_playable(artefact: Artefact) -> bool:
     config = artefact.config
     if artefact.kind != "meta" or not takes(artefact) or config["chooser"] == "random":
         return False
+    if ":" in config["termination"]:  # a rule of one's own may ask for more than a state
+        return False
     # Of many layouts the states are too many to say what follows in each.
     if config["network"] not in MEMORYLESS or config.get("layouts"):
         return False

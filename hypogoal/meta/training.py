@@ -14,8 +14,8 @@ The words of the loop:
 Where an option's time runs out in mid-episode (``timed_out`` in :meth:`.OptionLoop.advance`), the episode goes on:
 
 - record: its execution has ended, after ``option_timeout`` steps, without having reached its sub-goal.
-- reward: its policy's reward is 0, as at every step that does not reach the sub-goal; with ``experience=shared`` every
-  other member has its own, by its own prediction of s'.
+- reward: its policy's reward is 0, as at every step after which its member's prediction is negative; with
+  ``experience=shared`` every other member has its own, by its own prediction of s'.
 - bootstrap: time is not part of a state, so its policy's target there is the Double-DQN value of s', as if it went on.
   Only the sub-goal and the end of the task are terminal. A transition over several steps ends there, too.
 - SMDP return: R and gamma ** tau, as at any other end. The meta-policy's advantage (:mod:`.smdp`) takes

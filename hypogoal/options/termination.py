@@ -1,7 +1,8 @@
 """What decides that an option ends: one object, which every loop that plays options asks (Spec D1, D2, H4).
 
-An execution ends at the first of three things (the last lines of ``OptionLoop.advance`` and ``OptionEnv.step`` say so):
-its sub-goal is reached, as :meth:`Terminations.reached` says; it has taken ``option_timeout`` steps; its episode ends.
+An execution ends at the first of three things (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance`` and
+``OptionEnv.step``): its sub-goal is reached, as :meth:`Terminations.reached` says; it has taken ``option_timeout``
+steps; its episode ends.
 By default the sub-goal is reached where the prediction of the option's own member is positive: where the member's
 log-odds lie above its threshold. Another rule is another subclass, named by the setting ``termination``; with
 ``termination=oracle`` the sub-goals' true labels stand in for predictions.
@@ -31,9 +32,11 @@ ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub
 class Terminations(Part):
     """An execution ends at the first state in which its own member's prediction is positive (the paper).
 
-    Other rules are subclasses: :meth:`reached` by which an execution ends otherwise, with :meth:`finished` where the
-    rule learns from executions. What a rule keeps of running executions is by environment; in ``OptionEnv``, which has
-    its own object, E is 1. What it learns goes into checkpoints by ``CHANGING`` and into artefacts by :meth:`state`.
+    Other rules are subclasses: :meth:`reached`, asked at every step of training, of frozen play and of ``OptionEnv``,
+    and :meth:`finished`, called in training alone, where a rule learns from executions. What it keeps of a running
+    execution is by environment, and begins anew where ``age`` is 0; in ``OptionEnv``, which has its own object, E is 1.
+    What it learns goes into checkpoints by ``CHANGING`` and into artefacts by :meth:`state`. A rule ends executions;
+    rewards and targets of policies, and which options are offered, go by :meth:`positive`, of one state, all the same.
 
     Args:
         classify: state ids (n,) -> log-odds float32 (n, O), or predictions, bool (n, O); None without an engine.
