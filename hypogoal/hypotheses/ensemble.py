@@ -93,7 +93,9 @@ class Ensemble(nn.Module):
         built = []
         for _ in range(members):
             built.append(networks.build_network(self.network, self.view.shape, generator, self.view.dtype))
-        weights = [weight for member in built for weight in (*member.parameters(), *member.buffers())]
+        weights: list[Tensor] = []
+        for member in built:
+            weights += [*member.parameters(), *member.buffers()]
         if len({*weights}) < len(weights):
             do = "Make new layers at every call, with weights from PyTorch's generator."
             raise UserError("two members share weights", self.network, do)

@@ -28,6 +28,8 @@ def report(
     plays, ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.
     """
     if figures is not None:
+        from hypogoal.evaluation.figure_files import draw_figures
+
         written, missing = draw_figures(run, figures, format, force=call.force)
         for line in missing:
             say(line, err=True)
@@ -73,38 +75,3 @@ def report(
             path = moving / film.name
             path.write_bytes(film.gif)
     return Done()
-
-
-def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:
-    """Draw the paper's figures, those that the run has artefacts for, as files of their own, and ``captions.md``.
-
-    Returns the files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs. A run
-    that was not evaluated, another ``kind`` than svg, pdf and png, or a file that is there is a ``UserError``.
-    """
-    from hypogoal.core.files import replacing
-    from hypogoal.evaluation.plots import UNDATED, slug, to_file
-    from hypogoal.evaluation.questions import answers, captions, not_drawn
-    from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
-
-    if kind not in UNDATED:
-        raise UserError("no such format of figures", kind, f"Choose one of {', '.join(UNDATED)}.")
-    results = read_evaluation(run)
-    with fitting(evaluation_of(run).path):
-        figures = captions(answers(results, drawn=True))
-        missing = not_drawn(figures)
-    contents = {}
-    texts = []
-    for name, (drawn, caption) in sorted(figures.items()):
-        path = folder / f"{slug(name)}.{kind}"
-        contents[path] = to_file(drawn.figure, kind)
-        texts.append(f"## {path.name}\n\n{caption}")
-    text = "\n\n".join([*texts, *missing])
-    contents[folder / "captions.md"] = f"{text}\n".encode()
-    for path in contents:
-        if path.exists() and not force:
-            raise UserError("exists already", path, "Give --force to replace it, or choose another folder.")
-    folder.mkdir(parents=True, exist_ok=True)
-    for path, content in contents.items():
-        with replacing(path) as fresh:
-            fresh.write_bytes(content)
-    return [*contents], missing

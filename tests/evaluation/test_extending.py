@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 
 from hypogoal.evaluation import page
+from hypogoal.evaluation.figure_files import draw_figures
 from hypogoal.evaluation.questions import QUESTIONS
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.stages.report import draw_figures, report
+from hypogoal.stages.report import report
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
