@@ -120,6 +120,10 @@ class PaperPolicies:
 
     def __init__(self, options: saved.SavedOptions):
         self.recurrence = options.config["recurrence"]
+        if not isinstance(self.recurrence, int):
+            fault = "these options remember their executions in another way than this version's"
+            place = f"recurrence={self.recurrence}"
+            raise UserError(fault, place, "Train them again with --set recurrence=N.")
         actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
         make = partial(PaperQNetwork, options.shape, actions)
         self.networks = []
@@ -129,19 +133,18 @@ class PaperPolicies:
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
-        network = self.networks[option]
         window: deque[Observations] = deque(maxlen=self.recurrence)
+        return partial(_act, self.networks[option], window)
 
-        @torch.no_grad()
-        def act(observation: Observations) -> int:
-            window.append(observation)
-            features = network.see(torch.from_numpy(np.stack(window)))
-            count = len(window)
-            whole = torch.arange(count)[None]
-            values = network(features, whole, torch.tensor([count]))
-            return int(values.argmax())
 
-        return act
+@torch.no_grad()
+def _act(network: PaperQNetwork, window: deque[Observations], observation: Observations) -> int:
+    """The action in the last state of an execution, of which ``window`` has those before."""
+    window.append(observation)
+    features = network.see(torch.from_numpy(np.stack(window)))
+    count = len(window)
+    values = network(features, torch.arange(count)[None], torch.tensor([count]))
+    return int(values.argmax())
 
 
 class PaperLearner(Learner):

@@ -113,7 +113,7 @@ class OptionLoop(Resumable):
         self._finish_options(step, moved, learning=learning)
         return moved
 
-    def _choose(self, learning: bool) -> None:
+    def _choose(self, learning: bool = True) -> None:
         free = np.flatnonzero(self.option == NONE)
         if not len(free):
             return

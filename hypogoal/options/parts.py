@@ -34,7 +34,7 @@ def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most
     kinds = "b" if dtype == np.bool_ else "iu"
     if given.shape != (count,) or given.dtype.kind not in kinds:
         shown = f"{given.dtype} {given.shape}"
-    elif given.min() < 0 or given.max() > most:
+    elif count and (given.min() < 0 or given.max() > most):
         shown = f"{given.min()} to {given.max()}"
     else:
         return given

@@ -127,7 +127,7 @@ def test_minigrids_dictionary_is_read_without_its_text() -> None:
     """Spec B6: a picture and a number by key; a line says so."""
     env = gymnasium.make("MiniGrid-Empty-8x8-v0")
     with pytest.warns(UserWarning, match="observations are read without their text: mission"):
-        reader = reader_of(env)
+        reader = reader_of(env.observation_space)
     seen, _ = env.reset(seed=0)
     read = reader.read(seen)
     assert read.dtype.names == ("direction", "image")
@@ -135,7 +135,7 @@ def test_minigrids_dictionary_is_read_without_its_text() -> None:
     assert read["direction"].tolist() == [1.0, 0.0, 0.0, 0.0]
     nothing_else = spaces.Dict(mission=env.observation_space["mission"])
     with pytest.raises(UserError, match="observations must be images"):
-        reader_of(Says(nothing_else, None))
+        reader_of(nothing_else)
 
 
 def test_a_dictionary_hides_no_picture() -> None:

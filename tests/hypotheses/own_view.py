@@ -58,6 +58,13 @@ class Moved(View):
         return [positives[kinds == kind] for kind in np.unique(kinds)], 3 / 8
 
 
+class Wrong(Moved):
+    """It says that it shows more than it does."""
+
+    def see(self, observations: Any) -> Any:
+        return super().see(observations)[:, 1:]
+
+
 class OfNumbers(View):
     """A view of numbers."""
 

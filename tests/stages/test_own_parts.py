@@ -147,7 +147,7 @@ def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_ru
     refuses(fault, "train-options", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *own)
 
 
-@pytest.mark.parametrize(("pair", "without"), [("entropy=0.1", "chooser=random"), ("replay=500", "network=planned")])
+@pytest.mark.parametrize(("pair", "without"), [("decisions=64", "chooser=random"), ("replay=500", "network=planned")])
 def test_settings_that_do_nothing_are_refused(pair: str, without: str, corridor_run: Path, tmp_path: Path) -> None:
     """Spec G2: beside choosers and learners without them."""
     words = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *settings(pair, without)]
