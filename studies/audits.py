@@ -12,8 +12,9 @@ with no positive state before, which would have ended the execution: found by go
 Classifiers are drawn by seed, from the three worlds in turn, until there are 25 of either truth. The first five of
 either choose the rule, the other forty are scored. Rule, written before the run: the statistic below and the threshold
 that have the highest F1 on the ten; of equals the first. Expected: precision 1, since what was reached can be reached;
-recall below .9 without a policy that is paid for false positives alone (``search`` in the cells; the setting went),
-since a policy goes to the nearest positive state, which is success where that is nearer; above with it.
+recall below .9 without a policy that is paid for false positives alone (``search`` in the cells, played at commit
+0a909ff0 with half of the steps; the setting went), since a policy goes to the nearest positive state, which is success
+where that is nearer; above with it.
 """
 
 from __future__ import annotations

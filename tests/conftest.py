@@ -20,17 +20,21 @@ torch.set_num_threads(1)
 
 # Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
 LONGEST = (
+    "test_reference",
+    "test_evaluate_report",
+    "test_fuzz",
     "test_sweep",
     "test_examples",
-    "test_evaluate_report",
+    "test_agents",
+    "test_ladder_run",
+    "test_mixed",
+    "test_montezuma_sub_goals",
+    "test_start_states",
     "test_stopping",
     "test_cli",
     "test_docs",
-    "test_loop",
-    "test_rooms_domain",
-    "test_own_code",
-    "test_bad_files",
-    "test_fuzz",
+    "test_notebook",
+    "test_package",
 )
 
 
