@@ -220,8 +220,9 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
     columns = labels.reshape(len(labels), len(sub_goals))
     for sub_goal, column in zip(sub_goals, columns.T, strict=True):
         group = file.require_group(f"{split}/{sub_goal}")
-        for name in first.keys() - group.keys() - {"labels"}:
-            group[name] = first[name]
+        for name in ("observations", "origin"):  # in this order, whatever the hashes of this process
+            if name in first and name not in group:
+                group[name] = first[name]
         _store(group, "labels", column)
 
 

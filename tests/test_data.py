@@ -1,6 +1,7 @@
 """The data file: whole or refused in one line (Spec A1, A8, G2)."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -132,3 +133,14 @@ def test_a_changed_byte_is_found(tmp_path: Path, name: str) -> None:
     whole[chunk.byte_offset + chunk.size // 2] ^= 1
     path.write_bytes(whole)
     assert "cannot be read" in fails("verify", path).out
+
+
+def test_bytes_do_not_depend_on_the_hashes_of_a_process(tmp_path: Path) -> None:
+    """Spec G1: where sub-goals share their states."""
+    files = []
+    for number in ("1", "2", "3"):
+        files.append(tmp_path / f"{number}.h5")
+        words = ["collect", "doorkey", "--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1", "-q"]
+        command = [sys.executable, "-m", "hypogoal", *words, "--out", str(files[-1])]
+        subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": number}, capture_output=True, check=True)
+    assert len({file.read_bytes() for file in files}) == 1
