@@ -33,7 +33,7 @@ def checkout(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
 def test_it_installs_elsewhere_and_runs_the_demos_first_stage(kind: str, checkout: Path, tmp_path: Path) -> None:
     """Dependencies are those of this environment; hypogoal is not in it but by a link, which a path does not carry."""
-    pytest.importorskip("setuptools")
+    pytest.importorskip("setuptools", minversion="77")
 
     def called(*words: object) -> str:
         command = [str(word) for word in words]
