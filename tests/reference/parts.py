@@ -473,7 +473,8 @@ def evaluation_demo(work: Path) -> Table:
     """The demo of DoorKey with shorter trainings."""
     run = work / "demo"
     shorter = settings_of("collect", heldout_layouts=2) + settings_of("train-ensemble", steps=40, batch_size=32)
-    shorter += settings_of("train-options", steps=8_000) + settings_of("train-meta", steps=6_000)
+    explored = {"epsilon_steps": 8_000, "update_interval": 16, "option_learning_rate": 5e-4}  # as the preset once had
+    shorter += settings_of("train-options", steps=8_000, **explored) + settings_of("train-meta", steps=6_000)
     shorter += settings_of("train-baseline", steps=6_000)
     command("run", "doorkey", "--preset", "demo", *settings(workers=1), *shorter, "--out", str(run))
     return evaluated(run)
