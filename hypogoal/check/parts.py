@@ -66,7 +66,8 @@ class _PlayedPart:
             checkpoints = Checkpoints(Path(folder, "state"))
             checkpoints.save(loop.snapshot())
             saved = checkpoints.load()
-        assert saved, "what CHANGING names is not finite"
+        promise(saved is not None, "no checkpoint could be kept", "Keep finite numbers in what CHANGING names.")
+        assert saved is not None
         resumed.restore(saved)
         require_same(_play(loop), _play(resumed), "Name in CHANGING all that changes.")
         return None
