@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import io
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -15,9 +17,6 @@ from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, replacing
 from hypogoal.learners.episodes import LAST
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 MAX_INTEGER = 2**53  # integers that a float holds exactly
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
@@ -43,21 +42,16 @@ class Table(Columns):
 
     def write(self, folder: Path) -> None:
         """The file of this table into ``folder``; a NaN is an empty cell."""
-        with replacing(folder / self.FILE) as fresh:
-            self.frame().to_csv(fresh, index=False, lineterminator="\n")
+        with replacing(folder / self.FILE) as fresh, fresh.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(self.names())
+            for row in self.rows():
+                writer.writerow(["" if math.isnan(number) else number for number in row])
 
     def rows(self) -> list[tuple[Any, ...]]:
         """Plain numbers, row by row; truth values are 0 and 1."""
-        return [*self.frame().itertuples(index=False, name=None)]
-
-    def frame(self) -> DataFrame:
-        """Numbers, truth values as 0 and 1."""
-        from pandas import DataFrame
-
-        columns = {}
-        for name in self.names():
-            columns[name] = getattr(self, name) * 1
-        return DataFrame(columns)
+        columns = [(getattr(self, name) * 1).tolist() for name in self.names()]
+        return [*zip(*columns, strict=True)]
 
 
 @dataclass(frozen=True)
