@@ -1,7 +1,5 @@
 """Commands of hypogoal in this process: those that succeed, and those that are refused."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout

@@ -16,6 +16,8 @@ import shared_runs
 import torch
 from command_line import run, trusting
 
+from hypogoal.core.own_code import VARIABLE
+
 torch.set_num_threads(1)
 
 # Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
@@ -64,6 +66,12 @@ def nothing_typed_before() -> None:
 
 
 @pytest.fixture
+def trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The user allows the code that files name."""
+    monkeypatch.setenv(VARIABLE, "1")
+
+
+@pytest.fixture
 def small_gru(monkeypatch: pytest.MonkeyPatch) -> None:
     """The paper's option networks with a GRU of 32 units instead of 512: 10.5 M parameters each say no more."""
     from hypogoal.options.conv_gru import PaperQNetwork
@@ -75,6 +83,12 @@ def small_gru(monkeypatch: pytest.MonkeyPatch) -> None:
 def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A run of every stage on DoorKey, to be read only: ``shared_runs.DOORKEY_RUN`` says what is in it."""
     yield from shared_runs.built_once(tmp_path_factory, "tiny", partial(shared_runs.make, shared_runs.DOORKEY_RUN))
+
+
+@pytest.fixture(scope="session")
+def mixed_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Imported states of two cameras and numbers, of one sub-goal, hypotheses and their audit, to be read only."""
+    yield from shared_runs.built_once(tmp_path_factory, "mixed", shared_runs.make_mixed)
 
 
 @pytest.fixture

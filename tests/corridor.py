@@ -75,7 +75,7 @@ class LongCorridor(Corridor):
     n_actions = 4
     position_names = ("room", "x", "y")
     restarts = True
-    observation_shape = (20, 84, 4)  # not made of cells
+    observation_shape = (20, 42, 4)  # not made of cells
     cells: ClassVar[dict[str, int]] = {"middle": 2, "left": 0}
 
     def __init__(self, count: int, max_steps: int = 30, *, start: str = "middle", memory: int = 200_000, seed: int = 0):
@@ -127,7 +127,7 @@ class LongCorridor(Corridor):
             raise ValueError("a forgotten state")
         images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8)
         for row, identity in enumerate(ids):
-            images[row, :, 14 * self.cell[identity] : 14 * self.cell[identity] + 14] = 255
+            images[row, :, 7 * self.cell[identity] : 7 * self.cell[identity] + 7] = 255
         return images
 
     def positions(self, ids: np.ndarray) -> np.ndarray:

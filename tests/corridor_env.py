@@ -1,7 +1,5 @@
 """The corridor as a Gymnasium environment, and domains of it: what a user would bring (Spec B6)."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Observations of two cameras and a state vector, whose sub-goal is seen by one camera and felt in the state."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +7,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+GOAL = "door-open"
 FRONT, WRIST, STATE = (48, 64, 3), (44, 44, 3), (4,)
 
 

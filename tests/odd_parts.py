@@ -1,7 +1,5 @@
 """Choosers, learners, termination rules, views and teachers as strangers write them: right ones, and one fault each."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -9,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.views import View
 from hypogoal.options.choosers import Chooser
 from hypogoal.options.learner import Learner
@@ -83,7 +82,17 @@ class Unnamed(First):
 
 
 class Straight(Learner):
-    """Its options play by the state's number."""
+    """Every option plays by its number and the sum of the pixels; it counts the steps and learns nothing."""
+
+    @classmethod
+    def policies(cls, saved: Any) -> Any:
+        return lambda option: lambda picture: preferred(picture, option, 7)
+
+    @classmethod
+    def refuse(cls, config: Any, engine: Any) -> None:
+        super().refuse(config, engine)
+        if config.experience != "shared":
+            raise UserError("straight options have no experience", f"experience={config.experience}", "Leave it out.")
 
     @staticmethod
     def reach(config: Any, options: int) -> int:
@@ -93,10 +102,15 @@ class Straight(Learner):
         self.table = torch.zeros(self.options)
 
     def greedy(self, ids: Any, options: Any, age: Any) -> Any:
-        return (ids + options) % self.engine.n_actions
+        pairs = zip(self.engine.images(ids), options.tolist(), strict=True)
+        return np.array([preferred(picture, option, self.engine.n_actions) for picture, option in pairs])
 
     def observe(self, moved: Any) -> None:
         self.count(moved.options)
+
+
+def preferred(picture: Pictures, option: int, actions: int) -> int:
+    return (int(picture.sum()) // 7 + option) % actions
 
 
 class Unsaved(Straight):
@@ -125,7 +139,7 @@ class Negative(Straight):
 
 
 class Twice(Terminations):
-    """Two positive predictions in a row."""
+    """Two positive predictions in a row; a threshold falls with every execution."""
 
     CHANGING = (*Terminations.CHANGING, "row")
 
@@ -137,15 +151,20 @@ class Twice(Terminations):
         self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
         return self.row >= 2
 
+    def finished(self, environments: Any, options: Any, reached: Any) -> None:
+        self.thresholds = self.thresholds - np.float32(0.001)
+
+
+class AtLeast(Terminations):
+    """No execution reaches its sub-goal in its first two steps."""
+
+    def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
+        return self.positive(log_odds, options) & (age >= 2)
+
 
 class Never(Terminations):
     def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
         return np.zeros(len(options), np.bool_)
-
-
-class Chances(Terminations):
-    def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
-        return 1 / (1 + np.exp(-log_odds))
 
 
 class Counts(Terminations):

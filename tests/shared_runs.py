@@ -1,28 +1,29 @@
 """Runs that many tests read: made by commands, once for all processes of the test run, and left as they are."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
-from command_line import run
+from command_line import run, settings
 from filelock import FileLock
+
+from tests import mixed
 
 FEW = "--set members=2 --set workers=1 --set steps=20"
 GOALS = "--set sub_goals=collect-red-key,open-red-door"
 DOORKEY = "--set max_episode_steps=64 --set layout_seed=100"
 PLAY = f"--set steps=2048 {DOORKEY}"
-SHORT = "--set environments=4 --set warm_up=50 --set steps=400"
+SHORT = "--set environments=4 --set warm_up=50 --set steps=400 --set max_episode_steps=30"
 VISITED = "--set save_visited=5"
 
 # Output -> the command that makes it; what stages need comes before them. The ensemble with which agents are learned
 # is neither the only one nor the first.
 DOORKEY_RUN = {
-    "data.h5": "collect doorkey --set heldout_layouts=2 --set unlabelled_seeds=1",
-    "another": f"train-ensemble {{run}}/data.h5 {FEW} {GOALS} --seed 1",
+    "data.h5": "collect doorkey --set heldout_layouts=1 --set unlabelled_seeds=1",
+    "another": f"train-ensemble {{run}}/data.h5 {FEW} --set sub_goals=open-red-door --seed 1",
     "ensemble": f"train-ensemble {{run}}/data.h5 {FEW} {GOALS}",
     "ensemble-none": f"train-ensemble {{run}}/data.h5 {FEW} --set sub_goals=open-red-door --set diversity=none"
     " --set threshold=unlabelled-split",
@@ -60,6 +61,15 @@ def make(commands: dict[str, str], folder: Path) -> None:
         run(*command(commands, folder, name))
     run("evaluate", folder, "-q")
     run("report", folder)
+
+
+def make_mixed(folder: Path) -> None:
+    """States that somebody recorded, in which a door is open or not, and what is made of them."""
+    np.savez(folder / "states.npz", **mixed.arrays())
+    run("import", folder / "states.npz", "--out", folder / "data.h5", "--sub-goal", mixed.GOAL, "-q")
+    few = settings("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3")
+    run("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "-q", *few)
+    run("audit", folder / "ensemble", "--out", folder / "audit")
 
 
 def built_once(factory: pytest.TempPathFactory, name: str, build: Callable[[Path], None]) -> Iterator[Path]:

@@ -1,7 +1,5 @@
 """Files that are missing, cut off, of another kind, newer or no text: one line, exit code 2, nothing left behind."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

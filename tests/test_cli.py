@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from command_line import refuses, run
-from shared_runs import DOORKEY_RUN, command
+from shared_runs import CORRIDOR_RUN, DOORKEY_RUN, command
 
 
 def test_steps_of_both_stages_count(tiny_run: Path) -> None:
@@ -57,17 +57,17 @@ def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
     refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
 
 
-def test_same_seed_same_bytes(tiny_run: Path, tiny_copy: Path, tmp_path: Path) -> None:
+def test_same_seed_same_bytes(corridor_run: Path, corridor_copy: Path, tmp_path: Path) -> None:
     """Same seed, same machine, same bytes: every stage, in any number of processes, logs in TensorBoard or not."""
     boards = tmp_path / "boards"
     more = {"ensemble": ["--set", "workers=2", "--tensorboard", boards], "meta": ["--tensorboard", boards / "meta"]}
     for name in ("data.h5", "ensemble", "options", "meta", "ppo"):
-        run(*command(DOORKEY_RUN, tiny_copy, name), *more.get(name, []), "--force")
-        made = tiny_run / name
+        run(*command(CORRIDOR_RUN, corridor_copy, name), *more.get(name, []), "--force")
+        made = corridor_run / name
         for path in [made, *made.rglob("*")]:
             if path.is_file() and path.name != "manifest.json":
-                assert path.read_bytes() == (tiny_copy / path.relative_to(tiny_run)).read_bytes(), path
-    for name in ("open-red-door", "meta"):
+                assert path.read_bytes() == (corridor_copy / path.relative_to(corridor_run)).read_bytes(), path
+    for name in ("left-end", "meta"):
         assert any((boards / name).iterdir()), name
 
 

@@ -5,11 +5,11 @@ import resource
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from command_line import refuses
 from corridor import Corridor
+from option_loops import loop_of, played
 from torch import Tensor
 
 from hypogoal.core.errors import NumericalError
@@ -17,27 +17,8 @@ from hypogoal.core.files import replace_text
 from hypogoal.core.tensors import save_tensors
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.config import OptionConfig
-from hypogoal.options.light import LightLearner
-from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
-from hypogoal.options.termination import oracle_terminations
 
-CONFIG = OptionConfig.of(environments=4, warm_up=20, update_interval=4, option_batch=16)
-
-
-def loop_of(engine: Corridor) -> OptionLoop:
-    verdicts = oracle_terminations(engine, (0, 1))
-    learner = LightLearner(engine, verdicts, CONFIG, 0)
-    return OptionLoop(
-        engine, verdicts, learner, RandomChooser(np.random.default_rng(0)), Recorder(2, engine), CONFIG, gamma=0.9
-    )
-
-
-def play(loop: OptionLoop, steps: int) -> None:
-    for _ in range(steps):
-        loop.step()
+QUICK = {"environments": 4, "warm_up": 20, "update_interval": 4, "option_batch": 16}
 
 
 def stops(update: Callable[[], object], weight: Tensor, spoilt: Tensor, of_gradient: str, of_loss: str) -> None:
@@ -55,8 +36,7 @@ def stops(update: Callable[[], object], weight: Tensor, spoilt: Tensor, of_gradi
 
 def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
     """Spec G3: the option, the batch and the step are named; the weights stay as they were."""
-    loop = loop_of(Corridor(4))
-    play(loop, 20)
+    loop = played(loop_of(Corridor(4), **QUICK), 20)
     heads = loop.learner.networks.online.heads
     of_gradient = r"a gradient of options \[0, 1\] is (nan|inf) in the batch of update \d+, step"
     of_loss = r"the loss of options \[1\] is nan in the batch of update \d+"
@@ -65,7 +45,7 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
 
 def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:
     """Spec G3."""
-    loop = loop_of(Corridor(4))
+    loop = loop_of(Corridor(4), **QUICK)
     loop.chooser = MetaPolicy(loop.engine, 2, MetaConfig(decisions=8), seed=0)
     weight = next(loop.chooser.network.parameters())
     before = weight.detach().clone()
@@ -73,7 +53,7 @@ def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:
     with pytest.raises(
         NumericalError, match=r"a gradient of the meta-policy is (nan|inf) in update 0, epoch 0, batch 0"
     ):
-        play(loop, 100)
+        played(loop, 100)
     assert torch.equal(before, weight)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.attacks.fuzz import CHANGES, Sandbox, outcome_of
 
-CASES = range(1, 10)  # case 0 takes seconds
+CASES = range(1, 6)  # case 0 takes seconds
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """``show``, ``verify``, ``status``: what is there, is it whole, is it up to date (Spec A8, G2)."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import fails
+from command_line import fails, settings
+from toy_data import write
 
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import PACE
@@ -35,17 +36,22 @@ def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
+def last_checkpoint(out: Path) -> int:
+    """When an unfinished output's newest checkpoint was written, in ns; 0 before the first."""
+    files = Draft(out).checkpoint.glob("*.safetensors")
+    return max((file.stat().st_mtime_ns for file in files), default=0)
+
+
 def test_ctrl_c_and_sigterm_say_how_to_continue(tmp_path: Path) -> None:
     """One line and 128 + the signal; then neither flag, or another seed, is refused in one line."""
-    out = tmp_path / "ppo"
-    words = ["train-baseline", "doorkey", "--out", str(out), "-q"]
+    data, out = write(tmp_path / "data.h5"), tmp_path / "ensemble"
+    words = ["train-ensemble", str(data), "--out", str(out), "-q", *settings("steps=1000000", "workers=1")]
     for number, resume in ((signal.SIGINT, []), (signal.SIGTERM, ["--resume"])):
-        log = Draft(out).files / "metrics.jsonl"
-        before = log.stat().st_size if log.exists() else 0
+        before = last_checkpoint(out)
         command = [sys.executable, "-m", "hypogoal", *words, *resume]
         paced = {**os.environ, PACE: "0.1"}
         with subprocess.Popen(command, cwd=ROOT, env=paced, stderr=subprocess.PIPE, text=True) as process:
-            wait_for(lambda log=log, before=before: log.exists() and log.stat().st_size > before, process)  # type: ignore[misc]
+            wait_for(lambda before=before: last_checkpoint(out) > before, process)  # type: ignore[misc]
             process.send_signal(number)
             _, told = process.communicate()
         assert process.returncode == 128 + number

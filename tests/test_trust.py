@@ -1,19 +1,15 @@
 """Spec B6, G2, H8: code that a file names is loaded only with ``--trust``, in every process; what one typed is."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import fails, refuses, run
 from toy_data import write
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
-from hypogoal.data import Collected, States, write_dataset
 from hypogoal.domains.base import load_domain
 
 ROOT = Path(__file__).parents[1]
@@ -74,13 +70,11 @@ def test_cells_have_what_one_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """In processes of their own, whose files name it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(ROOT / "tests")]))
-    (tmp_path / "wide_network.py").write_text((ROOT / "examples" / "wide_network.py").read_text())
-    rng, labels = np.random.default_rng(0), np.array([[False], [True]] * 4)
-    states = States(rng.integers(0, 256, (8, 48, 48, 3), dtype=np.uint8), labels, {"layout_seed": np.arange(8)})
-    write_dataset(
-        tmp_path / "data.h5", Collected((48, 48, 3), ("one",), states, states, states), domain="toy", config={}, seed=0
+    (tmp_path / "margin.py").write_text((ROOT / "examples" / "margin.py").read_text())
+    write(tmp_path / "data.h5")
+    command = (
+        "train-ensemble data.h5 --diversity {own} --set steps=2 --set members=2 --set workers=1 --set sub_goals=one"
     )
-    command = "train-ensemble data.h5 --set network={own} --set steps=2 --set members=2 --set workers=1"
-    (tmp_path / "own.toml").write_text(EXPERIMENT.format(own="doorkey", command=command))
-    run("run", "own.toml", "--out", "out", "-q", "--set", "own=wide_network:wide")
+    (tmp_path / "own.toml").write_text(EXPERIMENT.format(own="dbat", command=command))
+    run("run", "own.toml", "--out", "out", "-q", "--set", "own=margin:pair_loss")
     assert len([*tmp_path.glob("out/c/*/manifest.json")]) == 1

@@ -8,20 +8,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from hypogoal.core.artefacts import LOG, MANIFEST
+from hypogoal.core.artefacts import LOG, MANIFEST, create
 from hypogoal.core.tensors import save_tensors
 from hypogoal.data import Collected, States, create_hdf5, write_dataset
+from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 SHAPE = (4, 5, 3)
 
 
 def write(path: Path, states: int = 7, domain: str = "toy", goals: tuple[str, ...] = ("one", "two")) -> Path:
-    """Two sub-goals, three sets of random states; ``path``."""
+    """Three sets of random states; ``path``."""
     rng = np.random.default_rng(0)
 
     def some(count: int) -> States:
         images = rng.integers(0, 256, size=(count, *SHAPE), dtype=np.uint8)
-        return States(images, rng.random((count, 2)) < 0.5, {"layout_seed": np.arange(count)})
+        return States(images, rng.random((count, len(goals))) < 0.5, {"layout_seed": np.arange(count)})
 
     collected = Collected(SHAPE, goals, some(states), some(states), some(states))
     write_dataset(path, collected, domain=domain, config={"a": 1}, seed=3)
@@ -46,6 +47,21 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
         "report": {"index.html"},
         "comparison": {"index.html", "pairs.csv"},
     }[kind]
+
+
+def untrained(folder: Path, domain: Any, members: int = 2, network: str = "montezuma", seed: int = 0) -> Path:
+    """An ensemble artefact of random weights for a domain's usual sub-goals."""
+    shape = domain.observation_shape
+    config = {
+        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
+        "network": network, "observation_shape": list(shape), "observation_dtype": "uint8", "view": "full",
+    }  # fmt: skip
+    with create(folder, kind="ensemble", config=config, seed=seed, inputs=[]) as draft:
+        for number, sub_goal in enumerate(domain.usual_sub_goals):
+            ensemble = Ensemble(network, shape, members, torch.Generator().manual_seed(number))
+            write_ensemble(draft.files, sub_goal, ensemble)
+        fill(draft.files, "ensemble", config)
+    return folder
 
 
 def fill(artefact: Path, kind: str, config: Mapping[str, Any]) -> None:

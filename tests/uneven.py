@@ -5,8 +5,6 @@ Here products and convolutions always do: what is computed again in the same way
 ``pytest -p tests.uneven`` runs every test on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from typing import Any

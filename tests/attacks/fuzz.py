@@ -4,8 +4,6 @@
 fails when something else than success or a ``UserError`` of one line comes of it, or another file changes.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import faulthandler

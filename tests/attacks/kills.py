@@ -8,8 +8,6 @@ A command runs in a process group of its own, forked from this process so that i
 a folder that has what it reads; the whole group gets SIGKILL.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """``hypogoal check``: what keeps its contract passes, and each broken law is named (Spec B6, C1, C2, C5)."""
 
-from __future__ import annotations
-
 import itertools
 import sys
 from dataclasses import replace

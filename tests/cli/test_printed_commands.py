@@ -1,7 +1,5 @@
 """What is printed as a command works as printed: after a stage, and as what an error says to do (Spec A8, G2)."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import subprocess
@@ -88,7 +86,6 @@ def test_what_an_error_says_to_do(shell: Shell) -> None:
     assert "Do you trust it? Give --trust" in refusal
     shell("hypogoal train-ensemble 'a run/data.h5' --out 'a run/ensemble' -q --trust")
     shell(printed(shell("hypogoal report 'a run'", 2), "First run: ") + " --trust")
-    shell("hypogoal report 'a run'")
     shell("hypogoal train-options 'a run/ensemble' --out 'a run/options' -q --trust")
     since = read_evaluation(Path("a run")).facts["missing"]
     shell(printed(since[-1], "options: made since this evaluation (evaluate it again: ") + " --trust")

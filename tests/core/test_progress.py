@@ -1,7 +1,5 @@
 """What a stage says while it works and at its end."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """Diversity objectives against values worked by hand, and the laws each of them must keep (Spec C1, C2)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Three-key DoorKey: the Gymnasium environment, its sub-goals, and the collected states (Spec B1-B3)."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

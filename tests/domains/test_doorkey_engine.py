@@ -1,7 +1,5 @@
 """The fast DoorKey engines are pixel- and step-exact with the MiniGrid environment (Spec B1, B2)."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from typing import Any

@@ -1,14 +1,12 @@
 """Domains made from Gymnasium environments: collection, the engine, and what users get wrong (Spec B6, B7)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import corridor_env
 import gymnasium
 import numpy as np
 import pytest
-from corridor_env import DOMAIN, LENGTH, CorridorEnv
+from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
@@ -39,57 +37,24 @@ def test_collection_has_each_picture_once_with_its_labels() -> None:
     assert not known & {image.tobytes() for image in found.heldout.observations}
 
 
-class Stairs(gymnasium.Env[np.ndarray, int]):
-    """Action 0 climbs, 1 falls to the ground, 2 stays; the task is to be on step 12, which ends the episode.
-
-    The seed is the colour of the ground: what is seen says both.
-    """
-
-    observation_space = gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8)
-    action_space = gymnasium.spaces.Discrete(3)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.height, self.colour = 0, seed or 0
-        return self._picture(), {}
-
-    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.height = (self.height + 1, 0, self.height)[action]
-        return self._picture(), float(self.height == 12), self.height == 12, False, {}
-
-    def _picture(self) -> np.ndarray:
-        picture = np.zeros((32, 32, 3), np.uint8)
-        picture[2 * self.height, :, 0] = 255
-        picture[..., 1] = self.colour % 256
-        return picture
-
-
-STEPS_UP = {"half-way": lambda env: env.unwrapped.height >= 6, "top": lambda env: env.unwrapped.height == 12}
-FEW = GymnasiumConfig(unlabelled_seeds=(1,), heldout_seeds=(2,), steps=60, explore=0.0)
-
-
-def climb(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
-    return 0
-
-
 def test_policies_share_the_steps() -> None:
     """Spec B7: one policy a sub-goal, as many steps each; None is random play."""
-    counts = {"climb": 0, "stay": 0}
+    few = GymnasiumConfig(unlabelled_seeds=(1,), heldout_seeds=(4,), steps=60, explore=0.0)
+    counts = [0, 0]
 
-    def counted(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
-        counts["climb"] += 1
-        return 0
+    def going(action: int) -> Any:
+        def act(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
+            counts[action] += 1
+            return action
 
-    def stay(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
-        counts["stay"] += 1
-        return 2
+        return act
 
-    both = GymnasiumDomain(Stairs, STEPS_UP, policy={"top": counted, "half-way": stay})
-    assert collected(both, FEW).labelled.labels.sum(0).tolist() == [7, 1]
-    assert counts == {"climb": 3 * 30, "stay": 3 * 30}
-    counts["climb"] = 0
-    collected(GymnasiumDomain(Stairs, STEPS_UP, policy={"top": counted, "half-way": None}), FEW)
-    assert counts["climb"] == 3 * 30
+    both = GymnasiumDomain(CorridorEnv, SUB_GOALS, policy={"left-end": going(0), "right-end": going(1)})
+    assert collected(both, few).labelled.labels.sum(0).tolist() == [1, 1]
+    assert counts == [3 * 30, 3 * 30]
+    counts[0] = 0
+    collected(GymnasiumDomain(CorridorEnv, SUB_GOALS, policy={"left-end": going(0), "right-end": None}), few)
+    assert counts == [3 * 30, 3 * 30]
 
 
 @pytest.mark.parametrize(

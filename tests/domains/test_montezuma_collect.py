@@ -1,7 +1,5 @@
 """Montezuma's Revenge: collected states, their labels and origins, and the domain (Spec B4-B7)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """Observations that are no pictures, in domains made from Gymnasium environments (Spec B6)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import corridor_env

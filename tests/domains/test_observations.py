@@ -1,7 +1,5 @@
 """What is taken for what: the table of docs/own-domain.md, for environments and imported arrays alike (Spec B6)."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections import Counter
@@ -9,7 +7,6 @@ from collections.abc import Callable
 from itertools import pairwise
 from math import prod
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -38,19 +35,6 @@ LENGTHS = (1, 3, 4, 7, 16, 17, 24, 64)  # of axes: of colours, frames and pictur
 MOST = 200_000  # numbers in an observation
 
 
-class Constant(gymnasium.Env[Any, Any]):
-    """Shows the same observation, of ones, all the time."""
-
-    action_space = spaces.Discrete(2)
-
-    def __init__(self, shape: tuple[int, ...], dtype: str):
-        self.observation_space = spaces.Box(0, 1, shape, np.dtype(dtype).type)
-        self.observation = np.ones(shape, dtype)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return self.observation, {}
-
-
 def drawn_observation(rng: random.Random) -> tuple[tuple[int, ...], str]:
     """A shape and a type; bytes are drawn more often."""
     shape = tuple(rng.choice(LENGTHS) for _ in range(rng.choice((1, 2, 2, 3, 3, 3, 4, 4))))
@@ -62,7 +46,8 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
 
     An ``AssertionError`` where environment and array differ, or it was guessed.
     """
-    env, state = Constant(shape, dtype), np.ones(shape, dtype)
+    state = np.ones(shape, dtype)
+    env = Says(spaces.Box(0, 1, shape, state.dtype.type), state)
     wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
     of_env, of_array = _refusal(lambda: reader_of(env.observation_space)), _refusal(lambda: take(state, "the state"))
     assert bool(of_env) == bool(of_array), (of_env, of_array)

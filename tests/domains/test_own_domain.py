@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import corridor_env
 import pytest
 from command_line import refuses, run, settings
 
@@ -11,13 +12,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain
 
-TESTS = Path(__file__).parents[1]
-
-
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TESTS))
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+pytestmark = pytest.mark.usefixtures("trusted")
 
 
 def test_an_own_domain_goes_through_the_stages(corridor_run: Path) -> None:
@@ -55,14 +50,11 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str,
     assert not list(tmp_path.glob("data.h5"))
 
 
-def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path) -> None:
     """Spec B6: states are collected, options and agents trained, baselines, films and judgements made in one world."""
-    import corridor_env
-
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
     data, folder = tmp_path / "run" / "data.h5", tmp_path / "run"
     small = settings("steps=60", "states=30", "mirrored=true")
-    play = settings("steps=200", "environments=2", "warm_up=50")
+    play = settings("steps=80", "environments=2", "warm_up=50")
     few = settings("steps=64", "environments=2", "max_episode_steps=20")
     network = settings("steps=5", "workers=1")
     commands = (

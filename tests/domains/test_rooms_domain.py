@@ -1,7 +1,5 @@
 """Rooms: one is right, and only the world's setting says by which feature."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

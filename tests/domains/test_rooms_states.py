@@ -1,7 +1,5 @@
 """Scenes with planted factors: drawn as MiniGrid draws them, aligned, mixed and crossed as they say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from minigrid.core.grid import Grid

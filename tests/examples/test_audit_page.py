@@ -1,7 +1,5 @@
 """docs/audit.md begins with the reader's classifier: its blocks and commands run as they are written (Spec H5)."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys

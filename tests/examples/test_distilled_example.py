@@ -1,7 +1,5 @@
 """The example of distilled options: what it learns, that it carries over, and its own commands (Spec H6)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import pytest
 import torch
 from command_line import settings
 from corridor import Corridor
+from option_loops import loop_of, played
 from torch import Tensor
 
 import hypogoal
@@ -28,9 +27,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import qualities
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.episodes import agent_of
-from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
 
 GOALS = 5
@@ -48,10 +45,8 @@ SHORT = {  # appended to the page's commands, so that they end in seconds
 }
 
 
-def loop_of(engine: Any, kind: type[Learner] = Learner) -> OptionLoop:
-    ends, config = oracle_terminations(engine, range(GOALS)), TrainOptionsConfig.of(**QUICK)
-    learner, recorder = kind(engine, ends, config, seed=0), Recorder(GOALS, engine)
-    return OptionLoop(engine, ends, learner, RandomChooser(rng_for(0, "c")), recorder, config, gamma=1.0)
+def distilling(engine: Any, kind: type[Learner] = Learner) -> OptionLoop:
+    return loop_of(engine, kind, options=GOALS, config=TrainOptionsConfig.of(**QUICK))
 
 
 def layouts(*seeds: int) -> Layouts:
@@ -67,7 +62,7 @@ class Aimless(Learner):
 
 def arrival(kind: type[Learner], state: Mapping[str, Tensor], seed: int) -> float:
     """How often greedy executions in a layout reach a sub-goal that can be had in time: the mean over sub-goals."""
-    loop = loop_of(DoorKeyEngine(seed, 1), kind)
+    loop = distilling(DoorKeyEngine(seed, 1), kind)
     loop.learner.load(state)
     states = loop.engine.plan().ids[::20]
     return float(np.nanmean(qualities(loop, np.arange(GOALS), states)))
@@ -75,9 +70,7 @@ def arrival(kind: type[Learner], state: Mapping[str, Tensor], seed: int) -> floa
 
 def test_options_carry_over_to_layouts_that_nobody_played() -> None:
     """Distilled from twelve layouts, they reach their sub-goals in others twice as often as random actions do."""
-    loop = loop_of(DoorKeyEngine(layouts(*range(1000, 1012)), 8))
-    for _ in range(400):
-        loop.step()
+    loop = played(distilling(DoorKeyEngine(layouts(*range(1000, 1012)), 8)), 400)
     state = loop.learner.state()
     distilled_options, random_actions = (
         np.array([arrival(kind, state, seed) for seed in range(6000, 6004)]) for kind in (Learner, Aimless)
@@ -88,14 +81,10 @@ def test_options_carry_over_to_layouts_that_nobody_played() -> None:
 
 def test_it_goes_on_where_it_was() -> None:
     """Spec G1: the same weights as without a break."""
-    whole, begun, resumed = (loop_of(DoorKeyEngine(layouts(3, 5), 8)) for _ in range(3))
-    for _ in range(20):
-        whole.step()
-    for _ in range(8):
-        begun.step()
-    resumed.restore(begun.snapshot())
-    for _ in range(12):
-        resumed.step()
+    whole, begun, resumed = (distilling(DoorKeyEngine(layouts(3, 5), 8)) for _ in range(3))
+    played(whole, 20)
+    resumed.restore(played(begun, 8).snapshot())
+    played(resumed, 12)
     for name, value in whole.learner.state().items():
         assert torch.equal(value, resumed.learner.state()[name]), name
 

@@ -1,7 +1,5 @@
 """Proposals that are jointly independent, and the members that they teach (examples/joint.py)."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import ModuleType

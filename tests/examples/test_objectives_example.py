@@ -1,7 +1,5 @@
 """Repulsive and ACE as objectives of one's own: the laws, and what they make of members."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Sub-goals of Montezuma's Revenge from labels of one room: examples/one_room.py (Spec B4, C5, G1, H4)."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 from command_line import run, settings
 from corridor import Corridor
+from option_loops import QUICK, loop_of, played
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
@@ -16,11 +15,6 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import train
 from hypogoal.hypotheses.views import StateOrigins
-from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.config import OptionConfig
-from hypogoal.options.light import LightLearner
-from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import one_room
@@ -87,13 +81,7 @@ def test_options_are_learned_that_were_out_of_reach() -> None:
     log_odds = np.array([[3, -1], [2, 0], [1, 1], [0, 2], [-1, 3], [-2, 4]], dtype=np.float32)
     rule = one_room.Patience(lambda ids: log_odds[ids], 2, None, np.array([3.5, 5.0], dtype=np.float32), 4)
     rule.steps = 150
-    engine = Corridor(4)
-    learning = {"warm_up": 50, "update_interval": 4, "option_batch": 32, "epsilon_steps": 300}
-    config = OptionConfig.of(experience="own", mask_reached=False, environments=4, **learning)
-    learner, chooser = LightLearner(engine, rule, config, seed=0), RandomChooser(np.random.default_rng(0))
-    loop = OptionLoop(engine, rule, learner, chooser, Recorder(2, engine), config, 1.0)
-    for _ in range(400):
-        loop.step()
+    loop = played(loop_of(Corridor(4), ends=rule, **QUICK, experience="own", mask_reached=False), 400)
     assert rule.thresholds.tolist() == [2.25, 3.0]  # three quarters of the surest state
     for rows, end in zip(loop.recorder.executions, (0, 5), strict=True):
         last = list(rows)[-20:]

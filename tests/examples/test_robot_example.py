@@ -1,7 +1,5 @@
 """The story of a simulated arm, by its own commands, at toy size (Spec I6)."""
 
-from __future__ import annotations
-
 import csv
 import ctypes.util
 import os

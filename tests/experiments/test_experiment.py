@@ -1,7 +1,5 @@
 """Experiments (Spec A6, G4): their cells, as Python functions, TOML files, and those that come with hypogoal."""
 
-from __future__ import annotations
-
 import re
 from itertools import pairwise
 from pathlib import Path

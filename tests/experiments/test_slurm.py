@@ -1,7 +1,5 @@
 """Spec G4: cells as Slurm job arrays; the scripts everywhere, the rest on a real Slurm where there is one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Spec G1, G4: the cells of an experiment on this machine: killed, resumed, failed, made in part, looked at."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import re

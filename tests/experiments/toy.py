@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-DATA = "collect rooms"
+DATA = "collect rooms --set labelled=64 --set unlabelled=128"
 SMALL = "--set steps=20 --set members=2"
 PLAY = "--layout-seed 990 --set steps=200"
 

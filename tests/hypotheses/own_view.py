@@ -1,7 +1,5 @@
 """A view and a rule for thresholds of one's own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Encoders of any modules as members: trained, stored, asked and explained (Spec C5, D1, F2, G2)."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An ensemble predicts what its members say, and comes back from its state (Spec C5, A8, G2)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Member networks: shapes, sizes, sharing of weights, DeepLift (Spec C5)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A view of one's own: what members see, how training states are changed and drawn (beyond the paper; Spec G1, G2)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +19,7 @@ from hypogoal.hypotheses.views import View
 OWN = TOY.model_copy(update={"steps": 3, "view": "own_view:Moved", "view_settings": ("jitter=3",)})
 
 
-@pytest.fixture(autouse=True)
-def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+pytestmark = pytest.mark.usefixtures("trusted")
 
 
 def members_of(view: View) -> Ensemble:

@@ -1,7 +1,5 @@
 """Working on distinct patches is the plain network: values, gradients and running statistics (Spec C5)."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 

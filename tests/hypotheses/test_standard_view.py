@@ -1,7 +1,5 @@
 """Members on observations that are no pictures (Spec C2, C5, F2)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

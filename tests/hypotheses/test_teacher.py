@@ -1,7 +1,5 @@
 """Members that a teacher, own code, tells what to predict in unlabelled states (teacher=module:function)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -4,8 +4,6 @@ Each episode is a light that wanders from left to right in what two cameras see;
 goal where the light is right of the middle of the picture.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """States that users bring: a white square at the left or at the right of grey noise."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Tables of labels of a data file (Spec B6)."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -11,16 +9,12 @@ from command_line import refuses, run
 
 from hypogoal.data import open_dataset
 from hypogoal.observations import digest
-from tests import mixed
+from tests.mixed import GOAL
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("tables")
-    np.savez(folder / "states.npz", **mixed.arrays())
-    out = folder / "data.h5"
-    run("import", folder / "states.npz", "--out", out, "--sub-goal", "open", "-q")
-    return out
+@pytest.fixture
+def data(mixed_run: Path) -> Path:
+    return mixed_run / "data.h5"
 
 
 def table(data: Path, count: int) -> str:
@@ -43,16 +37,16 @@ def table(data: Path, count: int) -> str:
 )
 def test_a_table_of_other_states_is_one_line(data: Path, tmp_path: Path, change, said: str) -> None:
     (tmp_path / "table.csv").write_text(change(table(data, 8)))
-    refuses(said, "import", data, "--label", f"open={tmp_path / 'table.csv'}", "--out", tmp_path / "more.h5", "-q")
+    refuses(said, "import", data, "--label", f"{GOAL}={tmp_path / 'table.csv'}", "--out", tmp_path / "more.h5", "-q")
 
 
 def test_a_table_saved_by_a_spreadsheet_is_read(data: Path, tmp_path: Path) -> None:
     marks = tmp_path / "table.csv"
     marks.write_bytes(table(data, 4).replace("\n", "\r\n").encode("utf-8-sig"))
-    run("import", data, "--label", f"open={marks}", "--out", tmp_path / "more.h5", "-q")
+    run("import", data, "--label", f"{GOAL}={marks}", "--out", tmp_path / "more.h5", "-q")
     before, after = open_dataset(data), open_dataset(tmp_path / "more.h5")
     np.testing.assert_array_equal(after.unlabelled(), before.unlabelled()[4:])
-    states = after.labelled("open")
+    states = after.labelled(GOAL)
     np.testing.assert_array_equal(states.observations[-4:], before.unlabelled()[:4])
     assert states.labels[-4:].tolist() == [False, True, False, True]
     refuses("labels data of one sub-goal", "import", data, "--label", f"shut={marks}", "--out", tmp_path / "x.h5")

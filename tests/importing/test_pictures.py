@@ -1,11 +1,8 @@
 """Pictures as viewers show them, folders of them, and films turned as players turn them (Spec B6)."""
 
-from __future__ import annotations
-
 import io
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from command_line import refuses, run
@@ -14,12 +11,7 @@ from PIL import Image
 from hypogoal.data import open_dataset
 from hypogoal.importing.pictures import picture_of, read_pictures
 from tests.importing.states import SIDE, pictures, save_pictures
-
-
-def saved(values: np.ndarray, kind: str = "PNG", **more: Any) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(values)).save(file, kind, **more)
-    return file.getvalue()
+from tests.importing.test_odd import stored
 
 
 def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
@@ -29,9 +21,9 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     palette = io.BytesIO()
     Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
     for data, said in (
-        (saved(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size or type: positive/zz.png[0] is (48, 20, 3)"),
+        (stored(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size or type: positive/zz.png[0] is (48, 20, 3)"),
         (b"no image", "this cannot be read"),
-        (saved(pictures(1)[0][0])[:200], "this cannot be read"),
+        (stored(pictures(1)[0][0])[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
         (palette.getvalue(), "it is transparent in places"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n", "git lfs pull"),
@@ -57,7 +49,7 @@ def test_folders_of_pictures_become_states(tmp_path: Path) -> None:
     grey = save_pictures(tmp_path / "grey", change=lambda image: image[..., 0])
     run("import", grey, "--out", data, "-q", "--force")
     assert open_dataset(data).observation_shape == (SIDE, SIDE, 1)
-    (grey / "positive" / "01.png").write_bytes(saved(images[1]))
+    (grey / "positive" / "01.png").write_bytes(stored(images[1]))
     run("import", grey, "--out", data, "-q", "--force")
     mixed = open_dataset(data).labelled("grey").observations
     np.testing.assert_array_equal(mixed[0], images[1])

@@ -1,7 +1,5 @@
 """docs/notebook.ipynb runs as it stands, in plain Python: every cell, and what the last line of each shows."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stages inside other people's programs: whatever torch, NumPy and threads were set to, the bytes are the same."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import warnings
@@ -97,11 +95,8 @@ SETTINGS: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "another device": lambda: setting(torch.set_default_device, "meta", None),
     "more threads": lambda: setting(torch.set_num_threads, 2, 1),
     "no gradients": torch.no_grad,
-    "gradients off": lambda: setting(torch.set_grad_enabled, False, True),
     "inference": torch.inference_mode,
     "half precision": lambda: torch.autocast("cpu", torch.bfloat16),
-    "deterministic": lambda: setting(torch.use_deterministic_algorithms, True, False),
-    "anomalies": lambda: setting(torch.autograd.set_detect_anomaly, True, False),
     "NumPy's errors": lambda: np.errstate(all="raise"),
     "warnings are errors": strict_warnings,
     "a thread that draws": drawing_beside,

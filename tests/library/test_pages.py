@@ -1,7 +1,5 @@
 """What the pages for users of the library show runs as it stands, on tiny artefacts; so do the doctests."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import sys

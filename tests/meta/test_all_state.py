@@ -1,7 +1,5 @@
 """What is restored is all there was: every attribute of every part, without a list of names (Spec G1)."""
 
-from __future__ import annotations
-
 import copy
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -12,31 +10,14 @@ import pytest
 import torch
 from corridor import Corridor
 from loops import CASES, loop_of
+from odd_parts import Twice
 
-from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.options.choosers import CHOOSERS
 from hypogoal.options.learner import LEARNERS
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.termination import Terminations
 
-STEPS = 60
-
-
-class Twice(Terminations):
-    """A rule with state: two positive predictions in a row; a threshold falls with every execution."""
-
-    CHANGING = (*Terminations.CHANGING, "row")
-
-    def __init__(self, *arguments: Any, **more: Any):
-        super().__init__(*arguments, **more)
-        self.row = np.zeros(self.environments, dtype=np.int64)
-
-    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
-        self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
-        return self.row >= 2
-
-    def finished(self, environments: Ints, options: Ints, reached: Bools) -> None:
-        self.thresholds = self.thresholds - np.float32(0.001)
+STEPS = 45
 
 
 def differences(one: Any, other: Any, place: str, known: set[int]) -> Iterator[str]:

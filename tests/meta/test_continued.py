@@ -1,15 +1,12 @@
 """Spec D2, D8, E1, E2: settings on the real DoorKey engine, and what training from an options artefact begins with."""
 
-from __future__ import annotations
-
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command_line import refuses, run, settings
+from command_line import run, settings
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
@@ -53,45 +50,13 @@ def walk(learner: Any, steps: int) -> None:
         learner.learn()
 
 
-@pytest.fixture
-def ensemble(tiny_run: Path) -> Path:
-    """A small real one."""
-    return tiny_run / "ensemble"
-
-
 @pytest.mark.usefixtures("small_gru")
-def test_the_papers_preset_plays_and_learns(ensemble: Path, tmp_path: Path) -> None:
+def test_the_papers_preset_plays_and_learns(tiny_run: Path, tmp_path: Path) -> None:
     """Spec E1, E2, Tables 3 to 5: its networks on the real engine, options and meta-policy updated."""
-    few = ["steps=120", "decisions=8", "warm_up=8", "option_batch=4"]
-    out = tmp_path / "meta"
-    changes = settings(*few)
-    run("train-meta", ensemble, "--out", out, "--preset", "paper", *changes, "-q")
+    out, few = tmp_path / "meta", settings("steps=120", "decisions=8", "warm_up=8", "option_batch=4")
+    run("train-meta", tiny_run / "ensemble", "--out", out, "--preset", "paper", *few, "-q")
     assert (out / "meta.safetensors").is_file()
     assert (out / "choices.csv").read_text().count("\n") > 1
-
-
-def test_options_go_on_with_the_time_they_learned_for(ensemble: Path, tmp_path: Path) -> None:
-    """Spec D1: the timeout is part of an option: it is taken over, and another one is refused."""
-    few = ["--set", "steps=64", "-q"]
-    options, out = str(tmp_path / "options"), str(tmp_path / "meta")
-    run("train-options", ensemble, "--out", options, "--set", "option_timeout=40", *few)
-    meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
-    refuses("trained with option_timeout=40, not 10", *meta, "--set", "option_timeout=10")
-    run(*meta)
-    assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["option_timeout"] == 40
-
-
-def test_an_embedding_by_name_goes_through_both_stages(ensemble: Path, tmp_path: Path) -> None:
-    """Spec D2, D8, H6: where an engine has tiles, too; it is part of the options, and of the light network alone."""
-    few = ["--set", "steps=64", "--set", "warm_up=20", "-q"]
-    options, out, named = str(tmp_path / "options"), str(tmp_path / "meta"), ["--set", "embedding=tiles"]
-    run("train-options", ensemble, "--out", options, *named, *few)
-    meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
-    refuses("trained with embedding=tiles, not auto", *meta, "--set", "embedding=auto")
-    run(*meta)
-    assert json.loads((tmp_path / "meta" / "manifest.json").read_text())["config"]["embedding"] == "tiles"
-    planned = ["--out", tmp_path / "other", *named, "--set", "network=planned", "-q"]
-    refuses("only beside another choice: embedding", *meta[:2], *planned)
 
 
 @pytest.mark.usefixtures("small_gru")

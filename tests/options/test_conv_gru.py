@@ -1,34 +1,29 @@
 """The paper's network and its learner: windows of an execution, in learning, acting, out of files (Spec D2, D3)."""
 
-from __future__ import annotations
-
+import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from corridor import Corridor, LongCorridor
+from option_loops import loop_of
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners import double_dqn
-from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.config import OptionConfig
-from hypogoal.options.conv_gru import Lived, PaperLearner, PaperPolicies, PaperQNetwork
+from hypogoal.options.conv_gru import Lived, PaperPolicies, PaperQNetwork
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
 from hypogoal.options.saved import SavedOptions
-from hypogoal.options.termination import oracle_terminations
 
 STAY = 0
-OWN = {"network": "paper", "experience": "own", "mask_reached": False, "option_batch": 4, "update_interval": 4}
+OWN = {"network": "paper", "experience": "own", "mask_reached": False, "replay": 100}
 
 
-def loop_of(engine: Any, **changes: Any) -> OptionLoop:
-    config = OptionConfig.of(**{**OWN, "environments": engine.count, "replay": 100, **changes})
-    ends = oracle_terminations(engine, (0, 1))
-    learner, chooser = PaperLearner(engine, ends, config, 0), RandomChooser(np.random.default_rng(0))
-    return OptionLoop(engine, ends, learner, chooser, Recorder(2, engine), config, gamma=1.0)
+def paper(engine: Any, **settings: Any) -> OptionLoop:
+    """Options of the paper's network on the engine."""
+    few = {"environments": engine.count, "option_batch": 4, "update_interval": 4}
+    return loop_of(engine, **OWN | few | settings)
 
 
 def lived(paths: list[list[int]], recurrence: int) -> Lived:
@@ -75,7 +70,7 @@ def test_the_papers_sizes() -> None:
 def test_only_states_of_the_window_are_seen(recurrence: int, states: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
     """The last N of the execution and the one that came next; never what stands in the padding."""
     engine = Corridor(1)
-    learner = loop_of(engine, recurrence=recurrence, option_batch=1).learner
+    learner = paper(engine, recurrence=recurrence, option_batch=1).learner
     learner.members[0].replay.add(lived([[1, 2, 3, 4, 5]], recurrence))
     seen: set[int] = set()
     images = engine.images
@@ -87,7 +82,7 @@ def test_only_states_of_the_window_are_seen(recurrence: int, states: set[int], m
 @pytest.mark.usefixtures("small_gru")
 def test_what_is_stored_are_the_steps_of_the_execution() -> None:
     """Each with its window, also where executions end in between."""
-    loop = loop_of(LongCorridor(2), recurrence=3, option_timeout=5, restart_options=True)
+    loop = paper(LongCorridor(2), recurrence=3, option_timeout=5, restart_options=True)
     steps: list[list[int]] = [[], []]
     wanted = []
     for _ in range(40):
@@ -107,8 +102,11 @@ def test_what_is_stored_are_the_steps_of_the_execution() -> None:
 @pytest.mark.usefixtures("small_gru")
 @pytest.mark.parametrize("recurrence", [1, 3])
 def test_what_is_loaded_plays_the_same(recurrence: int) -> None:
-    """Spec D2: outside an engine an execution sees what it saw in training, from its own first step on."""
-    loop = loop_of(LongCorridor(1), recurrence=recurrence, option_timeout=6, restart_options=True)
+    """Spec D2: outside an engine an execution sees what it saw in training, from its own first step on.
+
+    So it does in another process, with all that it remembers.
+    """
+    loop = paper(LongCorridor(1), recurrence=recurrence, option_timeout=6, restart_options=True)
     learner, engine = loop.learner, loop.engine
     with torch.no_grad():  # larger weights, so that the action depends on the pictures
         for member in learner.members:
@@ -116,7 +114,7 @@ def test_what_is_loaded_plays_the_same(recurrence: int) -> None:
                 weight.mul_(3.0)
     config = {"recurrence": recurrence, "sub_goals": ["end"], "members": 2}
     saved = SavedOptions(config, learner.weights(), engine.observation_shape)
-    policies, played = PaperPolicies(saved), set()
+    policies, played = pickle.loads(pickle.dumps(PaperPolicies(saved))), set()  # noqa: S301 - our own
     act = None
     for _ in range(40):
         if act is None:
@@ -126,7 +124,7 @@ def test_what_is_loaded_plays_the_same(recurrence: int) -> None:
         moved = loop.advance(learning=False)
         assert moved.actions[0] == wanted
         played.add(wanted)
-        act = None if moved.ended[0] else act
+        act = None if moved.ended[0] else pickle.loads(pickle.dumps(act))  # noqa: S301
     assert len(played) > 1
     with pytest.raises(UserError, match=r"recurrence=execution\. Train them again"):
         PaperPolicies(SavedOptions({"recurrence": "execution"}, {}, engine.observation_shape))
@@ -135,7 +133,7 @@ def test_what_is_loaded_plays_the_same(recurrence: int) -> None:
 @pytest.mark.usefixtures("small_gru")
 def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D1, D2: reward 1 there, and no value of what lies behind, though the episode goes on."""
-    learner = loop_of(Corridor(1), recurrence=2).learner
+    learner = paper(Corridor(1), recurrence=2).learner
     learner.members[0].replay.add(lived([[2, 1], [2, 1, 0]], 2))
     seen, targets = [], double_dqn.double_q_targets
     monkeypatch.setattr(double_dqn, "double_q_targets", lambda *of, **more: (seen.append(of), targets(*of, **more))[1])
@@ -148,7 +146,7 @@ def test_nothing_follows_on_a_positive_prediction(monkeypatch: pytest.MonkeyPatc
 def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
     """Spec D3: members share the engine's memory; windows that are gone are not learned from."""
     engine = LongCorridor(4, memory=300)
-    learner = loop_of(engine, recurrence=4).learner
+    learner = paper(engine, recurrence=4).learner
     for _ in range(20):
         states = engine.step(np.full(4, STAY)).next_ids
     for member in learner.members:
@@ -165,6 +163,6 @@ def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
 def test_what_it_cannot_learn_is_refused() -> None:
     """Spec D2, D3: others' experience, numbers, and a replay longer than the engine's memory."""
     with pytest.raises(UserError, match="experience=shared"):
-        loop_of(Corridor(1), experience="shared")
+        paper(Corridor(1), experience="shared")
     with pytest.raises(UserError, match=r"replay=1000\. Give --set replay="):
-        loop_of(LongCorridor(4, memory=900), replay=1000)
+        paper(LongCorridor(4, memory=900), replay=1000)

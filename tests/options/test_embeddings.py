@@ -6,22 +6,15 @@ import numpy as np
 import pytest
 import torch
 from corridor import LongCorridor
+from option_loops import BEGIN, QUICK, loop_of, played
 from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below
-from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import make_policies
-from hypogoal.options.light import LightLearner
-from hypogoal.options.loop import OptionLoop
 from hypogoal.options.networks import LightQNetwork, OwnEmbedding, PictureEmbedding, embedding_for
-from hypogoal.options.recording import Recorder
-from hypogoal.options.termination import oracle_terminations
 
 NAME = f"{__name__}:Small"
-QUICK = {"environments": 4, "warm_up": 50, "update_interval": 4, "option_batch": 32, "epsilon_steps": 300}
-BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "epsilon_final": 0.02}
 LIGHT = {"termination": "learned", "network": "light", "sub_goals": ["a", "b"], "members": 1, "embedding": NAME}
 
 
@@ -59,15 +52,13 @@ def test_every_pixel_is_seen(shape: tuple[int, ...]) -> None:
 def test_an_own_embedding_learns_and_plays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2, H6: an encoder as members have it: both options go straight to their ends, also out of their weights."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    engine, config = LongCorridor(4), OptionConfig.of(**QUICK, **BEGIN, embedding=NAME)
-    verdicts = oracle_terminations(engine, (0, 1))
-    learner, recorder = LightLearner(engine, verdicts, config, 0), Recorder(2, engine)
+    engine = LongCorridor(4)
+    loop = loop_of(engine, **QUICK, **BEGIN, epsilon_final=0.02, embedding=NAME)
+    learner = loop.learner
     fresh = {name: value.clone() for name, value in learner.state().items()}
-    loop = OptionLoop(engine, verdicts, learner, RandomChooser(np.random.default_rng(0)), recorder, config, 1.0)
-    for _ in range(400):
-        loop.step()
+    played(loop, 400)
     for option, shortest in ((0, 2), (1, 3)):
-        last = list(recorder.executions[option])[-20:]
+        last = list(loop.recorder.executions[option])[-20:]
         assert np.mean([row.reached for row in last]) >= 0.9
         assert np.median([row.duration for row in last]) == shortest
     state = learner.state()
@@ -84,6 +75,8 @@ def test_an_own_embedding_learns_and_plays(monkeypatch: pytest.MonkeyPatch) -> N
         greedy = learner.act(ids, np.full(40, option), np.ones(40), explore=False)
         assert greedy.tolist() == [policies(option)(image) for image in engine.images(ids)]
 
+    with pytest.raises(UserError, match="these options end at the true sub-goals"):
+        make_policies(LIGHT | {"termination": "oracle"}, {}, {})
     monkeypatch.delenv("HYPOGOAL_TRUST")
     monkeypatch.delitem(sys.modules, __name__)
     with pytest.raises(UserError, match=f"a file names code of its own as its network: {NAME}"):

@@ -1,7 +1,5 @@
 """Episodes in many layouts: engines, what is kept of them, and options tried without learning (Spec H6)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ import numpy as np
 import own_domain
 import pytest
 from corridor import Corridor
+from option_loops import loop_of
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
@@ -20,11 +19,7 @@ from hypogoal.evaluation.frozen import play
 from hypogoal.evaluation.zero_shot import alone, shortest_ways
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds
 from hypogoal.meta.setup import Setup, make_engine
-from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.planned import PlannedLearner
-from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations, oracle_terminations
 
 SEEDS = (5, 100, 101, 7)
@@ -95,9 +90,7 @@ def test_plans_are_of_all_layouts_together() -> None:
 
 def planned_loop(terminations: Any) -> OptionLoop:
     engine = DoorKeyEngine(Layouts(SEEDS), 4)
-    ends, config = terminations(engine), OptionConfig.of(network="planned", environments=4, mask_reached=False)
-    learner = PlannedLearner(engine, ends, config, seed=0)
-    return OptionLoop(engine, ends, learner, RandomChooser(rng_for(0, "c")), Recorder(5, engine), config, gamma=1.0)
+    return loop_of(engine, ends=terminations(engine), network="planned", environments=4, mask_reached=False)
 
 
 def test_planned_options_to_true_sub_goals_are_perfect_without_learning() -> None:

@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from command_line import refuses
 from corridor import LongCorridor
-from toy_data import fill
+from toy_data import untrained
 
-from hypogoal.cli import main
-from hypogoal.core.artefacts import create, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain
-from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_baseline import train_baseline
@@ -47,36 +45,12 @@ class LongCorridorDomain(Domain):
 DOMAIN = LongCorridorDomain()
 
 
-def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") -> Path:
-    """An ensemble artefact with random weights."""
-    shape = domain.observation_shape
-    config = {
-        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
-        "network": network, "observation_shape": list(shape), "observation_dtype": "uint8", "view": "full",
-    }  # fmt: skip
-    with create(folder, kind="ensemble", config=config, seed=0, inputs=[]) as draft:
-        place = draft.files
-        for number, sub_goal in enumerate(domain.usual_sub_goals):
-            write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
-        fill(place, "ensemble", config)
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The manifests here name this module's domain."""
-    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+pytestmark = pytest.mark.usefixtures("trusted")  # manifests here name this module's domain
 
 
 @pytest.fixture(scope="module")
 def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return ensemble_of(tmp_path_factory.mktemp("run") / "ensemble", TallDomain, members=1)
-
-
-class TallDomain:
-    """Only for the ensemble's manifest: oracle terminations read no weights."""
-
-    name, usual_sub_goals, observation_shape = DOMAIN.name, DOMAIN.sub_goals, (84, 84, 4)
+    return untrained(tmp_path_factory.mktemp("run") / "ensemble", DOMAIN, members=1, network="mlp")
 
 
 def rows_of(folder: Path) -> list[dict[str, int]]:
@@ -118,28 +92,18 @@ def test_same_seed_same_files(corridor: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one/executions.csv").read_bytes() != (tmp_path / "other/executions.csv").read_bytes()
 
 
-def test_a_start_must_be_one_of_the_domains(corridor: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_start_must_be_one_of_the_domains(corridor: Path, tmp_path: Path) -> None:
     """Spec D4, G2: one line that names those there are; nothing is left behind."""
-    for changes, line in (
-        ({"start": "top"}, "unknown start: top. Give --set start=X, X one of middle, left."),
-        ({}, "where are episodes to begin?: start. Give --set start=X, X one of middle, left."),
-    ):
-        with pytest.raises(UserError) as caught:
-            train(corridor, tmp_path / "options", **changes)
-        assert str(caught.value) == line
-    assert not (tmp_path / "options").exists()
-    command = ["train-options", str(corridor), "--out", str(tmp_path / "options"), "--set", "start=top"]
-    assert main([*command, "--set", "termination=oracle"]) == 2
-    assert capsys.readouterr().err.strip().splitlines() == [
-        "hypogoal: unknown start: top. Give --set start=X, X one of middle, left."
-    ]
+    words = ["train-options", corridor, "--out", tmp_path / "options", "--set", "termination=oracle"]
+    refuses("unknown start: top. Give --set start=X, X one of middle, left.", *words, "--set", "start=top")
+    refuses("where are episodes to begin?: start. Give --set start=X, X one of middle, left.", *words)
 
 
 def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
     """Spec D4, G2: DoorKey's layouts begin where they begin."""
     from hypogoal.domains.doorkey.domain import DOMAIN as doorkey
 
-    ensemble = ensemble_of(tmp_path / "ensemble", doorkey, 1, "doorkey")
+    ensemble = untrained(tmp_path / "ensemble", doorkey, 1, "mlp")
     with pytest.raises(UserError, match="unknown start: 1L"):
         train_options(ensemble, tmp_path / "options", steps=10, start="1L", quiet=True)
 
@@ -155,8 +119,8 @@ def test_options_on_a_ladder(tmp_path: Path) -> None:
     """Spec A3, B4, D4, F3: learned members and the oracle on the emulator, from an ensemble to executions and stops."""
     from hypogoal.domains.montezuma.domain import DOMAIN as montezuma
 
-    ensemble = ensemble_of(tmp_path / "ensemble", montezuma, members=2)
-    few = {"start": "1L", "option_timeout": 25, "steps": 320, "n_step": 3, "exploration": "persistent", "replay": 500}
+    ensemble = untrained(tmp_path / "ensemble", montezuma, members=2)
+    few = {"start": "1L", "option_timeout": 25, "steps": 160, "n_step": 3, "exploration": "persistent", "replay": 500}
     for name, options in (("learned", 2), ("oracle", 1)):
         train(ensemble, tmp_path / name, termination=name, **few)
         rows = rows_of(tmp_path / name)

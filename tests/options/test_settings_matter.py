@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 import torch
 from corridor import Corridor
+from option_loops import loop_of, played
 
-from hypogoal.core.seeding import rng_for
-from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.config import OptionConfig
-from hypogoal.options.learner import load_learner
-from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations
 
 QUICK: dict[str, Any] = {
@@ -36,25 +31,16 @@ class Endless(Corridor):
         return type(super().step(actions))(self.ids.copy(), none.astype(np.float32), none, none)
 
 
-def learned(network: str, **changes: Any) -> tuple[OptionLoop, dict[str, torch.Tensor]]:
-    """Options whose sub-goals never hold, after some updates, and their weights."""
-    engine, config = Endless(3), OptionConfig.of(network=network, **{**QUICK, **changes})
+def learned(network: str, **settings: Any) -> dict[str, torch.Tensor]:
+    """The weights of options whose sub-goals never hold, after some updates."""
     never = Terminations(lambda ids: np.zeros((len(ids), 2), np.bool_), 2)
-    learner = load_learner(network)(engine, never, config, seed=1, device="cpu")
-    loop = OptionLoop(
-        engine, never, learner, RandomChooser(rng_for(0, "choice")), Recorder(2, engine), config, gamma=0.9
-    )
-    for _ in range(40):
-        loop.step()
-    return loop, {name: value.clone() for name, value in learner.state().items()}
+    loop = loop_of(Endless(3), ends=never, network=network, **QUICK | {"option_learning_rate": 5e-4} | settings)
+    return {name: value.clone() for name, value in played(loop, 40).learner.state().items()}
 
 
 @pytest.mark.parametrize("network", ["light", "paper"])
 @pytest.mark.parametrize("change", [{"option_learning_rate": 5e-2}, {"bounded_values": False}, {"option_gamma": 0.1}])
 def test_other_settings_learn_other_weights(network: str, change: dict[str, Any]) -> None:
     """Spec D2: a setting that nobody reads would change nothing."""
-    (_, usual), (_, other) = (
-        learned(network, option_learning_rate=5e-4),
-        learned(network, **{"option_learning_rate": 5e-4, **change}),
-    )
+    usual, other = learned(network), learned(network, **change)
     assert any(not torch.equal(value, other[name]) for name, value in usual.items())

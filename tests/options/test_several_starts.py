@@ -5,50 +5,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_data import fill
+from toy_data import untrained
 
 import hypogoal
-from hypogoal.core.artefacts import create, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.montezuma.domain import DOMAIN
 from hypogoal.domains.montezuma.engine import MontezumaEngine
-from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.stages.train_options import train_options
 
-SHAPE = DOMAIN.observation_shape
-QUICK = {
-    "environments": 3,
-    "warm_up": 60,
-    "update_interval": 20,
-    "option_batch": 16,
-    "option_timeout": 20,
-    "replay": 500,
-}
-
-
-def ensemble_in(folder: Path, seed: int = 0) -> Path:
-    """An ensemble artefact of two members with random weights."""
-    config = {"domain": "montezuma", "domain_config": {}, "sub_goals": list(DOMAIN.usual_sub_goals), "members": 2,
-              "observation_shape": list(SHAPE), "observation_dtype": "uint8", "view": "full",
-              "network": "montezuma"}  # fmt: skip
-    with create(folder, kind="ensemble", config=config, seed=seed, inputs=[]) as draft:
-        place = draft.files
-        ensemble = Ensemble("montezuma", SHAPE, 2, torch.Generator().manual_seed(1))
-        write_ensemble(place, DOMAIN.sub_goals[0], ensemble)
-        fill(place, "ensemble", config)
-    return folder
+QUICK = {"environments": 3, "warm_up": 60, "update_interval": 20, "option_batch": 16, "option_timeout": 20}
 
 
 def train(ensemble: Path, out: Path, options: Path | None = None, **changes: object) -> dict[str, object]:
-    settings = DOMAIN.defaults["train-options"] | QUICK | {"steps": 200, "start": "1L"} | changes
+    settings = DOMAIN.defaults["train-options"] | QUICK | {"steps": 120, "replay": 500, "start": "1L"} | changes
     return train_options(ensemble, out, options=options, quiet=True, **settings).metrics
 
 
 @pytest.mark.atari
 def test_options_go_on_elsewhere(tmp_path: Path) -> None:
     """Policies trained at one ladder, then at another; what is loaded plays as they do."""
-    ensemble = ensemble_in(tmp_path / "ensemble")
+    ensemble = untrained(tmp_path / "ensemble", DOMAIN)
     train(ensemble, tmp_path / "near", start="1L")
     weights = load_tensors(tmp_path / "near" / "options.safetensors")
     # So long a warm-up that nothing is learned: the options as they are.
@@ -64,4 +42,4 @@ def test_options_go_on_elsewhere(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="trained with embedding=auto, not montezuma"):
         train(ensemble, tmp_path / "other", tmp_path / "near", embedding="montezuma")
     with pytest.raises(UserError, match="trained with another ensemble"):
-        train(ensemble_in(tmp_path / "another", seed=1), tmp_path / "other", tmp_path / "near", **as_they_are)
+        train(untrained(tmp_path / "another", DOMAIN, seed=1), tmp_path / "other", tmp_path / "near", **as_they_are)

@@ -8,64 +8,26 @@ import numpy as np
 import pytest
 import torch
 from corridor import Corridor, LongCorridor
+from option_loops import BEGIN, QUICK, Chosen, Scripted, loop_of, played
 
 from hypogoal.core.errors import UserError
-from hypogoal.options.choosers import EvenChooser, RandomChooser
+from hypogoal.options.choosers import EvenChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.networks import PictureEmbedding
 from hypogoal.options.recording import Recorder
 from hypogoal.options.tables import Executions
-from hypogoal.options.termination import oracle_terminations
 
 LEFT, RIGHT, STAY = 2, 3, 0
-QUICK = {"environments": 4, "warm_up": 50, "update_interval": 4, "option_batch": 32, "epsilon_steps": 300}
-BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own"}
 
 
-class Script:
-    """A learner that plays a list of actions, the same in every environment."""
-
-    def __init__(self, actions):
-        self.actions = list(actions)
-
-    def act(self, ids, options, age, *, explore=True):
-        return np.full(len(ids), self.actions.pop(0))
-
-    def observe(self, moved):
-        pass
-
-    def learn(self):
-        return {}
-
-
-class Chosen:
-    """A chooser that takes the options of a list; keeps where they began and what came of them."""
-
-    def __init__(self, options):
-        self.options, self.began, self.outcomes = list(options), [], []
-
-    def choose(self, environments, ids, offered):
-        assert offered.all()
-        self.began.extend(ids.tolist())
-        return np.array([self.options.pop(0) for _ in ids])
-
-    def record(self, outcome):
-        self.outcomes.append(outcome)
-
-    def learn(self):
-        return {}
-
-
-def play(engine, actions, options, **changes):
-    chooser, recorder = Chosen(options), Recorder(2, engine)
-    config = OptionConfig.of(**(BEGIN | {"option_timeout": 4} | changes))
-    verdicts = oracle_terminations(engine, (0, 1))
-    loop = OptionLoop(engine, verdicts, Script(actions), chooser, recorder, config, gamma=1.0)
-    for _ in range(len(actions)):
-        loop.step()
-    return chooser, recorder
+def play(engine: Corridor, actions: list[int], options: list[int], **settings: object) -> tuple[Chosen, Recorder]:
+    """The same in every environment: what became of these options while these actions were played."""
+    loop = loop_of(engine, Scripted(*actions), Chosen(*options), **BEGIN | {"option_timeout": 4} | settings)
+    played(loop, len(actions))
+    assert np.concatenate(loop.chooser.offered).all()
+    return loop.chooser, loop.recorder
 
 
 def columns(folder: Path) -> list[dict[str, int]]:
@@ -141,39 +103,32 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
     recorder.write(tmp_path)
     with h5py.File(tmp_path / "terminations.h5") as file:
         (picture,) = file["0"][()]
-    assert (picture[:, :14] == 255).all() and not picture[:, 14:].any(), "cell 0"
+    assert (picture[:, :7] == 255).all() and not picture[:, 7:].any(), "cell 0"
 
 
-def learned(steps: int, seed: int = 0, memory: int = 200_000, count: int = 4, **changes):
-    config = OptionConfig.of(**(QUICK | BEGIN | {"option_timeout": 10} | changes))
-    engine = LongCorridor(count, memory=memory, seed=seed)
-    verdicts = oracle_terminations(engine, (0, 1))
-    learner = LightLearner(engine, verdicts, config, seed)
-    recorder = Recorder(2, engine)
-    loop = OptionLoop(engine, verdicts, learner, RandomChooser(np.random.default_rng(seed)), recorder, config, 1.0)
-    for _ in range(steps // count):
-        loop.step()
-    return learner, recorder
+def learned(steps: int, engine: LongCorridor | None = None, **settings: object) -> OptionLoop:
+    loop = loop_of(engine or LongCorridor(4), **QUICK | BEGIN | {"option_timeout": 10} | settings)
+    return played(loop, steps // 4)
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"n_step": 3}, {"n_step": 3, "exploration": "persistent"}],
-    ids=["one-step", "three-step", "three-step persistent"],
+    [{}, {"n_step": 3, "exploration": "persistent"}],
+    ids=["one-step", "three-step persistent"],
 )
 def test_the_light_learner_learns_from_pictures(changes: dict) -> None:
     """Spec D2, D4: own experience, one step and several: both options go straight to their ends."""
-    learner, recorder = learned(1600, epsilon_final=0.02, **changes)
-    assert isinstance(learner.networks.online.cells, PictureEmbedding)
+    loop = learned(1600, epsilon_final=0.02, **changes)
+    assert isinstance(loop.learner.networks.online.cells, PictureEmbedding)
     for option, shortest in ((0, 2), (1, 3)):
-        last = list(recorder.executions[option])[-20:]
+        last = list(loop.recorder.executions[option])[-20:]
         assert np.mean([row.reached for row in last]) >= 0.9
         assert np.median([row.duration for row in last]) == shortest
 
 
 def test_values_over_several_steps_are_the_discounted_ones() -> None:
     """Spec D2: in cell 1 the left end is one step away, in cell 2 two: values near 1 and gamma."""
-    learner, _ = learned(2000, n_step=3, option_gamma=0.5, epsilon_final=0.3, option_learning_rate=2e-3)
+    learner = learned(2000, n_step=3, option_gamma=0.5, epsilon_final=0.3, option_learning_rate=2e-3).learner
     engine = learner.engine
     at = {cell: engine.cell.index(cell, engine.n_states - 1000) for cell in (1, 2)}
     with torch.no_grad():
@@ -190,27 +145,23 @@ def test_a_step_of_several_needs_own_experience() -> None:
 def test_a_replay_longer_than_the_memory_is_refused() -> None:
     """Spec D3: before it begins, with the number that fits; with that number it begins."""
     with pytest.raises(UserError, match=r"replay=1000\. Give --set replay=") as caught:
-        learned(4, memory=900, replay=1000)
-    learned(4, memory=900, replay=int(caught.value.do.split("replay=")[1].split()[0]))
+        learned(4, LongCorridor(4, memory=900), replay=1000)
+    learned(4, LongCorridor(4, memory=900), replay=int(caught.value.do.split("replay=")[1].split()[0]))
 
 
 def test_forgotten_states_are_not_learned_from() -> None:
     """Spec D3: positives from long ago are kept by id; once their pictures are gone they are not drawn again."""
     engine = LongCorridor(4, memory=400)
-    config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 200, "n_step": 3}))
-    verdicts = oracle_terminations(engine, (0, 1))
-    learner = LightLearner(engine, verdicts, config, 0)
-    recorder, chooser = Recorder(2, engine), RandomChooser(np.random.default_rng(0))
-    loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, 1.0)
+    loop = learned(0, engine, replay=200, n_step=3)
+    learner = loop.learner
     while not learner.positives.all():
         loop.step()
     learner.act = lambda ids, options, age, **_: np.zeros(len(ids), np.int64)  # from now on nothing is reached
-    for _ in range(150):
-        loop.step()
+    played(loop, 150)
     assert not engine.remembers(learner.positive.next_state[learner.positive.next_state > 0]).any()
     batch, indices, weights = learner._batch()
     assert engine.remembers(batch.state).all() and engine.remembers(batch.next_state).all()
-    assert len(indices) == len(weights) == config.option_batch, "all of it from the replay"
+    assert len(indices) == len(weights) == loop.config.option_batch, "all of it from the replay"
 
 
 def test_the_replay_never_outlives_the_memory() -> None:
@@ -218,19 +169,13 @@ def test_the_replay_never_outlives_the_memory() -> None:
     config = OptionConfig.of(**(QUICK | BEGIN | {"replay": 300, "n_step": 7}))
     smallest = LightLearner.reach(config, 2)
     slow = {"update_interval": 32, "option_batch": 300}  # few updates, each with most of the replay
-    learned(2000, memory=smallest, replay=300, n_step=7, option_timeout=9, **slow)
+    learned(2000, LongCorridor(4, memory=smallest), replay=300, n_step=7, option_timeout=9, **slow)
 
 
 def test_even_choice_gives_every_option_as_many_steps() -> None:
     """Spec D4: option 0 takes 2 steps each time, option 1 its full 10; uniform choice would give it 5 of 6 steps."""
-    engine = LongCorridor(4)
-    recorder = Recorder(2, engine)
-    config = OptionConfig.of(**(BEGIN | {"option_timeout": 10}))
-    verdicts = oracle_terminations(engine, (0, 1))
     chooser = EvenChooser(np.random.default_rng(0), 2)
-    loop = OptionLoop(engine, verdicts, Script([LEFT] * 1000), chooser, recorder, config, 1.0)
-    for _ in range(1000):
-        loop.step()
+    recorder = played(loop_of(LongCorridor(4), Scripted(LEFT), chooser, **BEGIN, option_timeout=10), 1000).recorder
     recorder.flush()
     steps = [sum(row[6] for row in recorder.choices if row[1] == option) for option in (0, 1)]
     assert abs(steps[0] - steps[1]) <= 4 * 10 and sum(steps) > 3900

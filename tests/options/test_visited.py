@@ -23,7 +23,7 @@ def walk(visited: Visited, engine: Corridor, steps: int, seed: int = 0) -> None:
 
 def cells(visited: Visited) -> list[int]:
     """Which cell each kept image shows."""
-    wide = 14 if isinstance(visited.engine, LongCorridor) else 8
+    wide = 7 if isinstance(visited.engine, LongCorridor) else 8
     return (visited.states()[:, 0, :, 0].argmax(axis=1) // wide).tolist()
 
 

@@ -312,7 +312,7 @@ def arrays_doorkey(work: Path) -> Table:
     return hashes(doorkey_data(work))
 
 
-@part("arrays-montezuma")
+@part("arrays-montezuma", slow=True)
 def arrays_montezuma(work: Path) -> Table:
     return hashes(montezuma_data(work))
 
@@ -366,7 +366,7 @@ def paper_network(work: Path, recurrence: int) -> Table:
     return [("line", "column", "value"), *log_of(options), *weights_of(options / "options.safetensors")]
 
 
-@part("paper-network-with-memory", traced=True)
+@part("paper-network-with-memory", traced=True, slow=True)
 def paper_network_with_memory(work: Path) -> Table:
     return paper_network(work, 10)
 

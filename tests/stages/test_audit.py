@@ -1,7 +1,5 @@
 """Spec H5: policies are trained against a success classifier: what they are fooled by, and what a mend changes."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

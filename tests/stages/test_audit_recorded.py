@@ -1,9 +1,8 @@
 """An audit of recorded data, labels for what it proposes, and their way back into the data (Spec I6)."""
 
-from __future__ import annotations
-
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +19,12 @@ from hypogoal.evaluation.pictures import picture_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
 from tests import mixed
-
-GOAL = "door-open"
-
-
-@pytest.fixture(scope="module")
-def audited(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data of two cameras and a state, an ensemble, and its audit."""
-    folder = tmp_path_factory.mktemp("recorded")
-    np.savez(folder / "states.npz", **mixed.arrays())
-    words = ["--sub-goal", GOAL, "--out", str(folder / "data.h5"), "-q"]
-    run("import", folder / "states.npz", *words)
-    few = settings("steps=8", "members=2")
-    run("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "-q", *few)
-    run("audit", folder / "ensemble", "--out", folder / "audit")
-    return folder
+from tests.mixed import GOAL
 
 
-def test_an_audit_of_recorded_data(audited: Path) -> None:
+def test_an_audit_of_recorded_data(mixed_run: Path) -> None:
     """Numbers, the table and the page; the rows are states of the file, each once, disputed ones first."""
-    audit, data = audited / "audit", open_dataset(audited / "data.h5")
+    audit, data = mixed_run / "audit", open_dataset(mixed_run / "data.h5")
     artefact = open_artefact(audit, "recorded-audit")
     pictures = {f"next/{GOAL}/{number:03d}.png" for number in range(1, 21)}
     assert artefact.manifest.files.keys() == {"audit.json", "index.html", *pictures}
@@ -59,14 +44,14 @@ def often(observations: Any) -> NDArray[np.float64]:
     return (observations["state"].mean(axis=1) > 0).astype(np.float64)
 
 
-def test_a_function_is_audited_on_labels_by_hand(audited: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_function_is_audited_on_labels_by_hand(mixed_run: Path, tmp_path: Path, capsys: Any) -> None:
     """Its share of known failures is that of the data; a larger one than allowed is exit code 3, and one JSON line."""
-    data = open_dataset(audited / "data.h5")
+    data = open_dataset(mixed_run / "data.h5")
     splits = data.labelled(GOAL), data.heldout(GOAL)
     failures = [often(split.observations[~split.labels]) for split in splits]
     share = float(np.concatenate(failures).mean())
     assert 0.1 < share < 0.9
-    words = ["audit", f"{__name__}:often", "--data", str(audited / "data.h5"), "--json"]
+    words = ["audit", f"{__name__}:often", "--data", str(mixed_run / "data.h5"), "--json"]
     capsys.readouterr()
     for number, (limit, code) in enumerate(((share - 0.01, 3), (share + 0.01, 0))):
         out = tmp_path / str(number)
@@ -78,14 +63,13 @@ def test_a_function_is_audited_on_labels_by_hand(audited: Path, tmp_path: Path, 
         }  # fmt: skip
 
 
-def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path) -> None:
+def test_what_is_labelled_next_becomes_data(mixed_run: Path, tmp_path: Path) -> None:
     """Each state of the table is a picture; filled in, it is imported, and the audit is whole."""
-    audit = tmp_path / "audit"
-    run("audit", audited / "ensemble", "--out", audit)
+    audit = shutil.copytree(mixed_run / "audit", tmp_path / "audit")
     table = audit / "next" / GOAL / TO_FILL_IN
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    before = open_dataset(audited / "data.h5")
+    before = open_dataset(mixed_run / "data.h5")
     unlabelled = before.unlabelled()
     for row in rows:
         with PIL.Image.open(table.with_name(row["name"])) as image:
@@ -98,7 +82,7 @@ def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path) -> No
     table.write_text(text)
     run("verify", audit)
     more = tmp_path / "more.h5"
-    run("import", audited / "data.h5", "--label", f"{GOAL}={table}", "--out", more, "-q")
+    run("import", mixed_run / "data.h5", "--label", f"{GOAL}={table}", "--out", more, "-q")
     after = open_dataset(more)
     places = [int(row["row"]) for row in rows[:4]]
     labelled = after.labelled(GOAL)
@@ -106,18 +90,17 @@ def test_what_is_labelled_next_becomes_data(audited: Path, tmp_path: Path) -> No
     assert labelled.labels[-4:].tolist() == [True, False, True, False] and len(labelled.labels) == 44
     np.testing.assert_array_equal(after.unlabelled(), np.delete(unlabelled, places))
     np.testing.assert_array_equal(after.heldout(GOAL).observations, before.heldout(GOAL).observations)
-    run("train-ensemble", more, "--out", tmp_path / "ensemble", "-q", *settings("steps=2", "members=2"))
 
 
-def test_a_data_file_is_taken_as_it_is(audited: Path, tmp_path: Path) -> None:
+def test_a_data_file_is_taken_as_it_is(mixed_run: Path, tmp_path: Path) -> None:
     """What ``import`` would do to other sources is not silently left out."""
-    table = audited / "audit/next" / GOAL / TO_FILL_IN
-    command = ["import", audited / "data.h5", "--label", f"{GOAL}={table}", "--out", tmp_path / "more.h5"]
+    table = mixed_run / "audit/next" / GOAL / TO_FILL_IN
+    command = ["import", mixed_run / "data.h5", "--label", f"{GOAL}={table}", "--out", tmp_path / "more.h5"]
     for words in (["--resize", "32"], ["--every", "2"], ["--domain", "doorkey"], ["--key", "front"], ["--stack"]):
         refuses("a data file is taken as it is", *command, *words)
 
 
-def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path) -> None:
+def test_a_table_is_of_one_sub_goal(mixed_run: Path, tmp_path: Path) -> None:
     """Data of two sub-goals can be audited."""
     arrays = mixed.arrays()
     for name in ("labels", "heldout_labels"):
@@ -133,15 +116,15 @@ def test_a_table_is_of_one_sub_goal(audited: Path, tmp_path: Path) -> None:
     assert {path.name for path in (folder / "audit/next").iterdir()} == {"one", "two"}
 
 
-def test_what_cannot_be_audited_is_one_line(audited: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_audited_is_one_line(mixed_run: Path, tmp_path: Path) -> None:
     """No ensemble, settings, an unknown sub-goal, another artefact; nothing is left behind."""
-    ensemble, out = str(audited / "ensemble"), tmp_path / "audit"
+    ensemble, out = str(mixed_run / "ensemble"), tmp_path / "audit"
     for words, fault in [
         (["mine:classify"], "an audit plays in a domain, or looks at recorded data"),
         ([ensemble, "--set", "steps=3"], "without settings"),
         ([ensemble, "--member", "1"], "an audit plays in a domain"),
         ([ensemble, "--sub-goal", "other"], "unknown sub-goal"),
         ([ensemble, "--domain", "doorkey"], "the domain has the truth"),
-        ([audited / "audit"], "but ensemble is needed"),
+        ([mixed_run / "audit"], "but ensemble is needed"),
     ]:
         refuses(fault, "audit", *words, "--out", out)

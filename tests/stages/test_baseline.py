@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 import torch
 from breaking import Breaking, Broken
-from corridor import Corridor
 from gymnasium import spaces
+from own_domain import TallCorridor
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.base import Step
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import epsilon, train
@@ -28,40 +27,7 @@ from hypogoal.learners.config import WorldConfig
 from hypogoal.learners.world import make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
-EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 6_000, ("dqn", "tuned"): 12_000}
-
-
-class Row(Corridor):
-    """Five cells in a row: action 2 steps right, action 0 left, the others do nothing; the goal is the last cell."""
-
-    n_actions, n_states, resumes = 7, 5, False
-    observation_shape = (64, 64, 3)
-    tiles = np.stack([np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), (255, 40, 40), np.uint8)])
-
-    def __init__(self, count: int, max_steps: int = 20):
-        super().__init__(count, max_steps)
-
-    def reset(self):
-        self.ids, self.elapsed = np.zeros((2, self.count), dtype=np.int64)
-        return self.ids.copy()
-
-    def step(self, actions):
-        following = np.clip(self.ids + (actions == 2).astype(int) - (actions == 0).astype(int), 0, 4)
-        self.elapsed += 1
-        terminated = following == 4
-        truncated = ~terminated & (self.elapsed >= self.max_steps)
-        over = terminated | truncated
-        self.ids = np.where(over, 0, following)
-        self.elapsed = np.where(over, 0, self.elapsed)
-        return Step(following, terminated.astype(np.float32), terminated, truncated)
-
-    def codes(self, ids):
-        codes = np.zeros((len(ids), 64), dtype=np.uint8)
-        codes[np.arange(len(ids)), 9 + np.asarray(ids)] = 1
-        return codes
-
-    def labels(self, ids):
-        return (np.asarray(ids) == 4)[:, None]
+EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 4_000, ("dqn", "tuned"): 6_000}
 
 
 def learn(env, chosen, steps, folder, kept=None):
@@ -74,36 +40,30 @@ def learn(env, chosen, steps, folder, kept=None):
 def test_solves_an_easy_task(agent, setting, tmp_path):
     """Spec E7: every baseline, in either setting, learns a corridor that random play rarely finishes in time."""
     chosen = HYPERPARAMETERS[agent, setting]
-    env = EngineEnv(Row(chosen.environments))
+    env = EngineEnv(TallCorridor(chosen.environments, max_steps=4))
     trained = learn(env, chosen, EASY_STEPS[agent, setting], tmp_path)
-    assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.8
-    trial = EngineEnv(Row(1))
+    assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.5
+    trial = EngineEnv(TallCorridor(1))
     observation: Any = trial.reset()
     while not trial.episodes:
         observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
-    assert trial.episodes == [(4, 4, 1.0, 1, 1)]  # the shortest way, by the greedy policy
+    assert trial.episodes == [(3, 3, 1.0, 1, 1)]  # the shortest way, by the greedy policy
 
 
 def test_a_time_limit_is_not_a_terminal_state():
     """Spec E7, D2: a cut episode is told to the agent as truncated, with the state it was cut in; the goal is not."""
-    corridor = Row(2, max_steps=3)
+    corridor = TallCorridor(2, max_steps=3)
     env = EngineEnv(corridor)
     env.reset()
     for _ in range(2):
-        assert not env.step(np.array([1, 2]))[2].any()
-    observations, _, done, infos = env.step(np.array([1, 2]))
-    assert done.tolist() == [True, True]
-    assert [info["TimeLimit.truncated"] for info in infos] == [True, True]
-    assert infos[1]["terminal_observation"].tolist() == corridor.codes(np.array([3]))[0].tolist()
-    assert np.array_equal(np.asarray(observations), corridor.codes(np.array([0, 0])))  # the next episode's start
-    assert env.episodes == [(6, 3, 0.0, 0, 0), (6, 3, 0.0, 0, 0)]
-    env = EngineEnv(Row(1, max_steps=4))
-    env.reset()
-    for _ in range(3):
-        env.step(np.array([2]))
-    _, rewards, done, infos = env.step(np.array([2]))  # the goal, on the last step before the limit
-    assert (done[0], rewards[0], infos[0]["TimeLimit.truncated"]) == (True, 1.0, False)
-    assert env.episodes == [(4, 4, 1.0, 1, 1)]
+        assert not env.step(np.array([0, 1]))[2].any()
+    observations, rewards, done, infos = env.step(np.array([0, 1]))  # the second is at the goal, in its last step
+    assert done.tolist() == [True, True] and rewards.tolist() == [0.0, 1.0]
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, False]
+    last, begin = (corridor.images(np.array([cell]))[0].transpose(2, 0, 1) for cell in (0, 2))
+    assert np.array_equal(infos[0]["terminal_observation"], last)
+    assert np.array_equal(np.asarray(observations), [begin, begin])  # the next episode's start
+    assert env.episodes == [(6, 3, 0.0, 0, 0), (6, 3, 1.0, 1, 1)]
 
 
 @pytest.mark.parametrize("network", list(NETWORKS))
@@ -174,7 +134,7 @@ def test_global_randomness_is_given_back(tmp_path):
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    learn(EngineEnv(Row(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
+    learn(EngineEnv(TallCorridor(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
     assert torch.rand(1) == expected
 
 

@@ -12,7 +12,7 @@ from hypogoal.evaluation.curves import budget_of
 from hypogoal.learners import episodes
 from hypogoal.options.tables import Episodes
 
-FEW = [*settings("environments=4", "warm_up=50", "steps=200"), "-q"]
+FEW = [*settings("environments=4", "warm_up=50", "steps=200", "max_episode_steps=30"), "-q"]
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,19 @@ def test_options_that_fit_are_continued(corridor_run: Path, tmp_path: Path) -> N
     run(*command, "--out", tmp_path / "shorter", "--set", "max_episode_steps=7")
     steps = [int(row.split(",")[0]) for row in (tmp_path / "shorter/episodes.csv").read_text().splitlines()[1:]]
     assert min(steps) > 400, "episodes of practice in a world of longer episodes are none of the agent's"
+
+
+def test_options_go_on_as_they_were_learned(corridor_run: Path, tmp_path: Path) -> None:
+    """Spec D1, D8, H6: their time and what they see by are taken over; others are refused."""
+    options, meta = tmp_path / "options", tmp_path / "meta"
+    own = settings("option_timeout=40", "embedding=tiles")
+    run("train-options", corridor_run / "ensemble", "--out", options, *FEW, *own)
+    command = ["train-meta", corridor_run / "ensemble", "--options", options, "--out", meta, *FEW]
+    refuses("trained with option_timeout=40, not 10", *command, "--set", "option_timeout=10")
+    refuses("trained with embedding=tiles, not auto", *command, "--set", "embedding=auto")
+    run(*command)
+    config = open_artefact(meta).config
+    assert (config["option_timeout"], config["embedding"]) == (40, "tiles")
 
 
 def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(

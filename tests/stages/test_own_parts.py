@@ -1,9 +1,6 @@
 """A chooser, a learner and a termination rule of one's own: one class each, and no other file."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,97 +10,21 @@ import numpy as np
 import pytest
 import torch
 from command_line import refuses, run, settings
-from numpy.typing import NDArray
-from torch import Tensor
+from option_loops import loop_of
 
-from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.meta.episodes import agent_of, play_episode
-from hypogoal.options.choosers import Chooser, Offered, load_chooser
+from hypogoal.options.choosers import load_chooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.env import OptionEnv, Options
-from hypogoal.options.learner import Learner, Transitions, load_learner, make_policies
-from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
+from hypogoal.options.learner import make_policies
 from hypogoal.options.reward import SubgoalReward
-from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.tables import ChoiceCounts
-from hypogoal.options.termination import Terminations, learned_terminations, saved_terminations
+from hypogoal.options.termination import learned_terminations, saved_terminations
 
-FEW = [*settings("steps=300", "environments=4"), "-q"]
-
-
-class FirstOffered(Chooser):
-    """It takes the first option offered."""
-
-    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
-        return offered.argmax(1)
-
-
-def preferred(picture: NDArray[np.uint8], option: int, actions: int) -> int:
-    return (int(picture.sum()) // 7 + option) % actions
-
-
-class Straight(Learner):
-    """Every option plays by its number and the sum of the pixels; it counts the steps and learns nothing."""
-
-    @classmethod
-    def policies(cls, saved: SavedOptions) -> Policies:
-        return lambda option: lambda picture: preferred(picture, option, 7)
-
-    @classmethod
-    def refuse(cls, config: Any, engine: Engine) -> None:
-        super().refuse(config, engine)
-        if config.experience != "shared":
-            raise UserError("straight options have no experience", f"experience={config.experience}", "Leave it out.")
-
-    def build(self, config: Any, seed: int) -> None:
-        self.actions = self.engine.n_actions
-
-    @staticmethod
-    def reach(config: Any, options: int) -> int:
-        return 0
-
-    def greedy(self, ids: Ints, options: Ints, age: Ints) -> Ints:
-        pairs = zip(self.engine.images(ids), options.tolist(), strict=True)
-        return np.array([preferred(picture, option, self.actions) for picture, option in pairs])
-
-    def observe(self, moved: Transitions) -> None:
-        self.count(moved.options)
-
-    def learn(self) -> dict[str, float]:
-        return {}
-
-    def weights(self) -> dict[str, Tensor]:
-        return {}
-
-    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        pass
-
-
-class AtLeast(Terminations):
-    """No execution reaches its sub-goal in its first two steps, nor before two positive predictions in a row."""
-
-    CHANGING = (*Terminations.CHANGING, "row")
-
-    def __init__(self, *arguments: Any, **more: Any):
-        super().__init__(*arguments, **more)
-        self.row = np.zeros(self.environments, dtype=np.int64)
-
-    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
-        self.row = np.where(self.positive(log_odds, options), self.row * (age > 0) + 1, 0)
-        return (self.row >= 2) & (age >= 2)
-
-
-class Never(Terminations):
-    """No execution reaches anything."""
-
-    def reached(self, log_odds: Floats, options: Ints, age: Ints) -> Bools:
-        return np.zeros(len(options), np.bool_)
+FEW = [*settings("steps=300", "environments=4", "max_episode_steps=30"), "-q"]
 
 
 def train(stage: str, source: Path, out: Path, *pairs: str) -> dict[str, Any]:
@@ -112,14 +33,14 @@ def train(stage: str, source: Path, out: Path, *pairs: str) -> dict[str, Any]:
     return open_artefact(out).config
 
 
-OWN = {"chooser": "FirstOffered", "network": "Straight", "termination": "AtLeast"}
+OWN = {"chooser": "First", "network": "Straight", "termination": "AtLeast"}
 
 
 @pytest.mark.parametrize("stage", ["train-options", "train-meta"])
 @pytest.mark.parametrize("setting", OWN)
 def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_path: Path) -> None:
     """Spec A3, A4, G2: the setting names the class; what is trained is played again where the user allows it."""
-    name = f"{__name__}:{OWN[setting]}"
+    name = f"odd_parts:{OWN[setting]}"
     assert train(stage, corridor_run, tmp_path / "made", f"{setting}={name}")[setting] == name
     if setting == "chooser":
         choices = ChoiceCounts.read(tmp_path / "made" / "choices.csv")
@@ -131,9 +52,9 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
 @pytest.mark.parametrize(
     ("pairs", "fault"),
     [
-        (["network={}:Straight", "experience=own"], "straight options have no experience: experience=own"),
-        (["chooser={}:Straight"], "this is no chooser"),
-        (["chooser={}:Missing"], "the chooser cannot be loaded"),
+        (["network=odd_parts:Straight", "experience=own"], "straight options have no experience: experience=own"),
+        (["chooser=odd_parts:Straight"], "this is no chooser"),
+        (["chooser=odd_parts:Missing"], "the chooser cannot be loaded"),
         (["chooser=odd_parts:Abstract"], "this chooser lacks choose"),
         (["chooser=odd_parts:Beyond"], "choose gave 4 to 4: Beyond"),
         (["chooser=odd_parts:Forgetful"], "learn gave None: Forgetful"),
@@ -143,11 +64,14 @@ def test_one_file_is_enough(setting: str, stage: str, corridor_run: Path, tmp_pa
 )
 def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_run: Path, tmp_path: Path) -> None:
     """Spec G2."""
-    own = settings(*(pair.format(__name__) for pair in pairs))
-    refuses(fault, "train-options", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *own)
+    words = [corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *settings(*pairs)]
+    refuses(fault, "train-options", *words)
 
 
-@pytest.mark.parametrize(("pair", "without"), [("decisions=64", "chooser=random"), ("replay=500", "network=planned")])
+ALONE = [("decisions=64", "chooser=random"), ("embedding=tiles", "network=planned")]
+
+
+@pytest.mark.parametrize(("pair", "without"), ALONE)
 def test_settings_that_do_nothing_are_refused(pair: str, without: str, corridor_run: Path, tmp_path: Path) -> None:
     """Spec G2: beside choosers and learners without them."""
     words = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *settings(pair, without)]
@@ -187,22 +111,21 @@ def door_key() -> gymnasium.Env[Any, Any]:
 
 
 @pytest.mark.filterwarnings("ignore:an episode begins where")
-@pytest.mark.parametrize("rule", ["learned", f"{__name__}:AtLeast", f"{__name__}:Never"])
+@pytest.mark.parametrize("rule", ["learned", "odd_parts:AtLeast", "odd_parts:Never"])
 def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D1, H4: step by step, one's own learner and chooser in the loop, in ``OptionEnv`` and as a reward."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    network, timeout = f"{__name__}:Straight", 6
+    network, timeout = "odd_parts:Straight", 6
     engine = DoorKeyEngine(100, 1)
     ensembles = ensembles_on(engine)
     config = OptionConfig.of(network=network, termination=rule, option_timeout=timeout, environments=1)
     ends = learned_terminations(engine, ensembles, rule=rule)
-    learner = load_learner(network)(engine, ends, config, 0)
-    chooser = load_chooser(f"{__name__}:FirstOffered").create(engine, 4, config, 0, "cpu")
-    loop = OptionLoop(engine, ends, learner, chooser, Recorder(4, engine), config, gamma=0.9)
+    chooser = load_chooser("odd_parts:First").create(engine, 4, config, 0, "cpu")
+    loop = loop_of(engine, chooser=chooser, ends=ends, config=config)
     steps = [loop.advance(learning=False) for _ in range(150)]
     executions = sorted(itertools.chain(*loop.recorder.executions), key=lambda execution: execution.step)
 
-    weights = learner.state() | ends.state()
+    weights = loop.learner.state() | ends.state()
     named = config.model_dump() | {"sub_goals": ["a", "b"], "members": 2}
     policies = make_policies(named, weights, {"observation_shape": engine.observation_shape})
     options = Options(("a", "b"), 2, ensembles, policies, saved_terminations(rule, weights, 4), timeout)
@@ -230,4 +153,4 @@ def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest
             held.append(paid["subgoal"]["predicted"])
         assert held == [False] * (len(held) - 1) + [info["reached"]]
     reached = [execution.reached for execution in executions]
-    assert any(reached) == (rule != f"{__name__}:Never") and (rule == "learned" or not all(reached))
+    assert any(reached) == (rule != "odd_parts:Never") and (rule == "learned" or not all(reached))
