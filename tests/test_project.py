@@ -201,7 +201,7 @@ def test_formats_are_readable_without_hypogoal(
     numbers = Path("runs/demo/evaluation/numbers.csv")
     numbers.parent.mkdir()
     numbers.write_text("quantity,value,method,scope,step\nsuccess,0.5,option agent,,\n")
-    assert len(snippets) == 4 and not any("hypogoal" in snippet for snippet in snippets)
+    assert len(snippets) == 3 and not any("hypogoal" in snippet for snippet in snippets)
     found: dict[str, Any] = {}
     for snippet in snippets:
         exec(compile(snippet, "docs/formats.md", "exec"), found)
@@ -210,9 +210,6 @@ def test_formats_are_readable_without_hypogoal(
     positives = int(open_dataset(data).labelled("open-red-door").labels.sum())
     assert f"open-red-door: 7 states, {positives} positives, uint8 (4, 5, 3)" in printed
     assert "7 unlabelled states" in printed and "members.0.13.weight float32 (2, 100)" in printed
-    (ensemble / "open-red-door.safetensors").write_bytes(b"changed")
-    with pytest.raises(AssertionError, match="open-red-door"):
-        exec(compile(snippets[1], "docs/formats.md", "exec"), {})
 
 
 def test_the_changelog_is_short() -> None:

@@ -27,7 +27,7 @@ from hypogoal.learners.config import WorldConfig
 from hypogoal.learners.world import make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
-EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 4_000, ("dqn", "tuned"): 6_000}
+EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 2_000, ("ppo", "tuned"): 3_000, ("dqn", "tuned"): 3_000}
 
 
 def learn(env, chosen, steps, folder, kept=None):
