@@ -38,11 +38,9 @@ class Commands(TyperGroup):
     """The commands; those of stages are made when they are called, since their settings take time to load."""
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
-        if words[0] == "sweep":
-            do = "Type 'hypogoal run' in its place, see 'hypogoal run --help'."
-            raise UserError("'sweep' is 'run' now", None, do)
-        if words[0] in stages.LISTED:
-            return words[0], stages.load_stage(words[0]).command, words[1:]
+        name, *rest = words
+        if name in stages.LISTED:
+            return name, stages.load_stage(name).command, rest
         return super().resolve_command(context, words)
 
 
@@ -148,8 +146,9 @@ def _advice(error: Any) -> str:
 def _fail(message: str, code: int, error: BaseException | None = None) -> int:
     """Say what is wrong, and the notes that were added to the error."""
     notes = getattr(error, "__notes__", [])
-    line = "; ".join([message.rstrip("."), *notes]) if notes else message
-    say(f"hypogoal: {printable(line)}", err=True)
+    if notes:
+        message = "; ".join([message.rstrip("."), *notes])
+    say(f"hypogoal: {printable(message)}", err=True)
     return code
 
 
@@ -211,7 +210,8 @@ def run(
     if only or not (out / "report").is_dir():
         say(out)
         return
-    say(*look.outcome(look.describe(out / "evaluation")), out / "report" / "index.html")
+    evaluation = look.describe(out / "evaluation")
+    say(*look.outcome(evaluation), out / "report" / "index.html")
 
 
 @command(LOOK, "show runs/mine")
@@ -239,10 +239,13 @@ def verify(path: Made, as_json: Json = False) -> None:
     """
     from hypogoal import look
 
-    faults, notes = look.faults(path), look.in_the_making(path)
+    faults = look.faults(path)
+    notes = look.in_the_making(path)
     state = "whole so far" if notes else "whole"
-    verdict = f"{path}: {state if look.parts_of(path) else 'nothing is complete yet'}"
-    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [verdict]), *notes])
+    if not look.parts_of(path):
+        state = "nothing is complete yet"
+    lines = faults or [f"{path}: {state}"]
+    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, lines + notes)
     if faults:
         raise typer.Exit(2)
 
@@ -410,19 +413,20 @@ def check(
     loaded = chosen = None
     if domain is not None:
         loaded = domains.load_domain(domain)
-        chosen = domains.settings_of("collect", domain, typed=settings.assigned(set_ or ()))
+        assigned = settings.assigned(set_ or ())
+        chosen = domains.settings_of("collect", domain, typed=assigned)
         checks.append(contracts.check_domain(loaded, chosen, seed=seed))
         observations = loaded.observation_shape, loaded.observation_dtype
-    if diversity is not None:
-        checks.append(contracts.check_objective(diversity))
-    if network is not None:
-        checks.append(contracts.check_network(network, *observations))
-    for name, check_it in ((view, contracts.check_view), (teacher, contracts.check_teacher)):
-        if name is not None:
-            checks.append(check_it(name, loaded, chosen, seed))
-    for setting, name in {"chooser": chooser, "network": learner, "termination": termination}.items():
-        if name is not None:
-            checks.append(contracts.check_part(setting, name, loaded, seed))
+    parts: list[Any] = [
+        (diversity, contracts.check_objective, ()),
+        (network, contracts.check_network, observations),
+        (view, contracts.check_view, (loaded, chosen, seed)),
+        (teacher, contracts.check_teacher, (loaded, chosen, seed)),
+        (chooser, functools.partial(contracts.check_part, "chooser"), (loaded, seed)),
+        (learner, functools.partial(contracts.check_part, "network"), (loaded, seed)),
+        (termination, functools.partial(contracts.check_part, "termination"), (loaded, seed)),
+    ]
+    checks += [check_it(name, *where) for name, check_it, where in parts if name is not None]
     if not checks:
         raise UserError("nothing to check", None, "Give a domain, or an option such as --network.")
     for verdict in itertools.chain(*checks):

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from examples.one_room import observed_pixel
 from hypogoal.core.processes import prepare
 from hypogoal.core.seeding import seed_for
-from hypogoal.domains.montezuma.collect import SEEN_NOWHERE
-from hypogoal.domains.montezuma.domain import DOMAIN
+from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import attributed, mean_state

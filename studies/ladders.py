@@ -27,8 +27,7 @@ from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
-from hypogoal.domains.montezuma.collect import SEEN_NOWHERE, MontezumaConfig
-from hypogoal.domains.montezuma.domain import DOMAIN
+from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE, MontezumaConfig
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.evaluation.house import above
 from hypogoal.hypotheses.config import EnsembleConfig

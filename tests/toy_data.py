@@ -1,7 +1,8 @@
 """A small data file in the real format, and manifests that somebody edited."""
 
+import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,14 @@ def write(path: Path, states: int = 7, domain: str = "toy", goals: tuple[str, ..
     return path
 
 
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file with a header."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
 def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
     """The files that a stage always writes, by its artefact's kind and settings, besides the manifest.
 
@@ -50,14 +59,16 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
 
 
 def untrained(folder: Path, domain: Any, members: int = 2, network: str = "montezuma", seed: int = 0) -> Path:
-    """An ensemble artefact of random weights for a domain's usual sub-goals."""
-    shape = domain.observation_shape
+    """An ensemble artefact of random weights for a domain's sub-goals, of Montezuma's for the paper's."""
+    shape, sub_goals = domain.observation_shape, list(domain.sub_goals)
+    if domain.name == "montezuma":
+        sub_goals = sub_goals[:1]
     config = {
-        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.usual_sub_goals), "members": members,
+        "domain": domain.name, "domain_config": {}, "sub_goals": sub_goals, "members": members,
         "network": network, "observation_shape": list(shape), "observation_dtype": "uint8", "view": "full",
     }  # fmt: skip
     with create(folder, kind="ensemble", config=config, seed=seed, inputs=[]) as draft:
-        for number, sub_goal in enumerate(domain.usual_sub_goals):
+        for number, sub_goal in enumerate(sub_goals):
             ensemble = Ensemble(network, shape, members, torch.Generator().manual_seed(number))
             write_ensemble(draft.files, sub_goal, ensemble)
         fill(draft.files, "ensemble", config)

@@ -14,7 +14,7 @@ from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.config import resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GET_MORE, Unmet, require_classes, write_dataset
+from hypogoal.data import GET_MORE, Collected, Unmet, require_classes, write_dataset
 from hypogoal.domains.base import Domain, Engine
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
@@ -28,10 +28,22 @@ def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, se
     Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
     (None: the defaults). ``seed`` is for both. A sub-goal that play does not reach is a warning.
     """
-    laws: list[Any] = [_Played.gymnasium] if domain.has_env else []
-    laws += [_Played.steps, _Played.two_engines, _Played.restore, _Played.collect]
-    config = config or resolve(domain.config_class, stage="collect")
-    return verdicts(laws, _Played(domain, config, layout_seed, seed))
+    laws = [
+        _Played.gymnasium,
+        _Played.steps,
+        _Played.two_engines,
+        _Played.restore,
+        _Played.collect,
+    ]
+    first = 0 if domain.has_env else 1
+    return verdicts(laws[first:], _Played(domain, config, layout_seed, seed))
+
+
+def collected(domain: Domain, config: Any, seed: int) -> Collected:
+    """States of a domain, collected with a config of its; None: with the defaults."""
+    settings = config or resolve(domain.config_class, stage="collect")
+    progress = Progress("check", total=1, quiet=True)
+    return domain.collect(settings, seed, progress)
 
 
 @dataclass
@@ -54,16 +66,14 @@ class _Played:
         elapsed = np.zeros(COUNT, int)
         seen = set()
         for shown in self.play(engine):
-            images, labels = engine.images(engine.ids), engine.labels(engine.ids)
-            _require_array("images", images, domain.observation_dtype, COUNT, *domain.observation_shape)
+            images = engine.images(engine.ids)
+            labels = engine.labels(engine.ids)
+            self.require_observations("images", images, COUNT)
             _require_array("labels", labels, np.bool_, COUNT, len(domain.sub_goals))
             elapsed += 1
             over = shown["terminated"] | shown["truncated"]
-            promise(
-                over[elapsed >= MAX_STEPS].all(),
-                "an episode went on after max_steps",
-                "Truncate it there.",
-            )
+            is_late = elapsed >= MAX_STEPS
+            promise(over[is_late].all(), "an episode went on after max_steps", "Truncate it there.")
             elapsed[over] = 0
             for image, row in zip(images, labels, strict=True):
                 seen.add((image.tobytes(), row.tobytes()))
@@ -75,7 +85,8 @@ class _Played:
 
     def two_engines(self) -> None:
         """Of the same layout seed: the same actions show the same."""
-        require_same(self.play(self.make_engine()), self.play(self.make_engine()), SEEDED)
+        first, second = self.make_engine(), self.make_engine()
+        require_same(self.play(first), self.play(second), SEEDED)
 
     def restore(self) -> str | None:
         """A restored engine goes on as the one whose snapshot it got."""
@@ -85,61 +96,77 @@ class _Played:
             return "not looked at"
         for _ in self.play(saved):
             pass
-        restored.restore(saved.snapshot())
+        snapshot = saved.snapshot()
+        restored.restore(snapshot)
         require_same(self.play(saved), self.play(restored), "Save all that the next steps need.")
         return None
 
     def collect(self) -> str:
         """Can be stored, fits the domain, the same file for the same seed, of both classes."""
-        domain, goals = self.domain, tuple(self.domain.usual_sub_goals)
-        progress = Progress("check", total=1, quiet=True)
+        domain = self.domain
         files = []
         with TemporaryDirectory() as folder:
             place = Path(folder, "data.h5")
             for _ in range(2):
                 try:
-                    collected = domain.collect(self.config, self.seed, progress)
+                    states = collected(domain, self.config, self.seed)
                 except Unmet as error:
                     warnings.warn(str(error), stacklevel=1)
                     return "not looked at: play did not reach the states"
-                write_dataset(place, collected, domain=domain.name, config={}, seed=self.seed)
+                write_dataset(place, states, domain=domain.name, config={}, seed=self.seed)
                 files.append(place.read_bytes())
         fault = f"states differ when collected again with seed {self.seed}"
         promise(files[0] == files[1], fault, SEEDED)
-        fault = f"sub_goals are {collected.sub_goals}, not {goals}"
-        promise(tuple(collected.sub_goals) == goals, fault, "Give the domain's, in their order.")
+        goals = tuple(states.sub_goals)
+        in_order = tuple(name for name in domain.sub_goals if name in goals)
+        do = f"Give the domain's, {domain.sub_goals}, in their order."
+        promise(goals == in_order, f"sub_goals are {goals}", do)
         for name in ("labelled", "unlabelled", "heldout"):
-            observations = getattr(collected, name).observations
+            observations = getattr(states, name).observations
             count = max(len(observations), 1)
-            _require_array(name, observations, domain.observation_dtype, count, *domain.observation_shape)
-        labels = collected.labelled.labels
+            self.require_observations(name, observations, count)
+        labels = states.labelled.labels
         require_classes(labels, goals, "collect", GET_MORE)
         return f"{len(labels)} labelled states, positives of each sub-goal: {labels.sum(0)}"
 
+    def require_observations(self, name: str, observations: Any, count: int) -> None:
+        """Refuse anything but so many of the domain's observations."""
+        domain = self.domain
+        _require_array(name, observations, domain.observation_dtype, count, *domain.observation_shape)
+
     def make_engine(self) -> Engine:
-        starts = self.domain.starts
-        arguments = {"start": starts[0], "memory": 10_000, "seed": self.seed} if starts else {}
+        arguments: dict[str, Any] = {}
+        if self.domain.starts:
+            arguments["start"] = self.domain.starts[0]
+            arguments["memory"] = 10_000
+            arguments["seed"] = self.seed
         return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **arguments)
 
     def play(self, engine: Engine) -> Iterator[dict[str, Any]]:
         """What an engine shows in each step, by name; the actions are random, the same at every call."""
-        for actions in rng_for(self.seed, "check").integers(engine.n_actions, size=(STEPS, COUNT)):
+        rng = rng_for(self.seed, "check")
+        for actions in rng.integers(engine.n_actions, size=(STEPS, COUNT)):
             step = engine.step(actions)
             _require_step(step)
             shown = step._asdict()
             ids = shown.pop("next_ids")
-            yield {**shown, "images": engine.images(ids), "labels": engine.labels(ids)}
+            shown["images"] = engine.images(ids)
+            shown["labels"] = engine.labels(ids)
+            yield shown
 
 
 def _require_step(step: Any) -> None:
     """Refuse a malformed step of an engine."""
+    do = f"Give a Step of arrays of length {COUNT}, of the types in hypogoal.domains.base.Step."
     for name, letters in STEP_KINDS.items():
-        values = np.asarray(getattr(step, name, None))
-        missing = name == "succeeded" and values.dtype == object  # None
+        value = getattr(step, name, None)
+        if name == "succeeded" and value is None:
+            continue
+        values = np.asarray(value)
         is_right = values.shape == (COUNT,) and values.dtype.kind in letters
-        do = f"Give a Step of arrays of length {COUNT}, of the types in hypogoal.domains.base.Step."
-        promise(missing or is_right, f"the engine's step gave {name} {values!r}", do)
-    promise(np.isfinite(step.rewards).all(), f"the engine's step gave {step.rewards}", "Give finite rewards.")
+        promise(is_right, f"the engine's step gave {name} {value!r}", do)
+    are_finite = np.isfinite(step.rewards).all()
+    promise(are_finite, f"the engine's step gave {step.rewards}", "Give finite rewards.")
 
 
 def require_same(first: Iterator[dict[str, Any]], second: Iterator[dict[str, Any]], do: str) -> None:
@@ -153,8 +180,4 @@ def _require_array(name: str, value: Any, dtype: Any, *shape: int) -> None:
     """Refuse anything but an array of this type and shape."""
     actual = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
     wanted = f"{np.dtype(dtype)} {shape}"
-    promise(
-        actual == wanted,
-        f"{name}: {actual} instead of {wanted}",
-        "Give a NumPy array of that type and shape.",
-    )
+    promise(actual == wanted, f"{name}: {actual} instead of {wanted}", "Give an array of that type and shape.")

@@ -12,6 +12,7 @@ import torch
 
 from hypogoal.check.domains import SEEDED, require_same
 from hypogoal.check.verdict import Verdict, promise, verdicts
+from hypogoal.core.arrays import Floats, Ints
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.domains.base import Domain, Engine, load_domain
 from hypogoal.meta.config import TrainMetaConfig
@@ -33,8 +34,14 @@ def check_part(setting: str, name: str, domain: Domain | None = None, seed: int 
     It is played for some steps, in DoorKey by default, beside built-in parts. Four options aim at made-up sub-goals,
     each of which holds in a third of the states.
     """
-    laws = [_PlayedPart.plays, _PlayedPart.again, _PlayedPart.resumes, _PlayedPart.is_kept]
-    return verdicts(laws, _PlayedPart(setting, name, domain or load_domain("doorkey"), seed))
+    part = _PlayedPart(setting, name, domain or load_domain("doorkey"), seed)
+    laws = [
+        _PlayedPart.plays,
+        _PlayedPart.again,
+        _PlayedPart.resumes,
+        _PlayedPart.is_kept,
+    ]
+    return verdicts(laws, part)
 
 
 @dataclass
@@ -48,14 +55,15 @@ class _PlayedPart:
 
     def plays(self) -> str:
         """Its answers are of the shapes, types and ranges that are asked for, at every step."""
-        loop = self.played()
-        if self.setting == "termination" and not any(loop.recorder.stops):
-            warnings.warn(f"no option reached its sub-goal in {loop.recorder.steps} steps", stacklevel=1)
-        return f"{loop.recorder.steps} steps"
+        recorder = self.played().recorder
+        if self.setting == "termination" and not any(recorder.stops):
+            warnings.warn(f"no option reached its sub-goal in {recorder.steps} steps", stacklevel=1)
+        return f"{recorder.steps} steps"
 
     def again(self) -> None:
         """Of the same seed: the same is played."""
-        require_same(_play(self.loop()), _play(self.loop()), SEEDED)
+        first, second = self.loop(), self.loop()
+        require_same(_play(first), _play(second), SEEDED)
 
     def resumes(self) -> str | None:
         """From a checkpoint it goes on as if there had been no break."""
@@ -74,14 +82,14 @@ class _PlayedPart:
 
     def is_kept(self) -> str:
         """What an artefact keeps of it, a fresh one loads."""
-        kept = self.part(self.played()).state()
-        state = {name: torch.as_tensor(values) for name, values in kept.items()}
+        part = self.part(self.played())
+        kept = {name: torch.as_tensor(values) for name, values in part.state().items()}
         fresh = self.part(self.loop())
-        fresh.load(state)
+        fresh.load(kept)
         for name, values in fresh.state().items():
-            is_same = torch.equal(torch.as_tensor(values), state[name])
+            is_same = torch.equal(torch.as_tensor(values), kept[name])
             promise(is_same, f"{name} is another one when loaded", "Give all in 'state' or 'weights', and load it.")
-        return f"{len(state)} arrays"
+        return f"{len(kept)} arrays"
 
     def played(self) -> OptionLoop:
         """It and other parts, after some steps."""
@@ -96,8 +104,10 @@ class _PlayedPart:
 
     def loop(self) -> OptionLoop:
         """It and other parts, fresh."""
-        config = TrainMetaConfig.of(**{**SMALL, "network": "light", "chooser": "random", self.setting: self.name})
-        return assemble(Setup(self.domain, SOURCE, Path(), config, self.seed), _made_up)
+        settings = {**SMALL, "network": "light", "chooser": "random", self.setting: self.name}
+        config = TrainMetaConfig.of(**settings)
+        setup = Setup(self.domain, SOURCE, Path(), config, self.seed)
+        return assemble(setup, _made_up)
 
 
 def _made_up(setup: Setup, engine: Engine) -> Terminations:
@@ -107,11 +117,12 @@ def _made_up(setup: Setup, engine: Engine) -> Terminations:
     if engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape)
     options = np.arange(1, 1 + setup.options)
-    return rule(
-        lambda ids: (8 * np.sin(ids[:, None] * options) - 4).astype(np.float32),
-        setup.options,
-        environments=engine.count,
-    )
+
+    def log_odds(ids: Ints) -> Floats:
+        waves = np.sin(ids[:, None] * options)
+        return (8 * waves - 4).astype(np.float32)
+
+    return rule(log_odds, setup.options, environments=engine.count)
 
 
 def _play(loop: OptionLoop) -> Iterator[dict[str, Any]]:

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from filelock import FileLock, Timeout, lock_descriptor
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from hypogoal.core.checkpoints import ANEW, Checkpoints
-from hypogoal.core.errors import Complete, UserError, reason
-from hypogoal.core.files import read_json, replace_text, sync
+from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.files import reading, replace_text, sync
 
 MANIFEST = "manifest.json"
 LOG = "metrics.jsonl"
@@ -134,12 +134,9 @@ def _fault(path: Path, digest: str) -> str:
 
 
 def _read_manifest(path: Path, do: str) -> Manifest:
-    content = read_json(path, "the manifest is", do)
-    try:
-        return Manifest.model_validate(content)
-    except ValidationError as error:
-        fault = f"the manifest is damaged, or of another version ({reason(error)})"
-        raise UserError(fault, path, do) from None
+    with reading(path, do, "the manifest"):
+        text = path.read_text(encoding="utf-8-sig")
+        return Manifest.model_validate_json(text)
 
 
 def open_artefact(path: Path, *kinds: str) -> Artefact:
@@ -348,14 +345,11 @@ def _manifest_of(out: Path) -> Manifest:
         return Artefact(out).manifest
     import h5py
 
-    try:
-        with h5py.File(out) as file:
-            domain = file.attrs["domain"]
-            name = domain if isinstance(domain, str) else domain.decode()
-            config = {**json.loads(file.attrs["config"]), "domain": name}
-            return Manifest(kind=DATA, config=config, seed=int(file.attrs["seed"]))
-    except Exception as error:  # noqa: BLE001 - whatever h5py makes of a damaged file
-        raise UserError(f"the data file is damaged ({error})", out, ANEW) from None
+    with reading(out, ANEW, "the data file"), h5py.File(out) as file:
+        domain = file.attrs["domain"]
+        name = domain if isinstance(domain, str) else domain.decode()
+        config = {**json.loads(file.attrs["config"]), "domain": name}
+        return Manifest(kind=DATA, config=config, seed=int(file.attrs["seed"]))
 
 
 def kind_of(out: Path) -> str | None:

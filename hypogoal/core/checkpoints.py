@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import replacing
+from hypogoal.core.files import reading, replacing
 
 State = dict[str, Any]
 
@@ -78,18 +78,14 @@ class Checkpoints:
 
     def load(self) -> State | None:
         """The saved state, or None. A damaged file is a ``UserError``."""
-        from safetensors import SafetensorError
         from safetensors.numpy import load_file
 
         if self.path is None or not self.path.is_file():
             return None
-        try:
+        with reading(self.path, ANEW, "the checkpoint"):
             arrays = load_file(self.path)
             text = arrays.pop(JSON_PART).tobytes()
-            state: State = json.loads(text, object_hook=partial(_with_array, arrays))
-        except (SafetensorError, KeyError, ValueError):
-            raise UserError("the checkpoint is damaged", self.path, ANEW) from None
-        return state
+            return json.loads(text, object_hook=partial(_with_array, arrays))
 
 
 def _without_array(arrays: dict[str, NDArray[Any]], value: Any) -> Any:

@@ -28,6 +28,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import reading
 
 C = TypeVar("C", bound="Config")
 Values: TypeAlias = Mapping[str, Any]  # of settings, by name
@@ -146,14 +147,12 @@ def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]
     if not folder.is_dir():
         folder = PRESETS / DOMAIN
     path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
+    if not path.exists():
         names = sorted(file.stem for file in folder.iterdir())
-        do = f"Choose one of {', '.join(names)}, or give a .toml file."
-        raise UserError("no such preset", name, do) from None
-    except (OSError, ValueError) as error:
-        raise UserError(f"the preset cannot be read ({error})", name, "Mend the file.") from None
+        raise UserError("no such preset", name, f"Choose one of {', '.join(names)}, or give a .toml file.")
+    with reading(path, "Mend the file.", "the preset"):
+        text = path.read_text(encoding="utf-8-sig")
+        tables = tomllib.loads(text)
     for key, table in tables.items():
         if key not in TABLES or not isinstance(table, dict):
             do = f"A preset has tables for {', '.join(TABLES)}."
@@ -221,12 +220,6 @@ def as_toml(stage: str, rows: Iterable[Values]) -> str:
         value = json.dumps(row["default"], ensure_ascii=False)
         lines.append(f"{row['name']} = {value}  # {row['meaning']}")
     return "\n".join(lines) + "\n"
-
-
-def near(word: str, candidates: Iterable[str]) -> str:
-    """'Did you mean ...?' if a candidate is like ``word``; else empty."""
-    close = difflib.get_close_matches(word, [*candidates], n=1)
-    return f"Did you mean {close[0]!r}? " if close else ""
 
 
 def _typed(raw: Any, kind: Any) -> Any:
@@ -299,4 +292,6 @@ def _refusal(model: type[Config], whole: type[Config], error: ValidationError, s
         return UserError(fault["msg"].removeprefix("Value error, "), where, do)
     if name in whole.model_fields:
         return UserError(f"{stage} has this setting only beside another choice", name, advice)
-    return UserError(f"{stage} has no setting", name, f"{near(name, whole.model_fields)}{advice}")
+    for close in difflib.get_close_matches(name, [*whole.model_fields], n=1):
+        advice = f"Did you mean {close!r}? {advice}"
+    return UserError(f"{stage} has no setting", name, advice)

@@ -1,17 +1,16 @@
 """Small files. What cannot be read is a ``UserError``; what is written has its name once it is whole and on the disk.
 
-``subject`` begins a message, with its verb ("the weights are"); ``do`` is what to do.
+``subject`` begins a message ("the weights"); ``do`` is what to do.
 """
 
 import contextlib
-import csv
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import UserError, reason
 
 NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
 POINTER = b"version https://git-lfs"  # how a file begins that Git LFS has not fetched
@@ -33,7 +32,7 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
     except IsADirectoryError:
         raise UserError(f"{subject} is a directory", path, do) from None
     except Exception as error:  # noqa: BLE001 - libraries raise what they like
-        fault = f"{subject} cannot be read ({type(error).__name__}: {error})"[:250]
+        fault = f"{subject} cannot be read ({type(error).__name__}: {reason(error)})"[:250]
         if "h5clear" in fault:
             do = f"If no program writes it any more, one has crashed: h5clear -s {path}"
         elif "unable to lock" in fault:
@@ -41,22 +40,6 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
         elif path.is_file() and path.read_bytes().startswith(POINTER):
             fault, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
         raise UserError(fault, path, do) from None
-
-
-def read_text(path: Path, subject: str, do: str) -> str:
-    """The text of a file in UTF-8, with or without a byte order mark, with line feeds as line ends."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{subject} not readable ({error})", path, do) from None
-
-
-def read_json(path: Path, subject: str, do: str) -> Any:
-    """The contents of a JSON file."""
-    try:
-        return json.loads(read_text(path, subject, do))
-    except ValueError as error:
-        raise UserError(f"{subject} not valid JSON ({error})", path, do) from None
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -97,14 +80,6 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file with a header."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
 
 
 def plain_name(name: str) -> bool:

@@ -14,14 +14,16 @@ if TYPE_CHECKING:
 def _sequence(seed: int, names: tuple[str | int, ...]) -> np.random.SeedSequence:
     keys = [int(seed)]
     for name in names:
-        key = zlib.crc32(name.encode()) if isinstance(name, str) else name
-        keys.append(int(key))
+        if isinstance(name, str):
+            name = zlib.crc32(name.encode())
+        keys.append(int(name))
     return np.random.SeedSequence(keys)
 
 
 def seed_for(seed: int, *names: str | int) -> int:
     """A 63-bit seed for the stream called ``names`` of run ``seed``."""
-    state = _sequence(seed, names).generate_state(1, np.uint64)
+    sequence = _sequence(seed, names)
+    state = sequence.generate_state(1, np.uint64)
     return int(state[0] >> 1)
 
 
@@ -36,5 +38,4 @@ def torch_generator(seed: int, *names: str | int) -> torch.Generator:
     import torch
 
     generator = torch.Generator()
-    generator.manual_seed(seed_for(seed, *names))
-    return generator
+    return generator.manual_seed(seed_for(seed, *names))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.files import reading
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -31,14 +32,10 @@ def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
     """Read tensors by name. A file that is missing, cut or not safetensors is a ``UserError``."""
-    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    try:
-        tensors: dict[str, Tensor] = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"the weights cannot be read ({error})", path, AGAIN) from None
-    return tensors
+    with reading(path, AGAIN, "the weights"):
+        return load_file(path)
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

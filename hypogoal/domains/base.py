@@ -197,45 +197,67 @@ class TurnEngine(Engine):
 
     Attributes:
         room: the number of states, besides start states, of which it keeps what it saw.
+        width: of how many bytes the facts are that it keeps of every state.
     """
 
     restarts = resumes = True
     room: int
-    _ring: list[Any]
+    width: int
+
+    def __init__(self) -> None:
+        self._seen: dict[int, Any] = {}  # by state, in order
+        self._facts = bytearray()
+
+    @property
+    def n_states(self) -> int:
+        return len(self._facts) // self.width
 
     @property
     def oldest(self) -> int:
-        return self.n_states - len(self._ring)
+        return max(len(self.starts), self.n_states - self.room)
 
-    def _keep(self, state: int, seen: Any) -> None:
-        """Keep what was seen in a new state, in place of the oldest if the ring is full."""
-        if len(self._ring) < self.room:
-            self._ring.append(seen)
-        else:
-            self._ring[self._place(state)] = seen
+    def _add(self, seen: Any, facts: NDArray[Any]) -> int:
+        """Keep what was seen in a new state, and its facts; returns its id."""
+        state = self.n_states
+        self._seen[state] = seen
+        self._facts += facts.tobytes()
+        forgotten = state - self.room
+        if forgotten >= len(self.starts):
+            del self._seen[forgotten]
+        return state
 
-    def _place(self, state: int) -> int:
-        """A state's place in the ring."""
-        return (state - len(self.starts)) % self.room
+    def facts_of(self, ids: Ints) -> Bytes:
+        """The facts of states, uint8 (n, ``width``), also of forgotten ones."""
+        every = np.frombuffer(self._facts, np.uint8)
+        return every.reshape(-1, self.width)[ids]
 
-    def _kept(self, ids: Ints) -> list[int]:
-        """The ids; ``ValueError`` if one is unknown or forgotten."""
-        kept = self.remembers(ids) & (ids >= 0) & (ids < self.n_states)
-        if not kept.all():
-            raise ValueError(f"state {ids[~kept][0]} is forgotten or unknown; the oldest kept is {self.oldest}")
-        return ids.tolist()
+    def images(self, ids: Ints) -> Observations:
+        """See ``Engine``; ``ValueError`` if a state is unknown or forgotten."""
+        images = np.empty((len(ids), *self.observation_shape), self.observation_dtype)
+        for row, state in enumerate(ids.tolist()):
+            if state not in self._seen:
+                raise ValueError(f"state {state} is forgotten or unknown; the oldest kept is {self.oldest}")
+            images[row] = self._image(self._seen[state])
+        return images
 
-    def _room_for(self, count: int) -> Observations:
-        """An array for ``count`` observations."""
-        return np.empty((count, *self.observation_shape), self.observation_dtype)
+    def _image(self, seen: Any) -> Any:
+        """The observation of what was seen."""
+        return seen
+
+    def snapshot(self) -> dict[str, Any]:
+        return {**super().snapshot(), "facts": np.frombuffer(self._facts, np.uint8).copy()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        super().restore(snapshot)
+        self._facts = bytearray(snapshot["facts"].tobytes())
 
     @abstractmethod
     def _begin(self, number: int) -> int:
         """Begin an episode in one environment; returns the start state."""
 
     @abstractmethod
-    def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
-        """Step ``elapsed`` of one environment's episode: state, reward, terminated, truncated."""
+    def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
+        """Step ``elapsed`` of one environment's episode: what a :class:`Step` says of it."""
 
     def restart(self, where: Bools) -> None:
         self.ids, self.elapsed = self.ids.copy(), np.where(where, 0, self.elapsed)
@@ -249,13 +271,13 @@ class TurnEngine(Engine):
         for number, action in enumerate(actions.tolist()):
             outcome = self._play(number, action, elapsed[number])
             outcomes.append(outcome)
-            state, _reward, terminated, truncated = outcome
+            state, _reward, terminated, truncated, *_ = outcome
             if terminated or truncated:
                 state, elapsed[number] = self._begin(number), 0
             ids.append(state)
         self.ids, self.elapsed = np.array(ids), np.array(elapsed)
-        following, rewards, terminated_all, truncated_all = map(np.array, zip(*outcomes, strict=True))
-        return Step(following, rewards.astype(np.float32), terminated_all, truncated_all)
+        following, rewards, *others = map(np.array, zip(*outcomes, strict=True))
+        return Step(following, rewards.astype(np.float32), *others)
 
 
 class Domain(ABC):
@@ -265,8 +287,7 @@ class Domain(ABC):
 
     Attributes:
         name: for messages.
-        sub_goals: their names (G).
-        usual_sub_goals: those that ``collect`` labels by default; all, if it labels all.
+        sub_goals: their names (G); ``collect`` may label some of them.
         config_class: the settings of ``collect``, a ``Config`` of ``core.config.setting`` fields.
         engine_settings: the names of the settings that define the world; later stages play with them too.
         defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
@@ -288,10 +309,6 @@ class Domain(ABC):
     many_layouts = False
     measures = pictures = False
     near = 0
-
-    @property
-    def usual_sub_goals(self) -> tuple[str, ...]:
-        return self.sub_goals
 
     @property
     @abstractmethod
@@ -345,10 +362,6 @@ class Domain(ABC):
         """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
         raise NotImplementedError
 
-    def rooms_of(self, start: str) -> tuple[int, ...]:
-        """The rooms to draw for a start."""
-        return ()
-
     def picture(self, room: int) -> Bytes:
         """A picture of a room, uint8 (height, width, 3); needs ``pictures``."""
         raise NotImplementedError
@@ -365,13 +378,11 @@ def load_domain(name: str) -> Domain:
     ``UserError``. What a domain of one's own has as defaults, such as a network, may be loaded with it.
     """
     name = "rooms" if name == "which-feature" else name  # so called in files of 0.23
-    try:
-        domain = REGISTERED.get(name) or own_code.load(name, "domain", ENTRY_POINTS, BUILT_IN)
-    except UserError:
-        if name != IMPORTED:
-            raise
+    domain = REGISTERED.get(name)
+    if domain is None and name == IMPORTED:
         do = f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file."
-        raise UserError("the domain of these imported states is not known", name, do) from None
+        raise UserError("the domain of these imported states is not known", name, do)
+    domain = domain or own_code.load(name, "domain", ENTRY_POINTS, BUILT_IN)
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "Derive it from hypogoal.domains.base.Domain.")
     for settings in domain.defaults.values():

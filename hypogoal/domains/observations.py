@@ -74,24 +74,20 @@ def channels_first(shape: Shape) -> bool:
 
 def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
     """The axes that make bytes of two axes or more a picture, and its shape; no axes if it would be refused again."""
-    if len(shape) == 2:
-        return (0, 1), (*shape, 1)
     if len(shape) == 3 and not channels_first(shape):
         return (0, 1, 2), shape
-    pairs = list(pairwise(shape))
     # The longest two neighbours are height and width; among equals the second pair.
-    shorter = [min(pair) for pair in pairs]
+    shorter = [min(pair) for pair in pairwise(shape)]
     height = max(
-        range(len(pairs)),
+        range(len(shorter)),
         key=lambda axis: (shorter[axis], axis == 1),
     )
     width = height + 1
     sides_at = (height, width)
     others = [axis for axis in range(len(shape)) if axis not in sides_at]
     others.sort(key=lambda axis: shape[axis] in (1, 3))  # colours last
-    pixels = shape[height] * shape[width]
-    channels = prod(shape) // pixels
-    target = (shape[height], shape[width], channels)
+    channels = prod(shape[axis] for axis in others)
+    target = (*shape[height : width + 1], channels)
     if channels_first(target):
         return (), shape
     return (height, width, *others), target

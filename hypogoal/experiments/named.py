@@ -3,7 +3,7 @@
 import inspect
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,8 @@ from pydantic import Field
 from hypogoal.cells import Value
 from hypogoal.core import own_code
 from hypogoal.core.config import DOMAIN, MODELS, STAGES, Config, model_of
-from hypogoal.core.errors import UserError, reason
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import reading
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.experiment import Command, Experiment, RunConfig, experiment, run_config
 
@@ -87,26 +88,19 @@ class File(RunConfig):
 
 def read_toml(path: Path) -> Experiment:
     """The experiment in a TOML file; a ``UserError`` where there is none."""
-    with _readable(path):
-        file = File.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
+    readable = partial(reading, path, "Mend the file, see docs/formats.md.", "the experiment")
+    with readable():
+        text = path.read_text(encoding="utf-8-sig")
+        file = File.model_validate(tomllib.loads(text))
         fields: dict[str, Any] = {}
         for name, axis in file.axes.items():
             kind: Any = int if isinstance(axis, str) else type(axis[0])
             fields[name] = (tuple[kind, ...], ())
         model = run_config(fields)
 
-    @_readable(path)
+    @readable()
     def commands(**axes: Any) -> list[Command]:
         return [*file.commands(axes)]
 
     defaults = {"workers": file.workers, "evaluate": file.evaluate, **file.axes}
     return Experiment(commands, [*fields], model, given=defaults)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ValueError, LookupError, NameError, AttributeError) as error:
-        problem = f"the experiment cannot be read ({reason(error)})"
-        raise UserError(problem, path, "Mend the file, see docs/formats.md.") from None

@@ -80,13 +80,20 @@ def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any])
             for word in shlex.split(text):
                 if output := OUTPUT.match(word):
                     option, other = output.groups()
-                    needs.append(cells[other].place)
-                    word = f"{option}{HERE}/{needs[-1]}"
+                    place = cells[other].place
+                    needs.append(place)
+                    word = f"{option}{HERE}/{place}"
                 words.append(word)
             domain = domains[needs[0]] if needs else DOMAIN
             words, domain = completed(words, domain)
-            waits = [cells[other].place for other in after]
-            cell = Cell(name=name, words=words, needs=needs, after=waits, columns=dict(columns), run=run)
+            cell = Cell(
+                name=name,
+                words=words,
+                needs=needs,
+                after=[cells[other].place for other in after],
+                columns=dict(columns),
+                run=run,
+            )
         except UserError as error:
             error.add_note(f"in the command {command[0]}")
             raise

@@ -11,8 +11,7 @@ from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, Labels, States, doubts_of, require_classes
 from hypogoal.importing.episodes import HELDOUT, LABELLED, ROLES, UNLABELLED
-from hypogoal.importing.states import Frames
-from hypogoal.importing.taken import together
+from hypogoal.importing.states import Frames, together
 from hypogoal.observations import digest, packed
 
 ROW = "row"  # the origin of each state: its place in its set
@@ -85,7 +84,8 @@ def with_roles(table: pd.DataFrame, seed: int) -> pd.DataFrame:
         return table
     is_missing = ~np.isin(ROLES, table["role"])
     shares = np.cumsum(SPLIT * is_missing)
-    ends = np.round(shares[:2] / shares[2] * len(episodes))
+    whole = shares / shares[2]
+    ends = np.round(whole[:2] * len(episodes))
     order = rng_for(seed, "minari").permutation(len(episodes))
     place = np.argsort(order)[number_of]
     role_of = np.searchsorted(ends, place, side="right")

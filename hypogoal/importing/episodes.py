@@ -1,7 +1,10 @@
-"""What every reader yields, whatever it reads."""
+"""What every reader yields, whatever it reads, and the files that there are to read."""
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from glob import iglob
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from numpy.typing import NDArray
@@ -30,3 +33,21 @@ class Episode:
     columns: Mapping[str, Array]
     role: str = ""
     group: str | Array = ""
+
+
+def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> list[Path]:
+    """The visible files with these suffixes in a folder and those below it, sorted, links followed.
+
+    ``left`` counts the others by suffix.
+    """
+    taken = []
+    for name in iglob("**/*", root_dir=folder, recursive=True):
+        file = folder / name
+        suffix = file.suffix.lower()
+        if file.is_dir():
+            continue
+        if suffix in suffixes:
+            taken.append(file)
+        else:
+            left[suffix or file.name] += 1
+    return sorted(taken)

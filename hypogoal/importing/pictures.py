@@ -18,8 +18,7 @@ import PIL.ImageOps
 
 from hypogoal.core.files import reading
 from hypogoal.data import Integers
-from hypogoal.importing.episodes import HELDOUT, LABELLED, UNLABELLED, Array, Episode
-from hypogoal.importing.files import files_of
+from hypogoal.importing.episodes import HELDOUT, LABELLED, UNLABELLED, Array, Episode, files_of
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP", "TIFF", "PPM", "AVIF")  # for PostScript, Pillow runs a program
 SUFFIXES = {".mpo"}  # that is JPEG

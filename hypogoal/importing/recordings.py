@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hypogoal.data import opened
-from hypogoal.importing.episodes import HELDOUT, Array, Episode
-from hypogoal.importing.files import files_of
+from hypogoal.importing.episodes import HELDOUT, Array, Episode, files_of
 from hypogoal.importing.films import SUFFIXES, count_frames, frames_in
 from hypogoal.importing.lerobot import INFO, read_lerobot
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_text, replacing
+from hypogoal.core.files import reading, replacing
 from hypogoal.learners.episodes import LAST
 
 MAX_INTEGER = 2**53  # integers that a float holds exactly
@@ -131,12 +130,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, Do
     """
     from pandas import read_csv
 
-    text = io.StringIO(read_text(path, "the table is", AGAIN))
-    try:
-        frame = read_csv(text, dtype=str)
+    with reading(path, AGAIN, "the table"):
+        frame = read_csv(path, dtype=str, encoding="utf-8-sig")
         frame = frame[[*(columns or frame)]].astype(np.float64)
-    except (ValueError, KeyError):
-        raise UserError("the table is damaged", path, AGAIN) from None
     for name, values in frame.items():
         exact = values.abs() < MAX_INTEGER  # no NaN, and an integer that has not lost digits
         if name in BLANK:

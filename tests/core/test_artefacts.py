@@ -162,7 +162,7 @@ def test_other_versions_and_damaged_drafts_are_not_continued(tmp_path: Path, mon
         with pytest.raises(UserError, match="begun with torch="):
             finish(out, resume=True)
     begun = Draft(out).begun.read_text()
-    for text, words in (("{", "not valid JSON"), ('{"identity": {}}', "kind: Field required")):
+    for text, words in (("{", "the manifest cannot be read"), ('{"identity": {}}', "kind: Field required")):
         Draft(out).begun.write_text(text)
         with pytest.raises(UserError, match=words):
             finish(out, resume=True)

@@ -20,10 +20,11 @@ from hypogoal.domains.montezuma.emulator import (
     RIGHT,
     UP,
     Emulator,
+    stacked,
 )
 from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MontezumaLadder, arrives, make_starts
-from hypogoal.domains.montezuma.ladders import BASES, distance_to, place_of
+from hypogoal.domains.montezuma.ladders import BASES, distance_to
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 
 pytestmark = pytest.mark.atari
@@ -60,24 +61,23 @@ def busy(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.int64]:
 def test_start_states_are_at_the_top_and_live(emulator: Emulator, name: str) -> None:
     """Spec D4: distinct pictures of the top, alive, from each of which the scripted descent gets to the base."""
     ladder = BEGINNINGS[name]
-    starts = make_starts(emulator, ladder, 6, seed=0)
-    assert len({start.snapshot.stack.tobytes() for start in starts}) == 6
+    starts = make_starts(emulator, name, 6, seed=0)
+    assert len({stacked(start.seen).tobytes() for start in starts}) == 6
     for start in starts:
-        assert start.facts[:3] == ladder.at
-        emulator.restore(start.snapshot)
+        emulator.restore(start)
         assert emulator.position() == ladder.at
         assert emulator.alive()
         assert arrives(emulator, ladder)
-        assert place_of(np.array([emulator.position()]), BASES) >= 0
+        assert CLIMB_DOWN.at(emulator.facts()[None]) >= 0
 
 
 def test_start_states_that_cannot_be(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2: too few phases to live from, or no state at all, is one clear line."""
     with pytest.raises(UserError, match="only 0 of 0 start states"):
-        make_starts(emulator, BEGINNINGS["1L"], 0, seed=0)
+        make_starts(emulator, "1L", 0, seed=0)
     monkeypatch.setattr(montezuma_env, "PHASES", range(2, 5))
     with pytest.raises(UserError, match=r"only 3 of 4 start states survive the script: 1L\. Ask for fewer"):
-        make_starts(emulator, BEGINNINGS["1L"], 4, seed=0)
+        make_starts(emulator, "1L", 4, seed=0)
 
 
 # The environment
@@ -112,7 +112,7 @@ def test_an_episode_of_the_environment(env: MontezumaLadder) -> None:
 
 def test_start_states_are_drawn_or_asked_for(env: MontezumaLadder) -> None:
     """Spec D4: reset with a seed repeats, without draws all of them, and one can be asked for by number."""
-    looks = {start.snapshot.stack.tobytes(): number for number, start in enumerate(env.starts)}
+    looks = {stacked(start.seen).tobytes(): number for number, start in enumerate(env.starts)}
     drawn = [looks[env.reset(seed=seed)[0].tobytes()] for seed in (5, 5)]
     assert drawn[0] == drawn[1]
     assert {looks[env.reset()[0].tobytes()] for _ in range(40)} == set(range(STARTS))
@@ -163,7 +163,7 @@ def test_ids_images_and_positions(engine: MontezumaEngine) -> None:
     assert contract.observation_shape == OBSERVATION_SHAPE
     assert set(engine.reset()) <= set(range(STARTS))
     starts = engine.images(np.arange(STARTS))
-    assert np.array_equal(starts, np.stack([start.snapshot.stack for start in engine.starts]))
+    assert np.array_equal(starts, np.stack([stacked(start.seen) for start in engine.starts]))
     assert engine.positions(np.arange(STARTS)).tolist() == [[1, 21, 192]] * STARTS
     before, first = engine.ids, engine.n_states
     shown = [engine.images(before)]
@@ -189,10 +189,12 @@ def test_old_states_are_forgotten() -> None:
     """Images of the newest ``memory`` states and of the start states are kept; positions and labels of all."""
     engine = MontezumaEngine("1L", 2, start_states=2, memory=20)
     shown, positions = [engine.images(np.arange(2))], [engine.positions(np.arange(2))]
+    known = [engine.facts_of(np.arange(2))]
     for number in range(40):
         step = engine.step(np.array([DOWN, UP] if number < 9 else [NOOP, DOWN]))
         shown.append(engine.images(step.next_ids))
         positions.append(engine.positions(step.next_ids))
+        known.append(engine.facts_of(step.next_ids))
         assert engine.oldest == max(2, engine.n_states - 20)
     images = np.concatenate(shown)
     for keep in (np.arange(2), np.arange(engine.oldest, engine.n_states)):
@@ -202,7 +204,7 @@ def test_old_states_are_forgotten() -> None:
         engine.images(np.array([0, engine.oldest - 1]))
     everything = np.arange(engine.n_states)
     assert np.array_equal(engine.positions(everything), np.concatenate(positions))
-    assert np.array_equal(engine.labels(everything)[:, 0], place_of(np.concatenate(positions), BASES) >= 0)
+    assert np.array_equal(engine.labels(everything)[:, 0], CLIMB_DOWN.at(np.concatenate(known)) >= 0)
     assert engine.labels(everything)[:, 0].sum() >= 1
 
 
@@ -266,7 +268,7 @@ def test_snapshots_are_exact() -> None:
         resumed.restore(snapshot)
         assert (resumed.n_states, resumed.oldest) == (kept[-1] + 1, kept[0])
         assert np.array_equal(resumed.images(kept), images)
-        for name in ("known", "frames", "stacks", "screens"):
+        for name in ("facts", "frames", "stacks"):
             snapshot[name].fill(0)  # the engine has its own copies
         assert all(np.array_equal(a, b) for a, b in zip(played(resumed, actions[begin:end]), expected, strict=True))
         everything = np.arange(unbroken.n_states)

@@ -23,7 +23,6 @@ from hypogoal.domains.montezuma.ladders import (
     SHAFT_ENTRY,
     SHAFT_EXIT,
     distance_to,
-    place_of,
     plane,
 )
 
@@ -86,16 +85,6 @@ def test_walls_are_where_they_are(emulator: Emulator) -> None:
             assert crosses(emulator, left + 1, 8, LEFT) == ((left, left + 1) not in WALLS), left
     for left, _ in WALLS:
         assert not crosses(emulator, left, 146, RIGHT)
-
-
-def test_at_a_place() -> None:
-    """Spec B4: within 2 in x and in y, in the place's own room; which place it is."""
-    positions = [(1, 21, 148), (1, 23, 146), (1, 24, 148), (1, 21, 151), (2, 21, 148), (1, 77, 235), (6, 76, 237)]
-    at = place_of(np.array(positions), BASES)
-    names = [LADDERS[index].name if index >= 0 else "" for index in at]
-    assert names == ["1L", "1L", "", "", "", "", "2-6"]
-    assert place_of(np.array(positions, np.uint8), BASES).tolist() == at.tolist()
-    assert place_of(np.zeros((0, 3), np.int64), BASES).shape == (0,)
 
 
 def test_distances_worked_by_hand() -> None:

@@ -1,24 +1,26 @@
 """Sub-goals of Montezuma's Revenge beyond the paper's: labels are compared with what the emulator forces."""
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hypogoal.core.progress import Progress
-from hypogoal.domains.montezuma.collect import MontezumaConfig, labelled_rooms, unlabelled_rooms
-from hypogoal.domains.montezuma.domain import DOMAIN
-from hypogoal.domains.montezuma.emulator import DOWN, LEFT, NOOP, SPRITE_TOP, UP, Emulator
-from hypogoal.domains.montezuma.env import BEGINNINGS, CLIMBED_UP, arrives, make_starts
-from hypogoal.domains.montezuma.ladders import LADDERS, TOPS, Ladder
-from hypogoal.domains.montezuma.sub_goals import ENEMIES, GATES, LASER_Y, SUB_GOALS, Enemy, facts_of, labels_of
+from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig, rooms_of
+from hypogoal.domains.montezuma.emulator import DOWN, FACTS, LEFT, NOOP, SPRITE_TOP, UP, Emulator
+from hypogoal.domains.montezuma.env import BEGINNINGS, arrives, make_starts
+from hypogoal.domains.montezuma.ladders import BASES, LADDERS, TOPS, Ladder
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ENEMIES, GATES, LASER_Y, SUB_GOALS, labels_of
 from hypogoal.evaluation.nearness import distances_of
 
 pytestmark = pytest.mark.atari
 
 PHASES = range(2, 254, 42)  # six
 LEFT_FIRE = 12
-MOVING = [enemy for enemy in ENEMIES if enemy.byte]
+ENEMY = [SimpleNamespace(**{"byte": "", **enemy}) for enemy in ENEMIES]
+MOVING = [enemy for enemy in ENEMY if enemy.byte]
+CLIMBED_UP = [ladder for ladder in LADDERS if ladder.steps_up]
 TINY = MontezumaConfig(states_per_room=40, unlabelled_per_room=8, heldout_per_room=6, workers=1)
 
 
@@ -29,9 +31,19 @@ def emulator() -> Emulator:
 
 def holding(emulator: Emulator) -> set[str]:
     """The sub-goals that hold now, by the console's memory."""
-    facts = facts_of(emulator.ram()[None])
-    labels = labels_of(facts, np.array([emulator.alive()]), SUB_GOALS.values())[0]
+    [labels] = labels_of(emulator.facts()[None], SUB_GOALS.values())
     return {name for name, holds in zip(SUB_GOALS, labels, strict=True) if holds}
+
+
+def test_at_a_place() -> None:
+    """Spec B4: within 2 in x and in y, in the place's own room; which place it is."""
+    positions = [(1, 21, 148), (1, 23, 146), (1, 24, 148), (1, 21, 151), (2, 21, 148), (1, 77, 235), (6, 76, 237)]
+    facts = np.zeros((len(positions), len(FACTS)), np.uint8)
+    facts[:, :3] = positions
+    at = CLIMB_DOWN.at(facts)
+    names = [LADDERS[index].name if index >= 0 else "" for index in at]
+    assert names == ["1L", "1L", "", "", "", "", "2-6"]
+    assert CLIMB_DOWN.at(facts[:0]).shape == (0,) and CLIMB_DOWN.places == BASES
 
 
 @pytest.mark.parametrize("ladder", CLIMBED_UP, ids=lambda ladder: ladder.name)
@@ -56,14 +68,14 @@ def test_every_ladder_is_climbed_up(emulator: Emulator, ladder: Ladder) -> None:
     assert lived >= 2
 
 
-def moved(emulator: Emulator, enemy: Enemy) -> Iterator[tuple[int, int, int]]:
+def moved(emulator: Emulator, enemy: SimpleNamespace) -> Iterator[tuple[int, int, int]]:
     """The byte of an enemy's x, and the first and last column of what moves on its floor, while the agent is aside."""
     aside = (21, 192) if enemy.room == 1 else (146, 235)
     assert emulator.place(enemy.room, *aside) is not None
     shots, at = [], []
     while len(shots) < 60 and emulator.alive():
         emulator.frames(NOOP, 4)
-        shots.append(emulator.screen_rgb())
+        shots.append(emulator.ale.getScreenRGB())
         at.append(emulator.read(enemy.byte))
     floor = SPRITE_TOP - enemy.y
     moving = (np.array(shots) != np.median(shots, axis=0)).any(3)[:, floor : floor + 17, 8:130].any(1)
@@ -72,7 +84,7 @@ def moved(emulator: Emulator, enemy: Enemy) -> Iterator[tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("enemy", MOVING, ids=lambda enemy: str(enemy.room))
-def test_an_enemy_is_drawn_where_its_byte_says(emulator: Emulator, enemy: Enemy) -> None:
+def test_an_enemy_is_drawn_where_its_byte_says(emulator: Emulator, enemy: SimpleNamespace) -> None:
     """The middle of what moves lies in the middle of the x at which an agent, drawn from x - 1 to x + 6, is past."""
     seen = [(byte, (first + last) / 2) for byte, first, last in moved(emulator, enemy) if last - first < 25 and last]
     assert len(seen) >= 20
@@ -80,8 +92,8 @@ def test_an_enemy_is_drawn_where_its_byte_says(emulator: Emulator, enemy: Enemy)
         assert abs(middle - (byte + (enemy.left + enemy.right) / 2 + 2.5)) <= 5, (byte, middle)
 
 
-@pytest.mark.parametrize("enemy", [enemy for enemy in ENEMIES if not enemy.byte], ids=lambda enemy: str(enemy.room))
-def test_snakes_kill_between_both_sides(emulator: Emulator, enemy: Enemy) -> None:
+@pytest.mark.parametrize("enemy", [enemy for enemy in ENEMY if not enemy.byte], ids=lambda enemy: str(enemy.room))
+def test_snakes_kill_between_both_sides(emulator: Emulator, enemy: SimpleNamespace) -> None:
     """An agent lives where it is past a snake, and dies at some x in between."""
     lives = {x: emulator.place(enemy.room, x, enemy.y) is not None for x in range(enemy.ends[0], enemy.ends[1] + 1)}
     between = [x for x in lives if enemy.left <= x <= enemy.right]
@@ -127,8 +139,8 @@ def test_each_sub_goal_is_collected_alone(name: str) -> None:
     goal = SUB_GOALS[name]
     clear = {place.room for index, place in enumerate(goal.places) if index not in goal.unclear}
     assert rooms <= clear and len(rooms) >= len(clear) / 2
-    unlabelled = unlabelled_rooms(config)
-    assert not set(unlabelled) & set(labelled_rooms(config))
+    labelled, unlabelled = rooms_of(config)
+    assert not {*unlabelled} & {*labelled}
     assert [room in {place.room for place in goal.places} for room in unlabelled] == [True, False]
 
 
@@ -136,11 +148,11 @@ def test_each_sub_goal_is_collected_alone(name: str) -> None:
 def test_every_beginning_has_start_states(name: str) -> None:
     """Alive where the beginning is, with a script that arrives; a new game is the game's, without a torch."""
     emulator, beginning = Emulator(), BEGINNINGS[name]
-    for start in make_starts(emulator, beginning, 2, seed=0):
-        emulator.restore(start.snapshot)
-        assert emulator.position() == beginning.at and start.facts[:3] == beginning.at
+    for start in make_starts(emulator, name, 2, seed=0):
+        emulator.restore(start)
+        assert emulator.position() == beginning.at
         assert arrives(emulator, beginning)
-        emulator.restore(start.snapshot)
+        emulator.restore(start)
         assert (emulator.read("inventory") == 0) == (name == "game")
 
 

@@ -16,7 +16,7 @@ from test_numbers import Says
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.gymnasium.reader import reader_of
-from hypogoal.importing.taken import take
+from hypogoal.importing.states import take
 from hypogoal.observations import PICTURE
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"

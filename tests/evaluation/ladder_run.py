@@ -4,10 +4,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-from toy_data import fill
+from toy_data import fill, write_table
 
 from hypogoal.core.artefacts import create
-from hypogoal.core.files import write_table
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.domains.base import Domain
@@ -39,9 +38,6 @@ class LadderDomain(Domain):
 
     def make_engine(self, layout_seed, count, max_steps, **arguments):
         raise NotImplementedError
-
-    def rooms_of(self, start):
-        return {"1L": (1,), "2-6": (2, 6)}[start]
 
     def picture(self, room):
         return np.full((210, 160, 3), 5 * room, np.uint8)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from ladder_run import COLUMNS, executions
 from made_up import figures, results_of, row, shown
+from toy_data import write_table
 
-from hypogoal.core.files import write_table
 from hypogoal.evaluation import distance
 from hypogoal.evaluation.distance import BEST, WORST, last_executions, option_numbers, rows_of_ladder
 from hypogoal.evaluation.house import joined

@@ -227,7 +227,6 @@ def test_what_a_run_refuses(whole: Path, out: Path, tmp_path: Path) -> None:
         refuses(told, "run", toy, "-q", *words)
     assert "what they need is not made" in fails("run", toy, "-q", "--out", tmp_path / "new", "--only", "report").err
     refuses("unknown experiment", "run", "figure7", "--out", out, "-q")
-    refuses("'sweep' is 'run' now", "sweep", toy, "--out", out)
     assert renewed(before, out) == []
 
 

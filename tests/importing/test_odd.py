@@ -18,8 +18,7 @@ from PIL import Image
 from hypogoal.core.errors import UserError
 from hypogoal.importing.pictures import picture_of
 from hypogoal.importing.recordings import read_robomimic
-from hypogoal.importing.states import frames_of
-from hypogoal.importing.taken import together
+from hypogoal.importing.states import frames_of, together
 
 LENGTH = 6  # of an episode
 

@@ -7,10 +7,9 @@ import shutil
 import pandas as pd
 import pytest
 from command_line import refuses, run
-from toy_data import fill, reseal
+from toy_data import fill, reseal, write_table
 
 from hypogoal.core.artefacts import Artefact, create, open_artefact, sha256_of
-from hypogoal.core.files import write_table
 from hypogoal.evaluation.compare import labels_of, read_pairs
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.tools.compare import compare

@@ -58,18 +58,12 @@ AGENT_ON[GOAL] = AGENT + 8
 _POSE = np.arange(POSES)
 _CELL, _DIRECTION = np.divmod(_POSE, 4)
 _ONE_ON = np.array((1, SIZE, -1, -SIZE))  # from a cell to the next, by direction
-# AHEAD: the cell in front of each pose. MOVES: the pose after each action.
-AHEAD = np.clip(_CELL + _ONE_ON[_DIRECTION], 0, CELLS - 1)
-MOVES = np.tile(_POSE, (N_ACTIONS, 1))
-MOVES[LEFT] = _CELL * 4 + (_DIRECTION - 1) % 4
-MOVES[RIGHT] = _CELL * 4 + (_DIRECTION + 1) % 4
-MOVES[FORWARD] = AHEAD * 4 + _DIRECTION
-TURN_OR_WALK = MOVES - _POSE  # what to add to the pose
-# For each action and code ahead: which row of MOVES applies, and may the configuration change?
-MOVE_AS = np.full((N_ACTIONS, N_CODES), DONE)
-MOVE_AS[LEFT] = LEFT
-MOVE_AS[RIGHT] = RIGHT
-MOVE_AS[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = FORWARD
+AHEAD = np.clip(_CELL + _ONE_ON[_DIRECTION], 0, CELLS - 1)  # the cell in front of each pose
+# For each action, code ahead and pose: what to add to the pose; and may the configuration change?
+MOVES = np.zeros((N_ACTIONS, N_CODES, POSES), np.int64)
+MOVES[LEFT] = (_DIRECTION - 1) % 4 - _DIRECTION
+MOVES[RIGHT] = (_DIRECTION + 1) % 4 - _DIRECTION
+MOVES[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = (AHEAD - _CELL) * 4
 MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), np.bool_)
 MAY_CHANGE[PICKUP, KEY : KEY + 3] = True
 MAY_CHANGE[DROP, EMPTY] = True
@@ -85,7 +79,6 @@ PER_STATE = (
     "_final",
 )
 PER_CONFIGURATION = (
-    "_doors",
     "_places",
     "_bare_codes",
     "_id_at",
@@ -132,11 +125,9 @@ class DoorKeyEngine(Engine):
         self.door_label = door_label
         self.harsh = wrong_key == "ends"
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
-        # For each configuration: its layout's seed; the door's cell; its state and the keys' places; its cell codes
-        # without the agent; ids by pose.
         self._numbers: dict[Configuration, int] = {}
-        self._seeds: list[int] = []
-        self._doors = np.zeros(16, np.int64)
+        self._configurations: list[Configuration] = []  # by number
+        # For each configuration: the door's state and the keys' places; its cell codes without the agent; ids by pose.
         self._places = np.zeros((16, 4), np.uint8)
         self._bare_codes = np.zeros((16, CELLS), np.uint8)
         self._id_at = np.full((16, POSES), UNKNOWN, np.int64)
@@ -193,8 +184,7 @@ class DoorKeyEngine(Engine):
         ahead = self._ahead.take(ids)
         code_ahead = self._bare_codes.ravel().take(ahead)
         case = np.asarray(actions, np.int64) * N_CODES + code_ahead
-        move = MOVE_AS.take(case)
-        following_site = site + TURN_OR_WALK.take(move * POSES + pose)
+        following_site = site + MOVES.take(case * POSES + pose)
         (changing,) = MAY_CHANGE.take(case).nonzero()
         for index in changing.tolist():
             action = int(actions[index])
@@ -210,15 +200,15 @@ class DoorKeyEngine(Engine):
         """The configuration after ``pickup``, ``drop`` or ``toggle``, possibly unchanged."""
         configuration, pose = divmod(site, POSES)
         front = AHEAD.item(pose)
-        door, *keys = self._places[configuration].tolist()
-        seed = self._seeds[configuration]
+        code = self._bare_codes[configuration, front]
+        seed, door, *keys = self._configurations[configuration]
         held = sum(place >= HELD for place in keys)
         has_red_key = keys[-1] >= HELD
         if action == PICKUP and front in keys:
             keys[keys.index(front)] = HELD + held
-        elif action == DROP and held and self._bare_codes[configuration, front] == EMPTY:
+        elif action == DROP and held and code == EMPTY:
             keys[keys.index(max(keys))] = front
-        elif action == TOGGLE and front == self._doors[configuration]:
+        elif action == TOGGLE and code >= DOOR:
             if door == OPEN:
                 door = CLOSED
             elif door == CLOSED or has_red_key:  # once unlocked it never locks again
@@ -258,11 +248,11 @@ class DoorKeyEngine(Engine):
 
     def labels(self, ids: Ints) -> Bools:
         """Spec B2: true sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
-        configuration, pose = np.divmod(self._site.take(ids), POSES)
-        places = self._places[configuration]
+        places = self._places[self._site.take(ids) // POSES]
         door_open = places[:, 0] == OPEN
         held = places[:, 1:] >= HELD
-        facing_door = AHEAD[pose] == self._doors[configuration]
+        ahead = self._ahead.take(ids)
+        facing_door = self._bare_codes.ravel().take(ahead) >= DOOR
         return sub_goals_reached(
             held,
             door_open,
@@ -300,12 +290,9 @@ class DoorKeyEngine(Engine):
             starts = self._starts_of(self.layouts.seeds)
         frontier = starts
         rings: list[Ints] = []
-        steps: list[Ints] = []
         seen = np.zeros(self.n_states, np.bool_)
         seen[starts] = True
         while len(frontier):
-            depth = len(rings)
-            steps.append(np.full(len(frontier), depth))
             rings.append(frontier)
             going_on = frontier[~self._final[frontier]]
             origin = np.repeat(going_on, len(SEARCHED))
@@ -314,7 +301,8 @@ class DoorKeyEngine(Engine):
             seen.resize(self.n_states, refcheck=False)  # with False for new states
             frontier = following[~seen[following]]
             seen[frontier] = True
-        return np.concatenate(rings), np.concatenate(steps)
+        steps = np.repeat(np.arange(len(rings)), [*map(len, rings)])
+        return np.concatenate(rings), steps
 
     def reachable(self) -> Ints:
         """Ids of all states reachable from the start, nearest first, one for each image.
@@ -371,16 +359,14 @@ class DoorKeyEngine(Engine):
         """All that a resumed run needs: each environment's state, and the ids assigned so far."""
         return {
             **super().snapshot(),
-            "seeds": list(self._seeds),
-            "configurations": self._places[: len(self._seeds)].copy(),
+            "configurations": np.array(self._configurations),
             "sites": self._site[: self.n_states].copy(),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an engine made with the same arguments; call it before the first step."""
-        configurations = snapshot["configurations"].tolist()
-        for seed, places in zip(snapshot["seeds"], configurations, strict=True):
-            self._number_of((seed, *places))
+        for configuration in snapshot["configurations"].tolist():
+            self._number_of(tuple(configuration))
         for site in snapshot["sites"].tolist():
             self._id_of(site)
         super().restore(snapshot)
@@ -400,9 +386,9 @@ class DoorKeyEngine(Engine):
         codes[cell] = AGENT_ON.item(codes.item(cell)) + direction
         self._site[new] = site
         self._ahead[new] = configuration * CELLS + AHEAD.item(pose)
-        at_goal = cell == layout_of(self._seeds[configuration]).goal
+        seed, _, blue, green, _ = self._configurations[configuration]
+        at_goal = cell == layout_of(seed).goal
         self._on_goal[new] = at_goal
-        blue, green = self._places[configuration, 1:3].tolist()
         is_wrong = self.harsh and max(blue, green) >= HELD
         self._final[new] = at_goal or is_wrong
         self._id_at[configuration, pose] = new
@@ -414,7 +400,7 @@ class DoorKeyEngine(Engine):
         number = self._numbers.get(configuration)
         if number is not None:
             return number
-        new = self._numbers[configuration] = len(self._seeds)
+        new = self._numbers[configuration] = len(self._configurations)
         if new == len(self._places):
             self._double(PER_CONFIGURATION)
         seed, door, *keys = configuration
@@ -427,9 +413,8 @@ class DoorKeyEngine(Engine):
         for colour, place in enumerate(keys):
             if place < HELD:
                 row[place] = KEY + colour
-        self._seeds.append(seed)
+        self._configurations.append(configuration)
         self._bare_codes[new] = np.frombuffer(row, np.uint8)
-        self._doors[new] = layout.door
         self._places[new] = door, *keys
         return new
 

@@ -35,7 +35,7 @@ def sub_goals_reached(
     door_open: Bools,
     facing_door: Bools,
     on_goal: Bools,
-    door_label: str = "open",
+    door_label: str,
 ) -> Bools:
     """Spec B2: the five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
 
@@ -180,7 +180,13 @@ class DoorKeyGrid(MiniGridEnv):
         facing = self.grid.get(*self.front_pos) is self.door
         on_goal = isinstance(self.grid.get(*self.agent_pos), Goal)
         door_open, facing_door, at_goal = np.array([self.door.is_open, facing, on_goal])
-        return sub_goals_reached(held, door_open, facing_door, at_goal, self.door_label)
+        return sub_goals_reached(
+            held,
+            door_open,
+            facing_door,
+            at_goal,
+            self.door_label,
+        )
 
     def _named_labels(self) -> dict[str, bool]:
         return dict(zip(SUB_GOALS, self.labels().tolist(), strict=True))

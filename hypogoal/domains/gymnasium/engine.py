@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +11,8 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Layouts, Step, TurnEngine
-from hypogoal.observations import Observations, digest
+from hypogoal.domains.base import Layouts, TurnEngine
+from hypogoal.observations import digest
 
 if TYPE_CHECKING:
     from hypogoal.domains.gymnasium.domain import GymnasiumDomain
@@ -61,25 +60,21 @@ class GymnasiumEngine(TurnEngine):
         memory: int = MEMORY,
         **arguments: Any,
     ):
+        super().__init__()
         self.domain, self.count, self.max_steps = domain, count, max_steps
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self.memory: int = memory
         self.room = 2 * memory
-        self._envs: list[Any] = [domain.make_env(**arguments) for _ in range(count)]
+        self.width = len(domain.sub_goals)  # the facts are labels
+        self._envs = [domain.make_env(**arguments) for _ in range(count)]
         self._earned = [0.0] * count  # in the episode so far
-        self._succeeded = [False] * count  # whether it just ended with a success
         self._played: list[list[int]] = [[] for _ in range(count)]  # the episode's actions
         self.observation_shape = domain.observation_shape
         self.observation_dtype = domain.observation_dtype
-        self.n_actions = int(self._envs[0].action_space.n)
-        self._ring: list[Observations] = []
-        self._labels = bytearray()
-        self._ids: OrderedDict[bytes, int] = OrderedDict()  # of the states in the ring by digest, oldest first
+        actions: Any = self._envs[0].action_space
+        self.n_actions = int(actions.n)
+        self._ids: dict[bytes, int] = {}  # of the states that are kept, by digest, oldest first
         self.reset()
-
-    @property
-    def n_states(self) -> int:
-        return len(self._labels) // len(self.domain.sub_goals)
 
     def _begin(self, number: int) -> int:
         env = self._envs[number]
@@ -88,67 +83,51 @@ class GymnasiumEngine(TurnEngine):
         self._played[number], self._earned[number] = [], 0.0
         return self._remember(env, observation)
 
-    def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
+    def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
         env = self._envs[number]
         observation, reward, terminated, cut, info = env.step(action)
-        earned, terminated = float(reward), bool(terminated)
-        truncated = (bool(cut) or elapsed >= self.max_steps) and not terminated
+        earned = float(reward)
+        terminated = bool(terminated)
+        is_over = bool(cut) or elapsed >= self.max_steps
+        truncated = is_over and not terminated
         self._played[number].append(action)
         self._earned[number] += earned
-        success = self.domain.success
-        if success:
-            over = terminated or truncated
-            so_far = self._earned[number]
-            self._succeeded[number] = over and bool(success(env, info, so_far, terminated))
         state = self._remember(env, observation)
-        return state, earned, terminated, truncated
-
-    def step(self, actions: Ints) -> Step:
-        step = super().step(actions)
-        if not self.domain.success:
-            return step
-        return step._replace(succeeded=np.array(self._succeeded))
+        success = self.domain.success
+        if success is None:
+            return state, earned, terminated, truncated
+        succeeded = False
+        if terminated or truncated:
+            so_far = self._earned[number]
+            succeeded = bool(success(env, info, so_far, terminated))
+        return state, earned, terminated, truncated, succeeded
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of an environment's current state."""
-        image = self.domain.reader.read(observation)
-        labels = labels_of(env, self.domain.label_functions).tobytes()
-        look = digest(image, labels)
-        new = self.n_states
+        domain = self.domain
+        image = domain.reader.read(observation)
+        labels = labels_of(env, domain.label_functions)
+        look = digest(image, labels.tobytes())
         state = self._ids.get(look)
-        if state is not None and state >= new - self.memory:
-            return state
-        self._keep(new, image)
-        self._labels += labels
-        self._file(look, new)
-        return new
+        if state is None or state < self.n_states - self.memory:
+            state = self._add(image, labels)
+            self._file(look, state)
+        return state
 
     def _file(self, look: bytes, state: int) -> None:
-        """Enter a digest's newest id, and drop that of a forgotten state."""
+        """Enter a digest's newest id, and drop one of a forgotten state where there are more than states."""
+        self._ids.pop(look, None)
         self._ids[look] = state
-        self._ids.move_to_end(look)
-        oldest_look = next(iter(self._ids))
-        if self._ids[oldest_look] < self.oldest:
-            del self._ids[oldest_look]
-
-    def images(self, ids: Ints) -> Observations:
-        images = self._room_for(len(ids))
-        for row, state in enumerate(self._kept(ids)):
-            images[row] = self._ring[self._place(state)]
-        return images
+        if len(self._ids) > self.room:
+            oldest = next(iter(self._ids))
+            del self._ids[oldest]
 
     def labels(self, ids: Ints) -> Bools:
-        every = np.frombuffer(self._labels, np.bool_)
-        rows = every.reshape(-1, len(self.domain.sub_goals))
-        return rows[ids]
+        return self.facts_of(ids).view(np.bool_)
 
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
-        return {
-            **super().snapshot(),
-            "images": np.stack(self._ring),
-            "labels": np.frombuffer(self._labels, np.uint8).copy(),
-        }
+        return {**super().snapshot(), "images": np.stack([*self._seen.values()])}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an engine made with the same arguments: replays the current episodes.
@@ -156,13 +135,11 @@ class GymnasiumEngine(TurnEngine):
         A ``UserError`` if they lead to other states: the environment is not deterministic.
         """
         super().restore(snapshot)
-        self._labels = bytearray(snapshot["labels"].tobytes())
-        self._ring = list(snapshot["images"])
-        self._ids.clear()
         states = np.arange(self.oldest, self.n_states)
         of_states = self.labels(states)
-        for state, labels in zip(states.tolist(), of_states, strict=True):
-            image = self._ring[self._place(state)]
+        self._seen = dict(zip(states.tolist(), snapshot["images"], strict=True))
+        self._ids.clear()
+        for (state, image), labels in zip(self._seen.items(), of_states, strict=True):
             self._file(digest(image, labels.tobytes()), state)
         for number in range(self.count):
             self._replay(number)

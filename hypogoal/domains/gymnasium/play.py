@@ -23,7 +23,6 @@ Policy = Callable[[gymnasium.Env, Any, Generator], int]
 """How to play when collecting states: (environment, observation, random numbers) -> action."""
 SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
 ORIGINS = ("layout_seed", "episode", "step")
-Origin = tuple[int, int, int]  # by these names
 
 
 class Met(NamedTuple):
@@ -31,12 +30,16 @@ class Met(NamedTuple):
 
     observation: Observations
     labels: Bools
-    origin: Origin
+    origin: tuple[int, int, int]  # by ``ORIGINS``
 
 
 def played(
-    policies: Sequence[Policy | None], env: Any, layout_seed: int, config: GymnasiumConfig, rng: Generator
-) -> Iterator[tuple[Any, Origin]]:
+    policies: Sequence[Policy | None],
+    env: Any,
+    layout_seed: int,
+    config: GymnasiumConfig,
+    rng: Generator,
+) -> Iterator[tuple[Any, tuple[int, int, int]]]:
     """Play a layout: each observation and its origin, also of an episode's last state, since a sub-goal may hold there.
 
     The policies share the steps; None plays at random.
@@ -62,7 +65,12 @@ def played(
 
 
 def sampled(
-    domain: GymnasiumDomain, env: Any, layout_seed: int, config: GymnasiumConfig, seen: set[bytes], rng: Generator
+    domain: GymnasiumDomain,
+    env: Any,
+    layout_seed: int,
+    config: GymnasiumConfig,
+    seen: set[bytes],
+    rng: Generator,
 ) -> list[Met]:
     """Distinct states of a layout, except those in ``seen``, digests: an even sample of all combinations of sub-goals.
 
@@ -77,8 +85,8 @@ def sampled(
             continue
         seen.add(look)
         labels = labels_of(env, domain.label_functions)
-        combination = labels.tobytes()
         state = Met(values, labels, origin)
+        combination = labels.tobytes()
         sample = kept.setdefault(combination, [])
         offered[combination] += 1
         if len(sample) < config.states:
@@ -92,16 +100,13 @@ def sampled(
 
 def even_sample(samples: list[list[Met]], size: int, rng: Generator) -> list[Met]:
     """Up to ``size`` states of all samples, as evenly as possible, in the order in which they were reached."""
-    left = size
     states: list[Met] = []
     samples.sort(key=len)
     for number, sample in enumerate(samples):
-        even = left // (len(samples) - number)
-        share = min(len(sample), even)
+        even = (size - len(states)) // (len(samples) - number)
         # Not the first places: those favour the first states reached, or, in a full sample, exclude the next ones.
         order = rng.permutation(len(sample))
-        states += [sample[place] for place in order[:share]]
-        left -= share
+        states += [sample[place] for place in order[:even]]
     return sorted(states, key=lambda state: state.origin)
 
 
@@ -113,7 +118,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
     unlabelled or no held-out states.
     """
     world = domain.world(config.model_dump())
-    env = domain.make_env(**world)
+    env, reader = domain.make_env(**world), domain.reader
     seeds_of_sets = [getattr(config, name) for name in SEEDS]
     progress.total = sum(map(len, seeds_of_sets))
     training: set[bytes] = set()  # digests of labelled and unlabelled states
@@ -122,23 +127,22 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
         met: list[Met] = []
         for layout_seed in seeds:
             seen = set(training) if name == "heldout_seeds" else set()
-            met += sampled(domain, env, layout_seed, config, seen, rng_for(seed, "play", layout_seed))
+            rng = rng_for(seed, "play", layout_seed)
+            met += sampled(domain, env, layout_seed, config, seen, rng)
             progress.advance()
         if not met:
             do = "Give other seeds, or more steps: states that look like training states do not count."
-            raise Unmet(
-                f"there are no states for {name}",
-                f"steps={config.steps}",
-                do,
-            )
-        observations = np.array([state.observation for state in met], domain.reader.dtype)
-        labels = np.array([state.labels for state in met])
-        origins = np.array([state.origin for state in met])
-        named = dict(zip(ORIGINS, origins.T, strict=True))
-        sets.append(States(observations, labels, named))
+            raise Unmet(f"there are no states for {name}", f"steps={config.steps}", do)
+        observations, labels, origins = zip(*met, strict=True)
+        named = dict(zip(ORIGINS, np.transpose(origins), strict=True))
+        states = States(
+            np.array(observations, reader.dtype),
+            np.array(labels),
+            named,
+        )
+        sets.append(states)
         training.update(map(digest, observations))
     env.close()
     labelled, unlabelled, heldout = sets
     require_classes(labelled.labels, domain.sub_goals, f"steps={config.steps}", GET_MORE)
-    reader = domain.reader
     return Collected(reader.shape, domain.sub_goals, labelled, unlabelled, heldout, reader.features)

@@ -1,23 +1,31 @@
-"""Sub-goals in Montezuma's Revenge (Spec B4, B5): the domain.
+"""Sub-goals in Montezuma's Revenge (Spec B4, B5): the domain, and how its states are collected.
 
 See also ``emulator`` (the game, with the agent placed anywhere), ``ladders`` (their positions), ``sub_goals``,
-``expert`` (scripted play), ``states`` (the states of a room), ``collect``, ``env`` and ``engine`` (one game and
-many, from the top of a ladder).
+``expert`` (scripted play), ``states`` (the states of a room), ``env`` and ``engine`` (one game and many, from the top
+of a ladder).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import chain
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
 
 from hypogoal.core.arrays import Bytes, Ints
+from hypogoal.core.config import Config, setting
+from hypogoal.core.processes import allowed, in_processes
+from hypogoal.data import Collected, States, joined
 from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma import emulator as game
-from hypogoal.domains.montezuma.collect import MontezumaConfig, collect
 from hypogoal.domains.montezuma.engine import MontezumaEngine
-from hypogoal.domains.montezuma.env import BEGINNINGS, MAX_STEPS, beginning_named
+from hypogoal.domains.montezuma.env import BEGINNINGS, MAX_STEPS
 from hypogoal.domains.montezuma.ladders import distance_to
-from hypogoal.domains.montezuma.states import emulator_of_process
-from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, SUB_GOALS
+from hypogoal.domains.montezuma.states import gather
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ROOMS, SUB_GOALS
 
 TABLE_1: Mapping[str, Any] = {
     "network": "montezuma",
@@ -51,12 +59,90 @@ ALONE: Mapping[str, Any] = {
 }
 
 
+SEEN_NOWHERE, SEEN_UNLABELLED, SEEN_LABELLED = range(3)
+
+
+class MontezumaConfig(Config):
+    """Settings of ``hypogoal collect montezuma``."""
+
+    groups: int = setting(1, "ladder groups with labels (N), out of seven", source="Figure 3", low=1, high=7)
+    sub_goals: Annotated[tuple[str, ...], Field(min_length=1)] = setting(
+        (CLIMB_DOWN.name,),
+        "what is labelled; others than ladders have five or three groups",
+        choices=SUB_GOALS,
+        source="paper; the others: the authors' code",
+    )
+    states_per_room: int = setting(600, "labelled states of each room of the groups", low=1, high=100_000)
+    unlabelled_per_room: int = setting(600, "unlabelled states of each of their rooms", low=1, high=100_000)
+    heldout_per_room: int = setting(300, "held-out states of each of the 24 rooms", low=1, high=100_000)
+    workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
+
+
+def rooms_of(config: MontezumaConfig) -> tuple[list[int], list[int]]:
+    """The rooms of the labelled states and of the unlabelled ones.
+
+    Labelled are the first N groups of each sub-goal. The others are two: one without labels where the first sub-goal
+    holds somewhere and one where it holds nowhere; or two of these, if all others have labels. Source: the paper, for
+    N = 1.
+    """
+    labelled: list[int] = []
+    for name in config.sub_goals:
+        groups = ROOMS[name]["groups"]
+        labelled += chain.from_iterable(groups[: config.groups])
+    of_first = ROOMS[config.sub_goals[0]]
+    holding = [room for room in of_first["unlabelled"] if room not in labelled]
+    unlabelled = holding[:1] + of_first["others"]
+    return [*dict.fromkeys(labelled)], unlabelled[:2]
+
+
+def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
+    """Spec B5: labelled, unlabelled and held-out states, each with its origin.
+
+    All 24 rooms have held-out states, the same for every N. States at the base of a ladder that continues through the
+    floor are in the unlabelled set only. No held-out stack is in another set, and no stack occurs twice in a room of a
+    set. The result does not depend on the number of processes.
+
+    ``seed`` seeds the rollouts; each room of each set has its own stream. All three sets have labels (the unlabelled
+    states' are for tests only). Origins: see ``states.states_of``; held-out states also have ``seen``: 0 the room is in
+    no training set, 1 it is an unlabelled room, 2 a labelled one. No emulator, or a room with too few different states
+    is a ``UserError``.
+    """
+    labelled, unlabelled = rooms_of(config)
+    names = tuple(dict.fromkeys(config.sub_goals))
+    sub_goals = [SUB_GOALS[name] for name in names]
+    sets = {
+        "labelled": (labelled, config.states_per_room),
+        "unlabelled": (unlabelled, config.unlabelled_per_room),
+        "heldout": (range(game.ROOMS), config.heldout_per_room),
+    }
+    jobs: list[Callable[[], States]] = []
+    places = []  # of the sets among the jobs
+    for split, (rooms, wanted) in sets.items():
+        first = len(jobs)
+        jobs += [partial(gather, split, room, wanted, seed, sub_goals) for room in rooms]
+        places.append(slice(first, len(jobs)))
+    progress.total = sum(wanted * len(rooms) for rooms, wanted in sets.values())
+    gathered: list[Any] = [*jobs]
+
+    def done(number: int, states: States) -> None:
+        gathered[number] = states
+        progress.advance(len(states.labels))
+
+    in_processes(jobs, allowed(config.workers), done)
+    for_labels, without_labels, heldout = [joined(gathered[place]) for place in places]
+    room_numbers = heldout.origins["room"]
+    seen = np.full(len(room_numbers), SEEN_NOWHERE)
+    seen[np.isin(room_numbers, unlabelled)] = SEEN_UNLABELLED
+    seen[np.isin(room_numbers, labelled)] = SEEN_LABELLED
+    heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
+    return Collected(game.OBSERVATION_SHAPE, names, for_labels, without_labels, heldout)
+
+
 class MontezumaDomain(Domain):
     """Spec B6: Montezuma's Revenge; the defaults are Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"
     sub_goals = tuple(SUB_GOALS)
-    usual_sub_goals = (CLIMB_DOWN.name,)
     observation_shape = game.OBSERVATION_SHAPE
     config_class = MontezumaConfig
     env_id = "hypogoal.envs:hypogoal/MontezumaLadder-v0"
@@ -78,27 +164,18 @@ class MontezumaDomain(Domain):
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, *, start: str = "1L", **arguments: Any
     ) -> MontezumaEngine:
-        """An engine of ``count`` games that begin at ``start``.
-
-        The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``. Other
-        arguments as for ``MontezumaEngine``.
-        """
+        """The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``."""
         seed = arguments.pop("seed", layout_seed)
         return MontezumaEngine(start, count, max_steps=max_steps, seed=seed, **arguments)
 
     def task(self, world: Mapping[str, Any]) -> str:
         return "Reach a sub-goal, such as the base of a ladder, from a start; a lost life ends the episode."
 
-    def rooms_of(self, start: str) -> tuple[int, ...]:
-        """The rooms of a start, from there to where its script ends, such as a ladder's top and its base."""
-        beginning = beginning_named(start)
-        return tuple(dict.fromkeys((beginning.at.room, beginning.end.room)))
-
     def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
         return distance_to(positions, SUB_GOALS.get(sub_goal, CLIMB_DOWN).places)
 
     def picture(self, room: int) -> Bytes:
-        return game.picture(emulator_of_process(), room)
+        return game.picture(game.Emulator(), room)
 
 
 DOMAIN = MontezumaDomain()

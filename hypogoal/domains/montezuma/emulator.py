@@ -6,7 +6,6 @@ and ``FrameStackObservation``).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,11 +41,15 @@ RAM = {
     "jump": 0x56,  # 255 on the ground, 19..0 in a jump
     "fall": 0x58,  # frames of free fall
 }
+# The bytes kept of a state, from which its labels and its kind follow.
+FACTS = ("room", "x", "y", "skull", "object", "dying", "pose", "jump")
+ROOM, X, Y, SKULL, OBJECT, DYING, POSE, JUMP = range(len(FACTS))
+FACT_BYTES = [RAM[name] for name in FACTS]
 TORCH = 0x80  # without it rooms 16 to 23 are dark
 ON_LADDER = 10  # a pose
 FIRST_ROOM_OF_ROW = (0, 3, 8, 15)
 RIGHT_EDGE, LEFT_EDGE, EDGE_Y = 146, 5, 235
-CROSSING_FRAMES = 40
+ENTERED_FROM_RIGHT = (0, 3, 8, 10, 15, 16, 21)  # rooms with a wall on their left, or none beside them
 FIRST_ROOM_FRAMES = 60  # until a new game accepts actions
 
 # The agent is drawn in columns x - 1 .. x + 6 and rows 308 - y .. 327 - y, with x and y from RAM: read off the
@@ -54,14 +57,6 @@ FIRST_ROOM_FRAMES = 60  # until a new game accepts actions
 SPRITE_WIDTH, SPRITE_HEIGHT = 8, 20
 SPRITE_LEFT, SPRITE_TOP = -1, 308
 THREE_PLACES = (20, 75, 130)  # so far apart that the agent and its traces never overlap
-
-
-def stack_frames(frames: Sequence[Bytes], out: Bytes | None = None) -> Bytes:
-    """Four frames (84, 84), the oldest first, as uint8 (84, 84, 4): ``np.stack(frames, axis=-1)``, ten times faster."""
-    import cv2
-
-    merged: Any = cv2.merge(frames, out)
-    return merged
 
 
 Frames = tuple[Bytes, ...]  # of the last four agent steps, uint8 (84, 84) each, oldest first
@@ -75,18 +70,19 @@ class Position(NamedTuple):
     y: int
 
 
-@dataclass(frozen=True)
-class Snapshot:
+class Snapshot(NamedTuple):
     """A state of the emulator and the frames before it, which the emulator does not keep."""
 
     state: Any  # an ``ALEState``
-    seen: Frames  # of its observation
-    screen: Bytes  # (210, 160), the last of them before resizing
+    seen: Frames
 
-    @property
-    def stack(self) -> Bytes:
-        """The observation, uint8 (84, 84, 4), a new array."""
-        return stack_frames(self.seen)
+
+def stacked(seen: Sequence[Bytes]) -> Bytes:
+    """Four frames (84, 84), the oldest first, as uint8 (84, 84, 4): ``np.stack(seen, axis=-1)``, ten times faster."""
+    import cv2
+
+    merged: Any = cv2.merge(seen)
+    return merged
 
 
 def row_of(rooms: Any) -> Any:
@@ -94,91 +90,71 @@ def row_of(rooms: Any) -> Any:
     return np.searchsorted(FIRST_ROOM_OF_ROW, rooms, side="right") - 1
 
 
-def load_ale() -> Any:
-    """A raw, deterministic emulator with the game's ROM, one frame per act; ``UserError`` if not installed."""
-    try:
-        import cv2  # noqa: F401
-        from ale_py import ALEInterface, LoggerMode
-        from ale_py.roms import get_rom_path
-    except ImportError as error:
-        fault = f"Montezuma's Revenge cannot be played ({error})"
-        raise UserError(fault, GAME, "pip install 'hypogoal[montezuma]'.") from None
-    ALEInterface.setLoggerMode(LoggerMode.Error)
-    ale = ALEInterface()
-    ale.setInt("random_seed", 0)  # without sticky actions nothing depends on it
-    ale.setFloat("repeat_action_probability", 0.0)
-    ale.setInt("frame_skip", 1)
-    rom: Any = get_rom_path(GAME)
-    ale.loadROM(rom)
-    return ale
-
-
 class Emulator:
-    """One game: agent steps of four frames, stacks of four steps, RAM, and the agent placed anywhere.
+    """One game, deterministic: agent steps of four frames, stacks of four steps, RAM, and the agent placed anywhere.
+
+    It begins in the first room. It is never played to the game's end: a lost life ends an episode, and each begins with
+    all lives. Without the packages that play it, a ``UserError``.
 
     Attributes:
-        seen, screen: as in ``Snapshot``; never modified: each step makes new ones.
+        seen: the frames of the last four agent steps; never modified: each step makes a new one.
     """
 
     def __init__(self) -> None:
-        self.ale = load_ale()  # refuses if cv2 is missing
-        import cv2
-
+        try:
+            import cv2
+            from ale_py import ALEInterface, LoggerMode
+            from ale_py.roms import get_rom_path
+        except ImportError as error:
+            fault = f"Montezuma's Revenge cannot be played ({error})"
+            raise UserError(fault, GAME, "pip install 'hypogoal[montezuma]'.") from None
         self._cv2 = cv2
-        self.actions = list(self.ale.getLegalActionSet())
-        self._drawn = np.zeros(SCREEN, np.uint8), np.zeros(SCREEN, np.uint8)
-        self._ram = np.zeros(128, np.uint8)
-        self._first_room: Any = None
+        ALEInterface.setLoggerMode(LoggerMode.Error)
+        self.ale = ALEInterface()
+        self.ale.setInt("random_seed", 0)  # without sticky actions nothing depends on it
+        self.ale.setFloat("repeat_action_probability", 0.0)
+        self.ale.setInt("frame_skip", 1)
+        rom: Any = get_rom_path(GAME)
+        self.ale.loadROM(rom)
+        self.actions = [*self.ale.getLegalActionSet()]
+        self.seen: Frames = ()
+        self._screens = [np.zeros(SCREEN, np.uint8) for _ in range(2)]
         self._entered: dict[int, Any] = {}
-        self.reset()
+        self.frames(NOOP, FIRST_ROOM_FRAMES)
+        self._first_room = self.ale.cloneState()
 
     @property
     def stack(self) -> Bytes:
-        """The observation, uint8 (84, 84, 4): a copy of the last four agent steps' frames, oldest first."""
-        return stack_frames(self.seen)
-
-    def reset(self) -> Bytes:
-        """Begin a new game; the stack repeats its first frame four times."""
-        self.ale.reset_game()
-        self.screen = self.ale.getScreenGrayscale()
-        self.seen: Frames = (self._shrink(self.screen),) * STACK
-        return self.stack
+        """The observation, uint8 (84, 84, 4), a new array."""
+        return stacked(self.seen)
 
     def step(self, action: int) -> float:
-        """Spec B4: play four frames of ``action`` (0..17), fewer if the game ends; returns the sum of their rewards."""
-        ale, act = self.ale, self.actions[action]
-        reward, drawn = 0.0, 0
-        for frame in range(FRAME_SKIP):
-            reward += ale.act(act)
-            if ale.game_over():
-                break  # without drawing this frame, as Gymnasium's wrapper does
-            if frame >= FRAME_SKIP - 2:
-                ale.getScreenGrayscale(self._drawn[drawn])
-                drawn += 1
-        if drawn:
-            before = self._drawn[1] if drawn == 2 else self.screen
-            # NumPy's maximum, if it uses AVX-512, slows down the emulator's next frames by a seventh.
-            self.screen = self._cv2.max(self._drawn[0], before)
-        self.seen = (*self.seen[1:], self._shrink(self.screen))
+        """Spec B4: play four frames of ``action`` (0..17); returns the sum of their rewards."""
+        act, number = self.ale.act, self.actions[action]
+        reward = 0.0
+        for _ in range(FRAME_SKIP - len(self._screens)):
+            reward += act(number)
+        for screen in self._screens:
+            reward += act(number)
+            self.ale.getScreenGrayscale(screen)
+        # NumPy's maximum, if it uses AVX-512, slows down the emulator's next frames by a seventh.
+        brighter = self._cv2.max(*self._screens)
+        frame: Any = self._cv2.resize(brighter, (SIDE, SIDE), interpolation=self._cv2.INTER_AREA)
+        self.seen = (*self.seen[1 - STACK :], frame)
         return reward
-
-    def _shrink(self, screen: Bytes) -> Bytes:
-        small: Any = self._cv2.resize(screen, (SIDE, SIDE), interpolation=self._cv2.INTER_AREA)
-        return small
 
     def frames(self, action: int, count: int) -> None:
         """Play ``count`` single frames of ``action`` undrawn: no agent step, the stack stays as it is."""
         for _ in range(count):
             self.ale.act(self.actions[action])
 
-    def ram(self) -> Bytes:
-        """The console's memory, uint8 (128,), overwritten by the next call."""
-        self.ale.getRAM(self._ram)
-        return self._ram
+    def facts(self) -> Bytes:
+        """The bytes of ``FACTS``, uint8 (8,), a new array."""
+        return self.ale.getRAM()[FACT_BYTES]
 
     def read(self, name: str) -> int:
         """One byte of ``RAM`` by name."""
-        return int(self.ram()[RAM[name]])
+        return int(self.ale.getRAM()[RAM[name]])
 
     def write(self, name: str, value: int) -> None:
         """Write one byte of ``RAM`` by name; the screen shows it with the next frame."""
@@ -190,27 +166,22 @@ class Emulator:
 
     def alive(self) -> bool:
         """Whether the agent is not dying."""
-        return self.read("dying") == 0 and not self.ale.game_over()
-
-    def screen_rgb(self) -> Bytes:
-        """The console's picture, uint8 (210, 160, 3)."""
-        return self.ale.getScreenRGB()
+        return self.read("dying") == 0
 
     def save(self) -> Snapshot:
         """The current state, for :meth:`restore`."""
-        return Snapshot(self.ale.cloneState(), self.seen, self.screen)
+        return Snapshot(self.ale.cloneState(), self.seen)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to a state saved by this or another emulator; ``screen_rgb`` shows it after the next step."""
+        """Return to a state saved by this or another emulator; the screen shows it after the next step."""
         self.ale.restoreState(snapshot.state)
-        self.seen, self.screen = snapshot.seen, snapshot.screen
+        self.seen = snapshot.seen
 
-    def place(self, room: int, x: int, y: int, *, phase: int = 2, settle: int = 4) -> Snapshot | None:
+    def place(self, room: int, x: int, y: int, *, phase: int = 2, settle: int = STACK) -> Snapshot | None:
         """Spec B5: place the agent at (x, y) of a room, with the torch, ``phase`` frames after entering.
 
         The agent enters through the room's side, from its neighbour: writing the room's number alone draws half a room.
-        From places in the air it falls. Then it waits for ``settle`` agent steps; four or more fill the stack with
-        frames of the place. None if it died meanwhile or left the room.
+        Then it waits for ``settle`` agent steps. None if it died meanwhile or left the room.
         """
         if room not in self._entered:
             self._entered[room] = self._enter(room)
@@ -220,43 +191,33 @@ class Emulator:
         self.write("y", y)
         for _ in range(settle):
             self.step(NOOP)
-        if not self.alive() or self.position().room != room:
-            return None
-        return self.save()
+        stays = self.read("room") == room
+        return self.save() if stays and self.alive() else None
 
     def new_game(self, phase: int) -> Snapshot:
         """Begin a new game; the agent waits for ``phase`` frames once it may act, then fills the stack."""
-        self._to_first_room()
+        self.ale.restoreState(self._first_room)
         self.frames(NOOP, phase)
         for _ in range(STACK):
             self.step(NOOP)
         return self.save()
 
-    def _to_first_room(self) -> None:
-        if self._first_room is None:
-            self.ale.reset_game()
-            self.frames(NOOP, FIRST_ROOM_FRAMES)
-            self._first_room = self.ale.cloneState()
-        self.ale.restoreState(self._first_room)
-
     def _enter(self, room: int) -> Any:
         """The emulator's state right after the agent entered a room."""
-        entries = (room - 1, RIGHT_EDGE, RIGHT), (room + 1, LEFT_EDGE, LEFT)
-        for neighbour, x, action in entries:
-            if not 0 <= neighbour < ROOMS:
-                continue
-            self._to_first_room()
-            self.write("row", int(row_of(room)))
-            self.write("inventory", self.read("inventory") | TORCH)
-            self.write("room", neighbour)
-            self.write("x", x)
-            self.write("y", EDGE_Y)
-            for _ in range(CROSSING_FRAMES):
-                self.frames(action, 1)
-                if self.read("room") == room:
-                    self.frames(NOOP, 2 * FRAME_SKIP)  # the old room's picture, then a black one
-                    return self.ale.cloneState()
-        raise RuntimeError(f"room {room} could not be entered: has the ROM changed?")
+        if room in ENTERED_FROM_RIGHT:
+            neighbour, x, action = room + 1, LEFT_EDGE, LEFT
+        else:
+            neighbour, x, action = room - 1, RIGHT_EDGE, RIGHT
+        self.ale.restoreState(self._first_room)
+        self.write("row", int(row_of(room)))
+        self.write("inventory", self.read("inventory") | TORCH)
+        self.write("room", neighbour)
+        self.write("x", x)
+        self.write("y", EDGE_Y)
+        while self.read("room") != room:  # at most 40 frames
+            self.frames(action, 1)
+        self.frames(NOOP, 2 * FRAME_SKIP)  # the old room's picture, then a black one
+        return self.ale.cloneState()
 
 
 def pixel(positions: Ints) -> NDArray[np.float64]:
@@ -276,5 +237,5 @@ def picture(emulator: Emulator, room: int) -> Bytes:
     for x in THREE_PLACES:
         emulator.place(room, x, EDGE_Y, settle=0)
         emulator.frames(NOOP, 1)  # the next frame shows what was written
-        shots.append(emulator.screen_rgb())
+        shots.append(emulator.ale.getScreenRGB())
     return np.median(shots, axis=0).astype(np.uint8)

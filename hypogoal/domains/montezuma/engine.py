@@ -1,7 +1,6 @@
 """The training engine of Montezuma's Revenge: many emulators stepped together, states by id, each frame kept once.
 
-An observation is four frames, and each step adds one, so states share frames. The newest ``memory`` states are kept;
-the frames of older ones are forgotten.
+An observation is four frames, of 7 kB each, and each step adds one, so states share frames.
 """
 
 from collections.abc import Mapping
@@ -11,34 +10,32 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.arrays import Bools, Bytes, Ints
+from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import TurnEngine
 from hypogoal.domains.montezuma import emulator as game
-from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, Start, beginning_named, make_starts
-from hypogoal.domains.montezuma.sub_goals import FACT_BYTES, FACTS, SUB_GOALS, labels_of
+from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, make_starts
+from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, labels_of
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
-DYING = game.RAM["dying"]
-KNOWN = len(FACTS) + 1  # bytes kept of every state: its facts, and whether the agent is alive
-facts_in = itemgetter(*FACT_BYTES)
 
 
 class MontezumaEngine(TurnEngine):
     """Many games that begin at one ladder or elsewhere, stepped together.
 
-    Ids 0 .. S-1 always are the S start states; every step of every environment gets a new id. Images are available for
-    the newest ``memory`` of these, at least one for each environment; positions and labels for all.
+    Every step of every environment gets a new id. Images are available for the newest ``memory`` of these, at least one
+    for each environment; positions and labels for all.
 
     Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``seed`` also draws the start
-    state each episode begins with. A frame is 7 kB, allocated on first use. An unknown start, too few start states, or
-    no emulator is a ``UserError``.
+    state each episode begins with.
     """
 
     CHANGING = (*TurnEngine.CHANGING, "_rng")
     n_actions = game.N_ACTIONS
     observation_shape = game.OBSERVATION_SHAPE
-    position_names = ("room", "x", "y")
+    position_names = game.Position._fields
+    width = len(game.FACTS)
+    _image = staticmethod(game.stacked)
 
     def __init__(
         self,
@@ -50,75 +47,56 @@ class MontezumaEngine(TurnEngine):
         memory: int = MEMORY,
         seed: int = 0,
     ):
+        super().__init__()
         self.count, self.max_steps = count, max_steps
-        self.memory: int = memory
-        self.room = memory
+        self.memory = self.room = memory
         self._emulators = [game.Emulator() for _ in range(count)]
-        self.starts: list[Start] = make_starts(game.Emulator(), beginning_named(start), start_states, seed)
+        emulator = self._emulators[0]
+        self.starts: list[game.Snapshot] = make_starts(emulator, start, start_states, seed)
         self._rng = rng_for(seed, "start-of-episode")
-        self._ring: list[game.Frames] = []  # four states' stacks share a frame in memory
-        self._known_bytes = bytearray()  # ``KNOWN`` of each state
         for begin in self.starts:
-            self._known_bytes += bytes((*begin.facts, True))
+            emulator.restore(begin)
+            self._add(begin.seen, emulator.facts())
         self.reset()
-
-    @property
-    def n_states(self) -> int:
-        return len(self._known_bytes) // KNOWN
 
     def _begin(self, number: int) -> int:
         begin = int(self._rng.integers(len(self.starts)))
-        start = self.starts[begin]
-        self._emulators[number].restore(start.snapshot)
+        self._emulators[number].restore(self.starts[begin])
         return begin
 
-    def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
+    def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
         emulator = self._emulators[number]
-        state = self.n_states
         reward = emulator.step(action)
-        ram = emulator.ram().tobytes()
-        alive = ram[DYING] == 0 and not emulator.ale.game_over()
-        self._keep(state, emulator.seen)
-        self._known_bytes += bytes((*facts_in(ram), alive))
-        return state, reward, not alive, elapsed >= self.max_steps
-
-    def images(self, ids: Ints) -> Bytes:
-        """Observations uint8 (n, 84, 84, 4) of states (n,); ``ValueError`` if one is unknown or forgotten."""
-        images = self._room_for(len(ids))
-        for image, state in zip(images, self._kept(ids), strict=True):
-            if state < len(self.starts):
-                seen = self.starts[state].snapshot.seen
-            else:
-                seen = self._ring[self._place(state)]
-            game.stack_frames(seen, image)
-        return images
-
-    def _facts(self, ids: Ints) -> Ints:
-        """``KNOWN`` of states, int64 (n, KNOWN), position first and life last, also of forgotten ones."""
-        table = np.frombuffer(self._known_bytes, np.uint8).reshape(-1, KNOWN)
-        return table[ids].astype(np.int64)
+        facts = emulator.facts()
+        state = self._add(emulator.seen, facts)
+        terminated = bool(facts[game.DYING])
+        truncated = elapsed >= self.max_steps
+        return state, reward, terminated, truncated
 
     def positions(self, ids: Ints) -> Ints:
-        return self._facts(ids)[:, : len(self.position_names)]
+        facts = self.facts_of(ids)
+        return facts[:, : len(self.position_names)].astype(np.int64)
 
     def labels(self, ids: Ints) -> Bools:
-        rows = self._facts(ids)
-        return labels_of(rows[:, :-1], rows[:, -1] == 1, SUB_GOALS.values())
+        facts = self.facts_of(ids)
+        return labels_of(facts, SUB_GOALS.values())
 
     def snapshot(self) -> dict[str, Any]:
-        """All that a resumed run needs. Nearly all of it is the frames in memory, 7 kB per state."""
-        saved = [emulator.save() for emulator in self._emulators]
-        stacks = [*self._ring, *(each.seen for each in saved)]
-        frames = {id(frame): frame for frame in chain.from_iterable(stacks)}  # each once, by its address
-        row = {address: number for number, address in enumerate(frames)}
-        rows = [row[id(frame)] for frame in chain.from_iterable(stacks)]
+        """All that a resumed run needs, nearly all of it the frames in memory."""
+        stacks = [*self._seen.values()]
+        stacks += [emulator.seen for emulator in self._emulators]
+        frames = [*chain(*stacks)]
+        addresses = [*map(id, frames)]
+        _, first, rows = np.unique(addresses, return_index=True, return_inverse=True)
+        states = []
+        for emulator in self._emulators:
+            state = emulator.ale.cloneState().serialize()
+            states.append(np.frombuffer(state, np.uint8))
         return {
             **super().snapshot(),
-            "known": np.frombuffer(self._known_bytes, np.uint8).copy(),
-            "frames": np.stack(list(frames.values())),
-            "stacks": np.array(rows, np.int32).reshape(-1, game.STACK),
-            "states": [np.frombuffer(each.state.serialize(), np.uint8) for each in saved],
-            "screens": np.stack([each.screen for each in saved]),
+            "frames": np.stack([frames[place] for place in first]),  # each once
+            "stacks": rows.reshape(-1, game.STACK),
+            "states": states,
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -126,10 +104,15 @@ class MontezumaEngine(TurnEngine):
         from ale_py import ALEState
 
         super().restore(snapshot)
-        self._known_bytes = bytearray(snapshot["known"].tobytes())
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
-        stacks = [itemgetter(*rows)(frames) for rows in snapshot["stacks"].tolist()]
-        self._ring = stacks[: -self.count]
-        playing = zip(self._emulators, snapshot["states"], stacks[-self.count :], snapshot["screens"], strict=True)
-        for emulator, state, seen, screen in playing:
-            emulator.restore(game.Snapshot(ALEState(state.tobytes()), seen, screen.copy()))
+        rows = snapshot["stacks"].tolist()
+        stacks = [itemgetter(*numbers)(frames) for numbers in rows]
+        starts = range(len(self.starts))
+        latest = range(self.oldest, self.n_states)
+        self._seen = dict(zip([*starts, *latest], stacks, strict=False))
+        states = snapshot["states"]
+        playing = stacks[-self.count :]
+        for emulator, saved, seen in zip(self._emulators, states, playing, strict=True):
+            state = ALEState(saved.tobytes())
+            start = game.Snapshot(state, seen)
+            emulator.restore(start)

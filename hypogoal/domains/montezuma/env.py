@@ -3,8 +3,6 @@
 This is the reference: tests compare the training engine (``engine.py``) with it.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -16,8 +14,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.emulator import Position
-from hypogoal.domains.montezuma.ladders import LADDERS, REACH, within
-from hypogoal.domains.montezuma.sub_goals import CROSSINGS, FACT_BYTES, SUB_GOALS, facts_of, labels_of
+from hypogoal.domains.montezuma.ladders import LADDERS, MEASURED
+from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, around, inside, labels_of
 
 MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
 START_STATES = 32
@@ -28,86 +26,64 @@ TRIES = 4  # phases tried per start state
 class Beginning(NamedTuple):
     """Where episodes may begin, and the script by which the agent must get alive from there to ``end``."""
 
-    name: str
     at: Position
     end: Position
     action: int = game.NOOP  # of the script
     steps: int = 1  # agent steps of it
 
 
-GAME = "game"
-FIRST = Position(1, 77, 235)  # where the game begins
-# Without 1M, from whose base the conveyor carries the agent off, and 13-21, at whose top the spider waits.
-CLIMBED_UP = [ladder for ladder in LADDERS if ladder.name not in ("1M", "13-21")]
+NEW_GAME = "game"
+BEGINNINGS = {}
+for _ladder in LADDERS:
+    BEGINNINGS[_ladder.name] = Beginning(_ladder.top, _ladder.base, game.DOWN, _ladder.steps_down)
+for _ladder in LADDERS:
+    if _ladder.steps_up:
+        BEGINNINGS[f"up-{_ladder.name}"] = Beginning(_ladder.base, _ladder.top, game.UP, _ladder.steps_up)
+for _name, _numbers in MEASURED["starts"].items():
+    _place = Position(*_numbers)
+    BEGINNINGS[_name] = Beginning(_place, _place)
 
 
-def _beginnings() -> Iterator[Beginning]:
-    for ladder in LADDERS:
-        yield Beginning(ladder.name, ladder.top, ladder.base, game.DOWN, ladder.steps_down)
-    for ladder in CLIMBED_UP:
-        yield Beginning(f"up-{ladder.name}", ladder.base, ladder.top, game.UP, ladder.steps_up)
-    for name, place in CROSSINGS.items():
-        yield Beginning(name, place, place)
-    yield Beginning(GAME, FIRST, FIRST)
-
-
-BEGINNINGS = {beginning.name: beginning for beginning in _beginnings()}
-
-
-def beginning_named(name: str) -> Beginning:
-    """A beginning by name; ``UserError`` if unknown."""
-    if name not in BEGINNINGS:
-        raise UserError("unknown start", name, f"Choose one of {', '.join(BEGINNINGS)}.")
-    return BEGINNINGS[name]
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where an episode begins."""
-
-    snapshot: game.Snapshot
-    facts: tuple[int, ...]  # the bytes that labels follow from, see ``FACTS``
-
-
-def make_starts(emulator: game.Emulator, beginning: Beginning, count: int, seed: int) -> list[Start]:
+def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> list[game.Snapshot]:
     """Spec D4: states at a beginning, such as the top of a ladder, from which its script survives.
 
     They differ in the phase of what moves, drawn from ``seed``, and look different if ``TRIES`` phases per state offer
-    enough different looks. The top of 14-22 has one look only; its states differ out of sight.
-
-    The same seed gives the same states, whatever was played before; the emulator's state is changed. Too few such
-    states is a ``UserError``.
+    enough different looks. The top of 14-22 has one look only; its states differ out of sight. The emulator's state is
+    changed. An unknown name and too few such states are a ``UserError``.
     """
-    rng = rng_for(seed, "start-states", beginning.name)
-    by_look: dict[bytes, Start] = {}
-    alike: list[Start] = []
-    for phase in rng.permutation(PHASES)[: TRIES * count].tolist():
-        start = _start(emulator, beginning, phase)
+    if name not in BEGINNINGS:
+        raise UserError("unknown start", name, f"Choose one of {', '.join(BEGINNINGS)}.")
+    rng = rng_for(seed, "start-states", name)
+    phases = rng.permutation(PHASES)
+    by_look: dict[bytes, game.Snapshot] = {}
+    alike: list[game.Snapshot] = []
+    for phase in phases[: TRIES * count].tolist():
+        start = _start(emulator, name, phase)
         if start is None:
             continue
-        look = start.snapshot.stack.tobytes()
+        look = game.stacked(start.seen).tobytes()
         if look in by_look:
             alike.append(start)
         else:
             by_look[look] = start
         if len(by_look) == count:
             break
-    starts = [*by_look.values(), *alike][:count]
+    starts = [*by_look.values(), *alike]
     if len(starts) < max(count, 1):
         fault = f"only {len(starts)} of {count} start states survive the script"
-        raise UserError(fault, beginning.name, "Ask for fewer.")
-    return starts
+        raise UserError(fault, name, "Ask for fewer.")
+    return starts[:count]
 
 
-def _start(emulator: game.Emulator, beginning: Beginning, phase: int) -> Start | None:
+def _start(emulator: game.Emulator, name: str, phase: int) -> game.Snapshot | None:
     """The beginning in a phase; None if its script does not survive from there."""
-    if beginning.name == GAME:
-        snapshot: game.Snapshot | None = emulator.new_game(phase)
+    beginning = BEGINNINGS[name]
+    if name == NEW_GAME:
+        start: game.Snapshot | None = emulator.new_game(phase)
     else:
-        snapshot = emulator.place(*beginning.at, phase=phase)
-    if snapshot is None or emulator.position() != beginning.at:
+        start = emulator.place(*beginning.at, phase=phase)
+    if start is None or emulator.position() != beginning.at:
         return None
-    start = Start(snapshot, tuple(emulator.ram()[FACT_BYTES].tolist()))
     return start if arrives(emulator, beginning) else None
 
 
@@ -117,8 +93,9 @@ def arrives(emulator: game.Emulator, beginning: Beginning) -> bool:
         emulator.frames(beginning.action, game.FRAME_SKIP)
         if not emulator.alive():
             return False
-    position = np.array([emulator.position()])
-    return bool(within(position, [beginning.end], REACH))
+    there = around([beginning.end])
+    facts = emulator.facts()
+    return inside(there, facts[None]).item()
 
 
 class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
@@ -140,16 +117,21 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
         self.observation_space = spaces.Box(0, 255, game.OBSERVATION_SHAPE, np.uint8)
         self.action_space = spaces.Discrete(game.N_ACTIONS)
         self.emulator = game.Emulator()
-        self.starts = make_starts(self.emulator, beginning_named(start), start_states, 0)
+        self.starts = make_starts(self.emulator, start, start_states, 0)
         self.elapsed = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Bytes, dict[str, Any]]:
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Bytes, dict[str, Any]]:
         """Begin an episode with one of the start states."""
         super().reset(seed=seed)
         number = (options or {}).get("start_state")
         if number is None:
             number = int(self.np_random.integers(len(self.starts)))
-        self.emulator.restore(self.starts[number].snapshot)
+        self.emulator.restore(self.starts[number])
         self.elapsed = 0
         return self.emulator.stack, self._info()
 
@@ -158,12 +140,16 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
         reward = self.emulator.step(int(action))
         self.elapsed += 1
         info = self._info()
+        terminated = not info["alive"]
         truncated = self.elapsed >= self.max_steps
-        return self.emulator.stack, reward, not info["alive"], truncated, info
+        return self.emulator.stack, reward, terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
-        alive = self.emulator.alive()
-        facts = facts_of(self.emulator.ram()[None])
-        [labels] = labels_of(facts, np.array([alive]), SUB_GOALS.values())
-        named = dict(zip(SUB_GOALS, labels.tolist(), strict=True))
-        return {"labels": named, "position": self.emulator.position(), "alive": alive}
+        facts = self.emulator.facts()
+        [labels] = labels_of(facts[None], SUB_GOALS.values())
+        named = zip(SUB_GOALS, labels.tolist(), strict=True)
+        return {
+            "labels": dict(named),
+            "position": self.emulator.position(),
+            "alive": self.emulator.alive(),
+        }

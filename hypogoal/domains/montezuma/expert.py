@@ -1,7 +1,7 @@
 """Spec B5: scripted play in a room of Montezuma's Revenge, from around the places of its sub-goals and elsewhere."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, cycle
+from collections.abc import Iterator, Sequence
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,12 +10,11 @@ from numpy.random import Generator
 
 from hypogoal.core.arrays import Bytes, Ints
 from hypogoal.domains.montezuma import emulator as game
-from hypogoal.domains.montezuma.emulator import RAM, Emulator, Position
-from hypogoal.domains.montezuma.ladders import BASES, LADDERS, REACH, SHAFT_ENTRY, SHAFT_EXIT, TOPS
-from hypogoal.domains.montezuma.sub_goals import SubGoal
+from hypogoal.domains.montezuma.emulator import DYING, ROOM, Emulator, Position
+from hypogoal.domains.montezuma.ladders import BASES, LADDERS, SHAFT_ENTRY, SHAFT_EXIT, TOPS
+from hypogoal.domains.montezuma.sub_goals import REACH, SubGoal
 
 ROLLOUT_STEPS = 40
-SETTLE = 4  # agent steps that fill the stack with frames of the start
 PHASES = (2, 200)  # frames for which the room's enemies move before the first step
 ROLLOUTS_PER_PHASE = 4
 STARTS = {  # shares, among the kinds that a room has
@@ -43,25 +42,24 @@ LAVA_BELOW = 220  # y; the agent stands on lava only if placed there
 
 
 class Shown(NamedTuple):
-    """One state of a rollout: the observation, uint8 (84, 84, 4), the RAM, uint8 (128,), and the last two actions."""
+    """One state of a rollout: the observation, uint8 (84, 84, 4), its facts, uint8 (8,), and the last two actions."""
 
     stack: Bytes
-    ram: Bytes
+    facts: Bytes
     action: int
     previous_action: int
 
     @property
     def dying(self) -> bool:
         """Whether the agent is dying."""
-        return bool(self.ram[RAM["dying"]] > 0)
+        return bool(self.facts[DYING])
 
 
 class Expert:
     """Plays in a room; ``rng`` draws all that it does.
 
-    A rollout begins at a spot of a sub-goal, in the midst of a ladder, at a side or anywhere; several of a kind take
-    turns. Its actions are repeated, most of them headings; some lead to a spot. It ends when the agent leaves the room
-    or would revive after a death.
+    A rollout begins at one of ``STARTS``; several of a kind take turns. Its actions are repeated, most of them
+    headings; some lead to a spot. It ends when the agent leaves the room or would revive after a death.
     """
 
     def __init__(
@@ -75,54 +73,50 @@ class Expert:
         self.room = room
         self.rng = rng
         self.places = standing_places(emulator, room)
-        self.spots = _in_room(room, [goal.spots for goal in sub_goals])
+        self.spots: list[Position] = []
+        sides: list[Position] = []
+        for goal in sub_goals:
+            self.spots += [spot for spot in goal.spots if spot.room == room]
+            sides += [side for side in goal.sides if side.room == room]
         starts: dict[str, Sequence[Any]] = {
             "spot": self.spots,
-            "side": _in_room(room, [goal.sides for goal in sub_goals]),
+            "side": sides,
             "ladder": climbs_in(room),
         }
         self.in_turn: dict[str, Iterator[Any]] = {}  # each kind's starts, in a random order, again and again
-        for kind, places in starts.items():
-            if places:
-                order = rng.permutation(len(places)).tolist()
-                self.in_turn[kind] = cycle([places[index] for index in order])
+        for kind, rows in starts.items():
+            if rows:
+                order = rng.permutation(rows)
+                self.in_turn[kind] = cycle(order.tolist())
         self.kinds = [kind for kind in STARTS if kind in self.in_turn or kind == "anywhere"]
         weights = np.array([STARTS[kind] for kind in self.kinds])
         self.chances = weights / weights.sum()
 
     def play(self) -> Iterator[Shown]:
-        """Endlessly, the states of rollouts."""
+        """Endlessly, the states of rollouts, of which some begin with the room's enemies in the same random phase."""
         while True:
-            scene = self._scene()
+            phase = int(self.rng.integers(*PHASES, endpoint=True))
+            scene = self.emulator.place(self.room, game.RIGHT_EDGE, game.EDGE_Y, phase=phase, settle=0)
+            if scene is None:
+                continue
             for _ in range(ROLLOUTS_PER_PHASE):
                 self.emulator.restore(scene)
                 first = self._begin()
                 if first is not None:
                     yield from self._rollout(first)
 
-    def _scene(self) -> game.Snapshot:
-        """The room with its enemies at a random phase; the agent is placed later."""
-        while True:
-            phase = int(self.rng.integers(*PHASES, endpoint=True))
-            entrance = (self.room, game.RIGHT_EDGE, game.EDGE_Y)
-            scene = self.emulator.place(*entrance, phase=phase, settle=0)
-            if scene is not None:
-                return scene
-
     def _begin(self) -> Shown | None:
         """Bring the agent to a start and fill the stack; None unless it is alive in the room then."""
-        emulator = self.emulator
         stays = self._place()
         action = previous = game.NOOP
-        for _ in range(SETTLE):
+        for _ in range(game.STACK):
             previous = action
             if stays:
-                action, _ = towards(emulator.position(), self.spots)
-            emulator.step(action)
-        outside = emulator.position().room != self.room
-        if outside or not emulator.alive():
-            return None
-        return Shown(emulator.stack, emulator.ram().copy(), action, previous)
+                action, _ = towards(self.emulator.position(), self.spots)
+            self.emulator.step(action)
+        shown = Shown(self.emulator.stack, self.emulator.facts(), action, previous)
+        stayed = shown.facts[ROOM] == self.room
+        return shown if stayed and not shown.dying else None
 
     def _place(self) -> bool:
         """Place the agent where a rollout begins; whether it is to stay at the spot while the stack fills."""
@@ -134,7 +128,7 @@ class Expert:
             row = rng.integers(len(self.places))
             x, y = self.places[row].tolist()
         elif kind == "ladder":
-            (_, x, y), action, longest = next(self.in_turn[kind])
+            x, y, action, longest = next(self.in_turn[kind])
             steps = int(rng.integers(1, longest + 1))
         else:
             _, x, y = next(self.in_turn[kind])
@@ -142,7 +136,8 @@ class Expert:
             share = HELD if kind == "spot" else 0.0
             stays = rng.random() < share
             if not stays:
-                action = (game.LEFT, game.RIGHT)[rng.integers(2)]
+                side = rng.integers(2)
+                action = (game.LEFT, game.RIGHT)[side]
                 steps = int(rng.integers(STEPS_ASIDE + 1))
         emulator.write("x", x)
         emulator.write("y", y)
@@ -152,40 +147,34 @@ class Expert:
     def _rollout(self, shown: Shown) -> Iterator[Shown]:
         """A state and those after it."""
         yield shown
-        for action in self._actions():
-            self.emulator.step(action)
-            ram = self.emulator.ram().copy()
-            following = Shown(self.emulator.stack, ram, action, shown.action)
-            revived = shown.dying and not following.dying
-            if revived or ram[RAM["room"]] != self.room or self.emulator.ale.game_over():
-                return
-            shown = following
-            yield shown
-
-    def _actions(self) -> Iterator[int]:
-        """The actions of a rollout, some of them towards the spots."""
         action, left = game.NOOP, 0
         homing = self.rng.random() if self.spots else 0.0
         for _ in range(ROLLOUT_STEPS):
             if left == 0:
                 action, left = self._next_action(homing)
             left -= 1
-            jitters = self.rng.random() < JITTER
-            yield int(self.rng.integers(game.N_ACTIONS)) if jitters else action
+            played = action
+            if self.rng.random() < JITTER:
+                played = int(self.rng.integers(game.N_ACTIONS))
+            self.emulator.step(played)
+            following = Shown(self.emulator.stack, self.emulator.facts(), played, shown.action)
+            revived = shown.dying and not following.dying
+            if revived or following.facts[ROOM] != self.room:
+                return
+            shown = following
+            yield shown
 
     def _next_action(self, homing: float) -> tuple[int, int]:
         """An action, towards a spot with the probability ``homing``, and its number of agent steps."""
         if self.rng.random() < homing:
             return towards(self.emulator.position(), self.spots)
         if self.rng.random() < HEADING:
-            action = HEADINGS[self.rng.integers(len(HEADINGS))]
+            number = self.rng.integers(len(HEADINGS))
+            action = HEADINGS[number]
         else:
             action = int(self.rng.integers(game.N_ACTIONS))
-        return action, int(self.rng.integers(1, LONGEST_REPEAT + 1))
-
-
-def _in_room(room: int, places: Iterable[Iterable[Position]]) -> list[Position]:
-    return [place for place in chain.from_iterable(places) if place.room == room]
+        steps = int(self.rng.integers(1, LONGEST_REPEAT + 1))
+        return action, steps
 
 
 def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
@@ -202,27 +191,25 @@ def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
     return game.NOOP, 1
 
 
-def climbs_in(room: int) -> list[tuple[Position, int, int]]:
-    """Each climb that begins in a room: its start, its action, and the most agent steps without leaving the room."""
+def climbs_in(room: int) -> list[tuple[int, int, int, int]]:
+    """Each climb that begins in a room: its x, y and action, and the most agent steps without leaving the room."""
     climbs = []
     for ladder in LADDERS:
         highest, lowest = ladder.top.y, ladder.base.y
         if ladder.joins_rooms:
             highest, lowest = SHAFT_ENTRY, SHAFT_EXIT
-        up = (highest - ladder.base.y) // STRIDE - 1
-        down = (ladder.top.y - lowest) // STRIDE - 1
-        if ladder.base.room == room:
-            climbs.append((ladder.base, game.UP, up))
-        if ladder.top.room == room:
-            climbs.append((ladder.top, game.DOWN, down))
+        ways = (ladder.base, game.UP, highest - ladder.base.y), (ladder.top, game.DOWN, ladder.top.y - lowest)
+        for start, action, height in ways:
+            if start.room == room:
+                climbs.append((start.x, start.y, action, height // STRIDE - 1))
     return climbs
 
 
 def standing_places(emulator: Emulator, room: int) -> Ints:
     """Places x, y (n, 2) of a room where an agent placed there stands on something, in the open.
 
-    Many places lie inside walls, where the game does not stop the agent from climbing about. So the agent's box must be
-    black, with something under its feet. Room 15 has no black places; for it, the row of entry is taken.
+    Many places lie inside walls, so the agent's box must be black, with something under its feet. Room 15 has no black
+    places; for it, the row of entry is taken.
     """
     black = ~game.picture(emulator, room).any(2)
     x = np.arange(game.LEFT_EDGE, game.RIGHT_EDGE + 1)
@@ -233,7 +220,9 @@ def standing_places(emulator: Emulator, room: int) -> Ints:
     body = boxes[:, :, :-1]
     feet = body[:, :, -FEET:]
     floor = boxes[:, :, -1]
-    stands = (body.mean((2, 3)) >= BLACK_SHARE) & feet.all((2, 3)) & (floor.mean(2) <= 0.5)
+    in_the_open = body.mean((2, 3)) >= BLACK_SHARE
+    has_floor = floor.mean(2) <= 0.5
+    stands = in_the_open & feet.all((2, 3)) & has_floor
     if room in LAVA_ROOMS:
         stands[y < LAVA_BELOW] = False
     rows, columns = np.nonzero(stands)

@@ -1,35 +1,68 @@
 """The sub-goals on Montezuma's Revenge (Spec I4): where each holds, by the console's memory, and rooms that label it.
 
 The paper has the first, ``CLIMB_DOWN``: the agent lives and is within ``REACH`` of a ladder's base, in x and in y. The
-others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``SUB_GOALS``. Where
+others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``ALL``. Where
 enemies and lasers are is in ``measured.toml``; where the authors' code differs, in docs/deviations.md.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from functools import partial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Bools, Bytes, Ints
-from hypogoal.domains.montezuma.emulator import RAM, Position
-from hypogoal.domains.montezuma.ladders import BASES, MEASURED, REACH, TOPS, place_of
+from hypogoal.core.arrays import Bools, Ints
+from hypogoal.domains.montezuma.emulator import DYING, OBJECT, ROOM, SKULL, Position, X, Y
+from hypogoal.domains.montezuma.ladders import BASES, FAR, MEASURED, TOPS
 
-FACTS = ("room", "x", "y", "skull", "object")  # the bytes of ``RAM`` that predicates read
-FACT_BYTES = [RAM[name] for name in FACTS]
-ROOM, X, Y = range(3)
+REACH = 2  # at a place: at most this far from it, in x and in y
+BETWEEN_SPOTS = 8  # RAM units
+LASER_Y = 235
+ROOMS = MEASURED["rooms"]  # by sub-goal
+ENEMIES = [*MEASURED["enemies"].values()]
+# By room, where an agent stands left of each laser gate, and right of it.
+GATES = {int(room): gates for room, gates in MEASURED["gates"].items()}
 Places: TypeAlias = tuple[Position, ...]
+
+
+class Region(NamedTuple):
+    """Where agents are: in a room, within these x and y; x is counted from that of the room's skull or spider if so."""
+
+    room: int
+    left: int
+    right: int
+    low: int
+    high: int
+    from_skull: bool = False
+    from_spider: bool = False
+
+
+def around(places: Iterable[Position], reach: int = REACH) -> Ints:
+    """The regions within ``reach`` of places, in x and in y, int64 (m, ``Region``)."""
+    regions = [Region(room, x - reach, x + reach, y - reach, y + reach) for room, x, y in places]
+    return np.array(regions)
+
+
+def inside(regions: Ints, facts: NDArray[np.integer]) -> Bools:
+    """Whether agents, facts (n, ``FACTS``), are in regions (m, ``Region``), bool (n, m)."""
+    room, left, right, low, high, *moving = regions.T
+    enemy = facts[:, [SKULL, OBJECT]] @ np.stack(moving)
+    x = facts[:, [X]] - enemy
+    y = facts[:, [Y]]
+    in_room = facts[:, [ROOM]] == room
+    in_width = (left <= x) & (x <= right)
+    in_height = (low <= y) & (y <= high)
+    return in_room & in_width & in_height
 
 
 @dataclass(frozen=True)
 class SubGoal:
-    """A sub-goal: it holds at ``places``, or beyond something that moves.
+    """A sub-goal: it holds for a living agent in one of its regions.
 
     Attributes:
-        places: where it holds; the last of them, for enemies: distances are to the nearest.
-        at: from facts (n, ``FACTS``) the index in ``places`` of the one at which it holds for a living agent, -1: none.
-        groups, unlabelled, others: rooms, see ``measured.toml``.
+        places: one in each region; distances are to the nearest.
+        regions: int64 (m, ``Region``).
         spots: where the expert begins and heads for.
         sides: where it begins, too.
         unclear: indices of places whose states are labelled nowhere.
@@ -37,124 +70,79 @@ class SubGoal:
 
     name: str
     places: Places
-    at: Callable[[Ints], Ints]
-    groups: Sequence[Sequence[int]]
-    unlabelled: Sequence[int]
-    others: Sequence[int]
+    regions: Ints
     spots: Places
     sides: Places = ()
-    unclear: frozenset[int] = frozenset()
+    unclear: Collection[int] = ()
+
+    def at(self, facts: NDArray[np.integer]) -> Ints:
+        """The index of the place at which agents are, facts (n, ``FACTS``), dead or alive; -1 for none; int64 (n,)."""
+        here = inside(self.regions, facts)
+        return np.where(here.any(1), here.argmax(1), -1)
 
 
-def facts_of(ram: Bytes) -> Ints:
-    """The bytes that predicates read, int64 (n, ``FACTS``), from RAM (n, 128)."""
-    return ram[:, FACT_BYTES].astype(np.int64)
-
-
-def labels_of(facts: Ints, alive: Bools, sub_goals: Iterable[SubGoal]) -> Bools:
-    """Spec B4: whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``) and whether the agent lives (n,)."""
+def labels_of(facts: NDArray[np.integer], sub_goals: Iterable[SubGoal]) -> Bools:
+    """Spec B4: whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``)."""
     reached = [sub_goal.at(facts) >= 0 for sub_goal in sub_goals]
-    return np.stack(reached, axis=1) & alive[:, None]
-
-
-@dataclass(frozen=True)
-class Enemy:
-    """An enemy, the floor that it is on, and when an agent there counts as past it."""
-
-    room: int
-    y: int  # of an agent on that floor
-    ends: tuple[int, int]  # x of an agent at the floor's left and right end
-    left: int  # past it on the left: x below this, relative to the enemy's
-    right: int  # past it on the right: x above this
-    byte: str = ""  # the byte of the enemy's x; empty: it stays, and ``left`` and ``right`` are x themselves
-
-    def beyond(self, side: str, facts: Ints) -> Bools:
-        """Whether agents, facts (n, ``FACTS``), stand on its floor and are past it on a side, bool (n,)."""
-        away = facts[:, X]
-        if self.byte:
-            away = away - facts[:, FACTS.index(self.byte)]
-        past = away < self.left if side == "left" else away > self.right
-        on_floor = np.abs(facts[:, Y] - self.y) <= REACH
-        return (facts[:, ROOM] == self.room) & on_floor & past
-
-
-ENEMIES = [Enemy(**enemy) for enemy in MEASURED["enemies"].values()]
-BETWEEN_SPOTS = 8  # RAM units
-# By room, where an agent stands left of each laser gate, and right of it.
-GATES = {int(room): gates for room, gates in MEASURED["gates"].items()}
-LASER_Y = 235
-
-
-def _at(places: Places, facts: Ints) -> Ints:
-    return place_of(facts[:, : len(Position._fields)], places)
-
-
-def _past(side: str, facts: Ints) -> Ints:
-    each = [enemy.beyond(side, facts) for enemy in ENEMIES]
-    past = np.stack(each, axis=1)
-    return np.where(past.any(1), past.argmax(1), -1)
+    lives = facts[:, [DYING]] == 0
+    return np.stack(reached, axis=1) & lives
 
 
 def _climb(name: str, ends: Places, others: Places) -> SubGoal:
     """Be at one end of a ladder; ends that are another ladder's other end are labelled nowhere (Spec B5)."""
-    unclear = frozenset(index for index, end in enumerate(ends) if end in others)
+    unclear = {index for index, end in enumerate(ends) if end in others}
     return SubGoal(
         name,
         places=ends,
-        at=partial(_at, ends),
+        regions=around(ends),
         spots=ends,
         sides=others,
         unclear=unclear,
-        **MEASURED["rooms"][name],
     )
 
 
 def _pass(side: str) -> SubGoal:
     """Be past an enemy on a side of it, on its floor."""
-    name = f"pass-enemy-{side}"
-    places, spots = [], []
+    places, spots, regions = [], [], []
     for enemy in ENEMIES:
-        first, last = enemy.ends
-        places.append(Position(enemy.room, first if side == "left" else last, enemy.y))
-        spots += [Position(enemy.room, x, enemy.y) for x in range(first, last + 1, BETWEEN_SPOTS)]
+        room, y = enemy["room"], enemy["y"]
+        first, last = enemy["ends"]
+        if side == "left":
+            end = first
+            left, right = -FAR, enemy["left"] - 1
+        else:
+            end = last
+            left, right = enemy["right"] + 1, FAR
+        byte = enemy.get("byte")
+        region = Region(room, left, right, y - REACH, y + REACH, byte == "skull", byte == "object")
+        regions.append(region)
+        places.append(Position(room, end, y))
+        spots += [Position(room, x, y) for x in range(first, last + 1, BETWEEN_SPOTS)]
     return SubGoal(
-        name,
+        f"pass-enemy-{side}",
         places=tuple(places),
-        at=partial(_past, side),
+        regions=np.array(regions),
         spots=tuple(spots),
-        **MEASURED["rooms"][name],
     )
 
 
 def _pass_lasers() -> SubGoal:
     """Stand left of a laser gate, as the authors' data do."""
-    name = "pass-lasers"
     before, behind = [], []
     for room, gates in GATES.items():
         before += [Position(room, left, LASER_Y) for left, _ in gates]
         behind += [Position(room, right, LASER_Y) for _, right in gates]
     places = tuple(before)
     return SubGoal(
-        name,
+        "pass-lasers",
         places=places,
-        at=partial(_at, places),
+        regions=around(places),
         spots=places,
         sides=tuple(behind),
-        **MEASURED["rooms"][name],
     )
 
 
 CLIMB_DOWN = _climb("climb-down-ladder", BASES, TOPS)
-ALL = (
-    CLIMB_DOWN,
-    _climb("climb-up-ladder", TOPS, BASES),
-    _pass("left"),
-    _pass("right"),
-    _pass_lasers(),
-)
+CLIMB_UP = _climb("climb-up-ladder", TOPS, BASES)
+ALL = (CLIMB_DOWN, CLIMB_UP, _pass("left"), _pass("right"), _pass_lasers())
 SUB_GOALS = {sub_goal.name: sub_goal for sub_goal in ALL}
-CROSSINGS = {  # starts from which to pass an enemy or a laser gate
-    "skull-right": Position(1, 133, 148),
-    "skull-left": Position(1, 21, 148),
-    "lasers": Position(0, 129, LASER_Y),
-}

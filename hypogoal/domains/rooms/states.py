@@ -83,11 +83,8 @@ def drawn(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
     for name in FACTORS:
         if name not in truth:
             truth[name] = rng.random(count) < 0.5
-    numbers = {name: holds.astype(np.int64) for name, holds in truth.items()}
-    colour = numbers["colour"]
-    shape = numbers["shape"]
-    right = numbers["place"]
-    many = numbers["count"]
+    every = np.array([truth[name] for name in FACTORS], np.int64)
+    colour, shape, right, many = every
     rows = np.arange(count)
 
     half = INNER // 2
@@ -100,8 +97,10 @@ def drawn(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
     # The cells in the order in which they get their contents: the object's first, one beside it last, so that it
     # stays free; the others at random.
     rank = rng.random((count, CELLS))
-    rank[rows, y * INNER + x] = -1.0
-    rank[rows, neighbour * INNER + x] = 2.0
+    cell = y * INNER + x
+    beside = neighbour * INNER + x
+    rank[rows, cell] = -1.0
+    rank[rows, beside] = 2.0
     cells = rank.argsort(axis=1)
 
     contents = np.full((count, CELLS), FLOOR)
