@@ -93,9 +93,9 @@ def arrives(emulator: game.Emulator, beginning: Beginning) -> bool:
         emulator.frames(beginning.action, game.FRAME_SKIP)
         if not emulator.alive():
             return False
-    there = around([beginning.end])
+    end = around([beginning.end])
     facts = emulator.facts()
-    return inside(there, facts[None]).item()
+    return inside(end, facts[None]).item()
 
 
 class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):

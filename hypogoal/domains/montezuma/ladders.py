@@ -75,8 +75,9 @@ def straight(positions: Ints, others: Ints) -> Ints:
     """The Manhattan distance of positions (n, 3) from others (m, 3), ``FAR`` between regions; int64 (n, m)."""
     apart = plane(positions)[:, None] - plane(others)
     away = np.abs(apart).sum(2)
-    here, there = positions[:, 0], others[:, 0]
-    is_joined = region_of(here)[:, None] == region_of(there)
+    region = region_of(positions[:, 0])
+    other_region = region_of(others[:, 0])
+    is_joined = region[:, None] == other_region
     return np.where(is_joined, away, FAR)
 
 

@@ -77,8 +77,8 @@ class SubGoal:
 
     def at(self, facts: NDArray[np.integer]) -> Ints:
         """The index of the place at which agents are, facts (n, ``FACTS``), dead or alive; -1 for none; int64 (n,)."""
-        here = inside(self.regions, facts)
-        return np.where(here.any(1), here.argmax(1), -1)
+        is_inside = inside(self.regions, facts)
+        return np.where(is_inside.any(1), is_inside.argmax(1), -1)
 
 
 def labels_of(facts: NDArray[np.integer], sub_goals: Iterable[SubGoal]) -> Bools:
