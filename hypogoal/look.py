@@ -91,12 +91,11 @@ def outcome(details: Details) -> list[str]:
         return count_lines(numbers)
     if kind == EVALUATION:
         from hypogoal.evaluation.questions import answers, summary
-        from hypogoal.evaluation.run import fitting, read_results
+        from hypogoal.evaluation.run import read_results
 
         path = Path(details["path"])
         results = read_results(Artefact(path))
-        with fitting(path):
-            table = drawn(summary(results, answers(results)), WIDTH)
+        table = drawn(summary(results, answers(results)), WIDTH)
         return [line.rstrip() for line in table.splitlines()]
     if kind == "comparison":
         from hypogoal.evaluation.compare import read_pairs, winners

@@ -15,6 +15,7 @@ option agents 213e512, PPO and DQN 8bd54d8, the paper's networks af805d0, withou
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.curves import budget_of, run_numbers
 from hypogoal.evaluation.frozen import ENVIRONMENTS, play
-from hypogoal.evaluation.run import find_artefacts, read_layout
+from hypogoal.evaluation.run import find_artefacts
 from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
@@ -81,7 +82,8 @@ class Run:
 def read_run(artefact: Artefact) -> Run:
     """The episodes and the layout of one trained agent."""
     episodes = Episodes.read(artefact.path / "episodes.csv")
-    return Run(artefact.seed, artefact.config, episodes, read_layout(artefact.path / "layout.json").model_dump())
+    layout = json.loads((artefact.path / "layout.json").read_bytes())
+    return Run(artefact.seed, artefact.config, episodes, layout)
 
 
 def collect(run: Path, path: Path) -> None:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from hypogoal.domains.montezuma.domain import DOMAIN
 from hypogoal.evaluation.distance import BEGAN_INSIDE, HIT, last_executions, stops_over_rooms
+from hypogoal.evaluation.plots import styled
 from hypogoal.options.tables import Executions
 from studies.cells import table
 
@@ -99,7 +100,8 @@ def draw(path: Path, seed: int, picture: Path) -> None:
         options[title] = pd.DataFrame(places, columns=["room", "x", "y", "fate"])
         options[title][["column", "row"]] = DOMAIN.pixel(places[:, :3])
     rooms = {int(room) for _, places in shown for room in places[:, 0]}
-    stops_over_rooms({str(room): DOMAIN.picture(room) for room in rooms}, options).savefig(picture, dpi=100)
+    with styled():
+        stops_over_rooms({str(room): DOMAIN.picture(room) for room in rooms}, options).savefig(picture, dpi=100)
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """Which held-out states are shown, and attributions of members to them (Spec F2, F6)."""
 
 from collections.abc import Iterator, Mapping
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,8 @@ import pandas as pd
 from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
-from hypogoal.evaluation.house import tidy_members
-from hypogoal.evaluation.judging import (
-    Judgement,
-    Work,
-    place_of,
-    states_of,
-)
+from hypogoal.evaluation.house import melted
+from hypogoal.evaluation.judging import Judged, Judgement, Work, place_of, states_of
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 GALLERY = 40  # states of all sub-goals
@@ -32,96 +28,70 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
     numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
     """
-    from hypogoal.hypotheses.deep_lift import (
-        DEEP_LIFT,
-        attributed,
-        mean_state,
-        method_of,
-    )
+    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, mean_state, method_of
+    from hypogoal.hypotheses.ensemble import read_ensemble
 
-    case, sub_goal, split = judgement.case, judgement.sub_goal, judgement.split
-    if case.ensemble != work.browsed or not len(split.labels):
+    artefact, data, sub_goal, judged = judgement
+    if artefact.path != work.browsed or not len(judged.labels):
         return
-    place = work.place_of(judgement)
+    place, sub_goals = work.place_of(judgement), artefact.config["sub_goals"]
     looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})
-    dataset, ensemble = open_dataset(case.data), case.read(sub_goal)
-    heldout, unlabelled = states_of(case.data)
+    dataset, ensemble = open_dataset(data), read_ensemble(artefact.path, artefact.config, sub_goal)
+    heldout, unlabelled = states_of(data)
     observations = heldout[sub_goal].observations
     are_pictures = dataset.observation_dtype == PICTURE
     kinds: list[str] = []
-    states = explained = spread_rows(len(split.labels), AVERAGED)
+    states = explained = spread_rows(len(judged.labels), AVERAGED)
     if are_pictures:
-        kinds, states = states_to_show(judgement)
+        kinds, states = states_to_show(judged, sub_goal, GALLERY // len(sub_goals))
         few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
-        explained = states[: max(len(kinds), few // len(case.config["sub_goals"]))]
+        explained = states[: max(len(kinds), few // len(sub_goals))]
     seen = ensemble.see(observations[explained])
     attributions = attributed(ensemble, seen, mean_state(ensemble.see(unlabelled)))
     error = attributions.completeness_error()
-    facts = {
-        "kinds": kinds,
-        "how": attributions.method,
-        "completeness_error": error.max(),
-    }
+    facts = {"kinds": kinds, "how": attributions.method, "completeness_error": error.max()}
     looked_at["sub_goals"][sub_goal] = facts
     values: Any = attributions.values
     group = work.arrays.create_group(f"saliency/{sub_goal}")
     if are_pictures:
         default = 3 if dataset.observation_shape[-1] == 3 else 1
         facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
-        facts["places"] = [place_of(split.origins, state) for state in states]
+        facts["places"] = [place_of(judged.origins, state) for state in states]
         group["observations"] = observations[states]
-        group["labels"] = split.labels[states]
-        group["probabilities"] = judgement.judged.probabilities[states]
-        group["predictions"] = judgement.judged.predictions[states]
+        for name in ("labels", "probabilities", "predictions"):
+            group[name] = getattr(judged, name)[states]
         group["seen"] = seen
     else:
         facts["features"] = dataset.features()
         values = of_features(values.reshape(*error.shape, -1), seen.dtype)
-    group.create_dataset(
-        "attributions",
-        data=values.astype(np.float32),
-        compression="gzip",
-    )
+    group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
     for row, kind in enumerate(kinds):
         columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
-        yield tidy_members(columns, **place, scope=f"state: {kind}")
+        yield melted(columns, **place, scope=f"state: {kind}")
 
 
-def states_to_show(judgement: Judgement) -> tuple[list[str], Ints]:
+def states_to_show(judged: Judged, sub_goal: str, most: int) -> tuple[list[str], Ints]:
     """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
-    labels, origins = judgement.split.labels, judgement.split.origins
-    predictions = judgement.judged.predictions
+    labels, origins = judged.labels, judged.origins
     allowed = origins.get("seen", np.zeros(len(labels))) == 0
     if not labels[allowed].any():
         allowed[:] = True
-    kinds = pick_to_explain(
-        judgement.judged.probabilities,
-        predictions,
-        labels,
-        allowed,
-    )
+    kinds = pick_to_explain(judged.probabilities, judged.predictions, labels, allowed)
     places = {name: origins[name] for name in PLACES if name in origins}
-    rng = rng_for(0, "browse", judgement.sub_goal)
-    browsed = pick_for_gallery(
-        predictions,
-        labels,
-        places,
-        rng,
-    )
+    browsed = pick_for_gallery(judged.predictions, labels, places, rng_for(0, "browse", sub_goal))
     states = pd.unique(np.array([*kinds.values(), *browsed]))
-    return [*kinds], states[: GALLERY // len(judgement.case.config["sub_goals"])]
+    return [*kinds], states[:most]
 
 
 def of_features(values: Floats, dtype: Any) -> Floats:
     """Attributions (n, K, D) to each number; of mixed observations those to a picture are added up."""
-    from hypogoal.hypotheses.deep_lift import by_key
-
     if not dtype.names:
         return values
     features = []
-    of_keys = by_key(values, dtype)
-    for key, (kind, _) in fields_of((), dtype).items():
-        of_key = of_keys[key].reshape(*values.shape[:2], -1)
+    start = 0
+    for kind, shape in fields_of((), dtype).values():
+        of_key = values[..., start : start + prod(shape)]
+        start += prod(shape)
         features.append(of_key.sum(axis=-1, keepdims=True) if kind == PICTURE else of_key)
     return np.concatenate(features, axis=-1)
 

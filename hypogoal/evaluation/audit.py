@@ -5,14 +5,13 @@ its positive predictions. So options are learned that end at these, and the trut
 up.
 """
 
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import compress
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.special import expit
 
 from hypogoal.core.arrays import Floats, Ints
@@ -56,14 +55,8 @@ def terminations_of(
         engine.standard = standard or standard_of(engine.observation_shape)
     rule = load_rule(setup.config.termination)
     rule.refuse(setup.config, engine)
-    edges = log_odds_of(np.array([*policies.values()]))
-    return rule(
-        log_odds,
-        len(policies),
-        None,
-        edges.astype(np.float32),
-        engine.count,
-    )
+    edges = log_odds_of(np.array([*policies.values()])).astype(np.float32)
+    return rule(log_odds, len(policies), None, edges, engine.count)
 
 
 def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict[str, Any]:
@@ -97,24 +90,30 @@ def findings(
 ) -> dict[str, Any]:
     """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
 
-    Of each of the most frequent kinds of false positives a film is put into ``folder``, of pictures.
+    False positives are of one kind where the same sub-goals hold, in the same cell if that is known. Of each of the
+    most frequent kinds a film is put into ``folder``, of pictures.
     """
+    engine = loop.engine
     threshold = expit(loop.terminations.thresholds[option].astype(np.float64))
     table = Exploits.read(folder / Exploits.FILE)
     last = table.at(table.option == option)
     executions = loop.recorder.executions[option]
     fooled = [*compress(executions, last.reached & ~last.near)]
+    ends = np.array([run.states[-1] for run in fooled], np.int64)
+    labels = engine.labels(ends)
+    positions = engine.positions(ends) if engine.position_names else np.empty((len(ends), 0), np.int64)
+    marks = pd.DataFrame(np.column_stack([labels, positions // CELL]))
+    alike_ones = [rows.index for _, rows in marks.groupby([*marks])]
     kinds = []
-    for number, alike in enumerate(kinds_of(loop.engine, fooled)):
+    for number, alike in enumerate(sorted(alike_ones, key=len, reverse=True)):
+        shortest = min(alike, key=lambda row: fooled[row].duration)
         film = f"{name}-{number + 1}.gif"
-        shortest = min(alike, key=attrgetter("duration"))
-        is_drawn = number < FILMS and _write_film(folder / film, loop, name, shortest)
-        labels, position = _end(loop.engine, shortest)
+        is_drawn = number < FILMS and _write_film(folder / film, loop, name, fooled[shortest])
         kinds.append(
             {
                 "executions": len(alike),
-                "holds": [*compress(sub_goals, labels)],
-                "position": dict(zip(loop.engine.position_names, position, strict=True)),
+                "holds": [*compress(sub_goals, labels[shortest])],
+                "position": dict(zip(engine.position_names, positions[shortest], strict=True)),
                 "film": film if is_drawn else None,
             }
         )
@@ -129,29 +128,7 @@ def findings(
     }
 
 
-def kinds_of(engine: Engine, fooled: Iterable[Any]) -> list[list[Any]]:
-    """False positives of one kind, the most frequent first: the same sub-goals hold, the cell is the same, if known."""
-    kinds = defaultdict(list)
-    for run in fooled:
-        labels, position = _end(engine, run)
-        kinds[*labels, *position // CELL].append(run)
-    by_mark = [kinds[mark] for mark in sorted(kinds)]
-    return sorted(by_mark, key=len, reverse=True)
-
-
-def _end(engine, run):
-    """Which sub-goals hold where an execution ended, and where that was, empty if the engine does not know."""
-    ids = np.array(run.states[-1:])
-    positions = engine.positions(ids) if engine.position_names else np.empty((1, 0), np.int64)
-    return engine.labels(ids)[0], positions[0]
-
-
-def _write_film(
-    path,
-    loop,
-    name,
-    run,
-):
+def _write_film(path, loop, name, run):
     """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
     ids = np.array([run.began, *run.states])
     engine, timeout = loop.engine, loop.config.option_timeout

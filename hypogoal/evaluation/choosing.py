@@ -19,7 +19,8 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import house
 from hypogoal.evaluation.names import UNIFORM
-from hypogoal.evaluation.run import takes
+from hypogoal.evaluation.run import choice_of
+from hypogoal.evaluation.selection import engine_on
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
@@ -35,11 +36,7 @@ TITLE = "What choosing is worth"
 BY = ["method", "chooser"]
 
 
-def qualities(
-    loop: OptionLoop,
-    goals: Ints,
-    states: Ints,
-) -> Doubles:
+def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
     Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
@@ -68,13 +65,8 @@ def qualities(
         ids = distinct[begins]
         going = np.arange(len(ids))
         for age in range(timeout):
-            options = np.full(len(going), option)
-            actions = loop.learner.act(
-                ids[going],
-                options,
-                np.full(len(going), age),
-                explore=False,
-            )
+            options, ages = np.full((2, len(going)), [[option], [age]])
+            actions = loop.learner.act(ids[going], options, ages, explore=False)
             ids[going] = plan.following[place[ids[going]], column[actions]]
             ended = loop.terminations.of_running(ids[going], options)
             final = plan.final[place[ids[going]]]
@@ -85,11 +77,7 @@ def qualities(
     return qualities
 
 
-def judge(
-    choices: Choices,
-    quality: Doubles,
-    members: int,
-) -> dict[str, Any]:
+def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
     ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
@@ -106,11 +94,7 @@ def judge(
     shares = among / counts[several][:, None]
     expected = shares.sum(axis=0).round(house.DIGITS)  # in any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
-    preference = np.where(
-        house.at_least(expected, LEAST),
-        chosen / np.maximum(expected, 1e-12),
-        np.nan,
-    )
+    preference = chosen / np.where(house.at_least(expected, LEAST), expected, np.nan)
     return {
         "preference": preference,
         "within_rho": _within_rho(quality, preference, goals),
@@ -119,11 +103,7 @@ def judge(
     }
 
 
-def _within_rho(
-    quality,
-    preference,
-    goals,
-):
+def _within_rho(quality, preference, goals):
     both = pd.DataFrame({"quality": quality, "preference": preference}).dropna()
     rhos = []
     for _, alike in both.groupby(goals[both.index]):
@@ -133,12 +113,7 @@ def _within_rho(
     return pd.Series(rhos, dtype=float).mean()
 
 
-def _better_of_two(
-    quality,
-    taken,
-    among,
-    goals,
-):
+def _better_of_two(quality, taken, among, goals):
     better, both = 0, 0
     for pair in combinations(range(len(quality)), 2):
         bad, good = sorted(pair, key=quality.__getitem__)
@@ -149,19 +124,13 @@ def _better_of_two(
     return better / both if both else math.nan
 
 
-def _score(
-    quality,
-    taken,
-    among,
-):
-    known = np.where(among, quality, np.nan)
-    compared = (np.isfinite(known).sum(axis=1) > 1) & np.isfinite(quality[taken])
-    if not compared.any():
-        return math.nan
-    values = known[compared]
-    average = np.nanmean(values, axis=1)
-    gain = (np.nanmax(values, axis=1) - average).sum()
-    gained = (quality[taken[compared]] - average).sum()
+def _score(quality, taken, among):
+    known = pd.DataFrame(np.where(among, quality, np.nan))
+    own = quality[taken]
+    compared = (known.count(axis=1) > 1) & np.isfinite(own)
+    average = known.mean(axis=1)
+    gain = (known.max(axis=1) - average)[compared].sum()
+    gained = (own - average)[compared].sum()
     return gained / gain if house.above(gain, 0.0) else math.nan
 
 
@@ -178,15 +147,13 @@ def rows(work):
         agent, uniform, members = played
         yield house.tidy(agent, **place)
         yield house.tidy(uniform, **place | {"method": UNIFORM})
-        yield house.of_options(members, artefact.config, **place)
+        yield house.melted(members, house.options_of(artefact.config), **place)
 
 
 def is_playable(artefact: Artefact) -> bool:
     """Whether it chose to learn among options that can be asked in any state, of one layout of a known domain."""
     config = artefact.config
-    if artefact.kind != "meta" or not takes(artefact) or config["chooser"] == "random":
-        return False
-    if ":" in config["termination"]:  # a rule of one's own may ask for more than a state
+    if choice_of(artefact) != "learned" or ":" in config["termination"]:  # a rule of one's own may ask for more
         return False
     # Of many layouts the states are too many to say what follows in each.
     if config["network"] not in MEMORYLESS or config.get("layouts"):
@@ -205,7 +172,7 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
 
     config, seed = artefact.config, artefact.seed
     # one game first, since many take long to begin
-    if not is_playable(artefact) or agent_of(artefact, seed).engine.plan() is None:
+    if not is_playable(artefact) or engine_on(config, [config["layout_seed"]]).plan() is None:
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
     of_options = house.options_of(config).get_level_values("sub_goal")
@@ -221,16 +188,10 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
     return numbers[0], numbers[1], {"quality": quality, "conditional_preference": preferences[0]}
 
 
-def runs(results):
+def context(results):
     """Each agent (``chooser`` its own), and uniform-random choice among its own options."""
-    return with_choosers(
-        house.per_run(
-            results.of(sub_goal=""),
-            *OF_PLAY,
-            *OF_CHOICE,
-            scope=FROZEN,
-        )
-    )
+    runs = house.per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN)
+    return house.tables_of(with_choosers(runs), BY)
 
 
 def with_choosers(runs: pd.DataFrame) -> pd.DataFrame:

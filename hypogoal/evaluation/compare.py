@@ -1,36 +1,22 @@
 """Several evaluated runs side by side: whether they can be compared, what differs, and who wins (Spec F5, F7)."""
 
 import os
-from collections.abc import (
-    Iterator,
-    Mapping,
-    Sequence,
-)
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import pandas as pd
 
 from hypogoal.core.files import reading
-from hypogoal.evaluation import (
-    curves,
-    distance,
-    hypotheses,
-    rooms,
-)
-from hypogoal.evaluation.house import over, pairs
-from hypogoal.evaluation.page import (
-    DASH,
-    Drawn,
-    Results,
-    draw_page,
-    lines_of,
-    listed,
-)
+from hypogoal.evaluation import curves, distance, hypotheses, rooms
+from hypogoal.evaluation.house import pairs
+from hypogoal.evaluation.page import DASH, Drawn, Results, lines_of, listed, render
 from hypogoal.evaluation.provenance import domains_of, settings_of
-from hypogoal.evaluation.questions import name_of, paired_runs
+from hypogoal.evaluation.questions import Context, context_of, name_of
 
 Runs = Mapping[str, Results]  # by a run's label
+Shared = Mapping[ModuleType, Mapping[str, Context]]  # see :func:`shared`
 QUESTIONS = (curves, hypotheses, rooms, distance)
 FIRST = 4  # lines that the page begins with
 
@@ -41,13 +27,22 @@ def labels_of(paths: Sequence[str]) -> list[str]:
     return [os.path.relpath(path, common) for path in paths]
 
 
-def shared(runs: Runs) -> list[ModuleType]:
-    """The questions of which every run has results."""
-    every = runs.values()
-    return [question for question in QUESTIONS if all(map(len, map(question.runs, every)))]
+def shared(runs: Runs) -> Shared:
+    """The questions of which every run has results, and what these are, by the run's label."""
+    found = {}
+    for question in QUESTIONS:
+        contexts = {label: context_of(question, results) for label, results in runs.items()}
+        if all(contexts.values()):
+            found[question] = contexts
+    return found
 
 
-def why_not(runs: Runs) -> str | None:
+def of_runs(contexts: Mapping[str, Context], name: str) -> pd.DataFrame:
+    """The tables of this name, one run's after another's, with a column ``run``."""
+    return pd.concat([context[name].assign(run=label) for label, context in contexts.items()])
+
+
+def why_not(runs: Runs, found: Shared) -> str | None:
     """Why runs cannot be compared, in a few words; None where they can.
 
     They must be of one domain and have at least one kind of result in common.
@@ -56,7 +51,7 @@ def why_not(runs: Runs) -> str | None:
     if len({*domains.values()}) > 1:
         each = "; ".join(map(": ".join, domains.items()))
         return f"they are of different domains ({each})"
-    return None if shared(runs) else "they have no kind of result in common"
+    return None if found else "they have no kind of result in common"
 
 
 def differences(runs: Runs) -> pd.DataFrame:
@@ -67,17 +62,14 @@ def differences(runs: Runs) -> pd.DataFrame:
     return by_run[by_run.nunique(axis=1) > 1].rename_axis(columns=None).reset_index()
 
 
-def compare_runs(runs: Runs) -> pd.DataFrame:
+def compare_runs(found: Shared) -> pd.DataFrame:
     """Spec F5: the first run against each other, ``agent`` by agent and method by method, over what they share."""
     parts = []
-    for question in shared(runs):
-        values = [
-            paired_runs(question, results, question.runs(results)).assign(run=label) for label, results in runs.items()
-        ]
-        for method, alike in pd.concat(values).groupby("method", sort=False):
-            if alike["run"].nunique() == len(runs):
+    for contexts in found.values():
+        for method, alike in of_runs(contexts, "compared").groupby("method", sort=False):
+            if alike["run"].nunique() == len(contexts):
                 parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))
-    return pd.concat(parts) if parts else pd.DataFrame(columns=["of", "quantity", "first", "second"])
+    return pd.concat(parts) if parts else pd.DataFrame(columns=["N", "quantity", "first", "second", "of"])
 
 
 def read_pairs(path: Path) -> pd.DataFrame:
@@ -89,27 +81,20 @@ def read_pairs(path: Path) -> pd.DataFrame:
 def winners(compared: pd.DataFrame) -> list[str]:
     """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
     rows = compared.astype(object).where(compared.notna(), None)
-    return lines_of("winners.txt", {"pairs": rows.to_dict("records")})
+    return lines_of("winners.txt", pairs=rows.to_dict("records"))
 
 
-def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[str, pd.DataFrame]]:
+def page_of(runs: Runs, found: Shared, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[str, pd.DataFrame]]:
     """The page of a comparison, its figures, and its tables by name."""
-    tables = {"pairs": compare_runs(runs), "differences": differences(runs)}
-    figures = list(_curves(runs))
-    label, first = next(iter(runs.items()))
+    tables = {"pairs": compare_runs(found), "differences": differences(runs)}
     titles = {}
-    for question in shared(runs):
+    for question, contexts in found.items():
         name = name_of(question)
         titles[name] = question.TITLE
-        of_runs = [
-            over(
-                question.runs(results),
-                question.BY,
-            ).assign(run=label)
-            for label, results in runs.items()
-        ]
-        tables[name] = pd.concat(of_runs).sort_values(question.BY, kind="stable")
-    context = {
+        tables[name] = of_runs(contexts, "table").sort_values(question.BY, kind="stable")
+    figures = [*_curves(runs)]
+    label, first = next(iter(runs.items()))
+    section = {
         "name": "compared",
         "title": "What is compared",
         "folded": False,
@@ -121,10 +106,10 @@ def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[st
         "figures": [],
         "curves": figures,
     }
-    page = draw_page(
-        f"hypogoal: {len(runs)} runs compared",
-        [context],
+    page = render(
         "lines.html",
+        title=f"hypogoal: {len(runs)} runs compared",
+        sections=[section],
         about=listed(domains_of(first)),
         lines=winners(tables["pairs"])[:FIRST],
     )
@@ -134,17 +119,9 @@ def page_of(runs: Runs, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[st
 def _curves(runs: Runs) -> Iterator[Drawn]:
     """Of each agent that every run has its reward and length, a line per run."""
     points = [results.of(quantity=[*curves.FIGURES]).assign(run=label) for label, results in runs.items()]
-    for (name, quantity), drawn in (
-        pd.concat(points)
-        .dropna(subset="step")
-        .groupby(
-            [
-                "method",
-                "quantity",
-            ]
-        )
-    ):
+    every = pd.concat(points).dropna(subset="step")
+    for (name, quantity), drawn in every.groupby(["method", "quantity"]):
         if drawn["run"].nunique() == len(runs) and drawn["value"].nunique() > 1:
             _, label, _ = curves.FIGURES[str(quantity)]
-            figure = curves.learning_curves(drawn.assign(method=drawn["run"]), label)
-            yield Drawn(f"{quantity}-{name}", f"{name}: {label.lower()}", figure)
+            draw = partial(curves.learning_curves, drawn.assign(method=drawn["run"]), label)
+            yield Drawn(f"{quantity}-{name}", f"{name}: {label.lower()}", draw)

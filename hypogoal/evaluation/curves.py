@@ -1,31 +1,19 @@
 """Figure 6: what agents achieve on layouts that no data came from, over training and at its end (Spec E6, E7, F5)."""
 
+import json
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import (
-    Bools,
-    Doubles,
-    Ints,
-)
-from hypogoal.evaluation.house import (
-    at_least,
-    melted,
-    per_run,
-    tidy,
-)
+from hypogoal.core.arrays import Bools, Doubles, Ints
+from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
 from hypogoal.evaluation.page import Drawn, Results
-from hypogoal.evaluation.plots import (
-    DOTTED,
-    legend_below,
-    plot,
-    styled,
-)
-from hypogoal.evaluation.run import read_layout, takes
+from hypogoal.evaluation.plots import DOTTED, legend_below, plot
+from hypogoal.evaluation.run import choice_of
 from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Episodes
 
@@ -54,11 +42,7 @@ FIGURES = {  # file, label, and what is dotted across
 }
 
 
-def scores(
-    succeeded: Bools,
-    steps: Ints,
-    shortest: float | Doubles | None,
-) -> dict[str, Doubles]:
+def scores(succeeded: Bools, steps: Ints, shortest: float | Doubles | None) -> dict[str, Doubles]:
     """``success``, and success within so many times the shortest path, ``WITHIN``: 1 or 0 of each episode (E, ...).
 
     ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
@@ -85,38 +69,30 @@ def table_of(episodes: Episodes) -> pd.DataFrame:
     return pd.DataFrame(columns, dtype=float)
 
 
-def curves(
-    episodes: Episodes,
-    grid: Ints,
-    window: int = LAST,
-) -> pd.DataFrame:
-    """Figure 6: means of the last ``window`` episodes known by each step of ``grid`` (G,), its index.
+def curves(episodes: Episodes, grid: Ints) -> pd.DataFrame:
+    """Figure 6: means of the last ``LAST`` episodes known by each step of ``grid`` (G,), its index.
 
     From ``FIRST`` on. Columns reward, success, length and solved_length; that is NaN where none is solved.
     """
     values = table_of(episodes).drop(columns=["ended", "cut"])
-    means = values.rolling(window, min_periods=1).mean()
+    means = values.rolling(LAST, min_periods=1).mean()
     count = np.searchsorted(episodes.step, grid, side="right")
     enough = count >= FIRST
     return means.loc[count[enough] - 1].set_axis(grid[enough]).rename_axis("step")
 
 
-def run_numbers(
-    episodes: Episodes,
-    shortest_path: int | None,
-    window: int = LAST,
-) -> dict[Any, float]:
-    """Spec F5: the numbers of one run, over its last ``window`` training episodes at most; NaN without episodes.
+def run_numbers(episodes: Episodes, shortest_path: int | None) -> dict[Any, float]:
+    """Spec F5: the numbers of one run, over its last ``LAST`` training episodes at most; NaN without episodes.
 
     ``shortest_path``: primitive steps from the start to the goal at least; None or 0 where unknown. ``steps_to_95``:
-    the first step at which 95 % of the last ``window`` had succeeded; NaN: never, or too few.
+    the first step at which 95 % of the last ``LAST`` had succeeded; NaN: never, or too few.
     """
-    last = episodes.last(window)
+    last = episodes.last()
     shortest = shortest_path or np.nan
     near = scores(last.succeeded, last.length, shortest)["near"]
     means = table_of(last).assign(near=near).mean()
-    solved = pd.Series(episodes.succeeded).rolling(window).sum()
-    reached = at_least(solved, SOLVED * window)
+    solved = pd.Series(episodes.succeeded).rolling(LAST).sum()
+    reached = at_least(solved, SOLVED * LAST)
     return {
         **means.to_dict(),
         "episodes": len(episodes),
@@ -140,12 +116,12 @@ def rows(work):
     random = {}
     for artefact in agents:
         place, steps = work.place(artefact), budget_of(artefact.config)
-        layout = read_layout(artefact.path / "layout.json")
+        layout = json.loads((artefact.path / "layout.json").read_bytes())
         episodes = Episodes.read(artefact.path / Episodes.FILE)
-        numbers = run_numbers(episodes, layout.shortest_path)
-        yield tidy({"steps": steps, "shortest_path": layout.shortest_path, **numbers}, **place)
+        numbers = run_numbers(episodes, layout["shortest_path"])
+        yield tidy({"steps": steps, "shortest_path": layout["shortest_path"], **numbers}, **place)
         yield melted(curves(episodes, grid[grid <= steps]), **place)
-        random[None if layout.layouts else place["layout"]] = layout.random_success
+        random[None if layout.get("layouts") else place["layout"]] = layout["random_success"]
     for seed, success in random.items():
         yield tidy({"random_success": success}, layout=seed)
 
@@ -154,10 +130,8 @@ def facts(work):
     """Of each agent, by its name, its ``members``, and ``choice``: learned, random, or none of members."""
     agents = {}
     for artefact in work.contents.agents:
-        config, choice = artefact.config, ""
-        if artefact.kind == "meta" and takes(artefact):
-            choice = "random" if config["chooser"] == "random" else "learned"
-        agents[work.place(artefact)["method"]] = {"members": config.get("members"), "choice": choice}
+        name, members = work.place(artefact)["method"], artefact.config.get("members")
+        agents[name] = {"members": members, "choice": choice_of(artefact)}
     return {"agents": agents}
 
 
@@ -167,15 +141,15 @@ def chosen_by(results: Results, choice: str) -> dict[str, dict[str, Any]]:
     return {name: agent for name, agent in agents.items() if agent["choice"] == choice}
 
 
-def runs(results):
-    """Every agent's numbers."""
-    agents = [*results.facts["agents"]]
-    return per_run(results.of(method=agents), *QUANTITIES)
+def context(results):
+    """Every agent's numbers; Figure 6."""
+    agents = results.of(method=[*results.facts["agents"]])
+    found = tables_of(per_run(agents, *QUANTITIES), BY, PAIRED)
+    return found and {**found, "figures": [*_figures(results)]}
 
 
-def figures(context):
+def _figures(results):
     """Figure 6 and the same of the length of solved episodes, where it is not the same everywhere."""
-    results = context["results"]
     for quantity, (name, label, reference) in FIGURES.items():
         drawn = results.of(quantity=quantity).dropna(subset="step")
         if drawn.empty or (quantity != "reward" and drawn["value"].nunique() < 2):
@@ -183,37 +157,26 @@ def figures(context):
         references = results.of(quantity=reference).drop_duplicates("layout")["value"]
         if quantity == "reward" and not drawn["value"].between(0, 1).all():
             references = references[:0]  # a share of episodes says nothing beside other rewards
-        figure = learning_curves(drawn, label, references.mean())
-        yield Drawn(name, label, figure, {"dotted": reference if len(references) else ""})
+        draw = partial(learning_curves, drawn, label, references.mean())
+        yield Drawn(name, label, draw, {"dotted": reference if len(references) else ""})
 
 
-def learning_curves(
-    drawn: pd.DataFrame,
-    label: str,
-    reference: float = np.nan,
-) -> Figure:
+def learning_curves(drawn: pd.DataFrame, label: str, reference: float = np.nan) -> Figure:
     """Figure 6: a quantity of episodes against environment steps, a line per method, a ``reference`` dotted across.
 
     ``drawn`` are rows of the table of numbers. The mean over layouts, or runs of one layout, and a band of one standard
     error.
     """
     unit = "layout" if drawn["layout"].nunique() > 1 else "artefact"
-    with styled():
-        figure, axes = plot(2.9)
-        for method, rows in drawn.groupby("method", sort=False):
-            values = rows.pivot_table(index="step", columns=unit, values="value", dropna=False)
-            steps = values.index.astype(float) / 1000
-            middle, wide = values.mean(axis=1), values.sem(axis=1)
-            [line] = axes.plot(steps, middle, label=method)
-            axes.fill_between(
-                steps,
-                middle - wide,
-                middle + wide,
-                color=line.get_color(),
-                alpha=0.18,
-                linewidth=0,
-            )
-        axes.axhline(reference, **DOTTED)
-        axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
-        legend_below(figure, 2)
+    figure, axes = plot(2.9)
+    for method, rows in drawn.groupby("method", sort=False):
+        values = rows.pivot_table(index="step", columns=unit, values="value", dropna=False)
+        steps = values.index.astype(float) / 1000
+        middle, wide = values.mean(axis=1), values.sem(axis=1)
+        [line] = axes.plot(steps, middle, label=method)
+        colour = line.get_color()
+        axes.fill_between(steps, middle - wide, middle + wide, color=colour, alpha=0.18, linewidth=0)
+    axes.axhline(reference, **DOTTED)
+    axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
+    legend_below(figure, 2)
     return figure

@@ -1,6 +1,7 @@
 """Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders (Spec F3, F4)."""
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -11,12 +12,7 @@ from matplotlib.figure import Figure
 from hypogoal.core.arrays import Bytes
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import (
-    melted,
-    options_of,
-    per_run,
-    tidy,
-)
+from hypogoal.evaluation.house import melted, options_of, per_run, tables_of, tidy
 from hypogoal.evaluation.hypotheses import VALIDATED
 from hypogoal.evaluation.names import ORACLE
 from hypogoal.evaluation.page import Drawn
@@ -112,11 +108,7 @@ def rows_of_ladder(
         yield tidy(picked, **place, sub_goal=sub_goal)
 
 
-def _write_stops(
-    work,
-    artefact,
-    executions,
-):
+def _write_stops(work, artefact, executions):
     """Figure 5: ``STOP`` of each execution of each sub-goal's best option, and pictures of the rooms."""
     domain = installed_domain(artefact.config["domain"])
     if domain is None or not domain.pictures:
@@ -130,55 +122,35 @@ def _write_stops(
     work.arrays[f"stops/{work.contents.name(artefact)}"] = shown[STOP].to_numpy(float)
     for room in stops["room"].unique():
         if f"pictures/{room}" not in work.arrays:
-            work.arrays.create_dataset(
-                f"pictures/{room}",
-                data=domain.picture(room),
-                compression="gzip",
-            )
+            work.arrays.create_dataset(f"pictures/{room}", data=domain.picture(room), compression="gzip")
 
 
-def runs(results):
+def context(results):
     """Spec F3, Figure 4: each seed's mean over the run's ladders of the best, validated, mean and worst member.
 
-    And the best member's shares. A seed that lacks a ladder is left out: unlike ladders are not averaged.
+    And the best member's shares. A seed that lacks a ladder is left out: unlike ladders are not averaged. Compared is
+    ladder by ladder, but oracle terminations, which have no members to choose among.
     """
-    ladders = of_ladders(results)
+    numbers = results.numbers[results.numbers["ladder"] != ""]
+    values = [per_run(numbers, "distance", member=member, name=which) for which, member in PICKED.items()]
+    values.append(per_run(numbers, "executions_deviation", *SHARES, member=BEST))
+    ladders = pd.concat(values)
     seeds = ladders.groupby([*BY, "quantity", "of", "seed"], dropna=False, sort=False)
     means = seeds.agg(value=("value", "mean"), ladders=("ladder", "nunique")).reset_index()
     whole = means[means["ladders"] == ladders["ladder"].nunique()]
-    return whole.assign(layout=None).sort_values("N", kind="stable")
+    found = tables_of(whole.assign(layout=None).sort_values("N", kind="stable"), BY)
+    if not found:
+        return {}
+    has_members = ~ladders["method"].str.startswith(ORACLE)
+    compared = ladders[has_members & ladders["quantity"].isin(PAIRED)]
+    return {**found, "compared": compared, "figures": [*_figures(results, found["table"])]}
 
 
-def of_ladders(results):
-    """The numbers of each run on each ladder."""
-    numbers = results.numbers[results.numbers["ladder"] != ""]
-    values = [
-        per_run(
-            numbers,
-            "distance",
-            member=member,
-            name=which,
-        )
-        for which, member in PICKED.items()
-    ]
-    values.append(per_run(numbers, "executions_deviation", *SHARES, member=BEST))
-    return pd.concat(values)
-
-
-def compared(results):
-    """Each ladder's numbers; oracle terminations have no members to choose among."""
-    values = of_ladders(results)
-    return values[~values["method"].str.startswith(ORACLE)]
-
-
-def figures(context):
+def _figures(results, table):
     """Figures 4 and 5."""
-    table, results = context["table"], context["results"]
-    yield Drawn(
-        "figure4",
-        "Figure 4: distance to the true sub-goal",
-        distance_bars(table[table["quantity"] == "best"]),
-    )
+    best = table[table["quantity"] == "best"]
+    yield Drawn("figure4", "Figure 4: distance to the true sub-goal", partial(distance_bars, best))
+    rooms = results.within("pictures")
     options = results.of(quantity=BEST).drop_duplicates("artefact")
     for ladder, of_ladder in options.groupby("ladder"):
         shown = {}
@@ -188,13 +160,8 @@ def figures(context):
                 groups = "" if pd.isna(option["N"]) else f", N={option['N']}"
                 shown[option["method"] + groups] = pd.DataFrame(stops, columns=STOP)
         if shown:
-            figure = stops_over_rooms(results.within("pictures"), shown)
-            yield Drawn(
-                f"figure5-{ladder}",
-                "Figure 5: where executions stopped",
-                figure,
-                {"ladder": ladder},
-            )
+            draw = partial(stops_over_rooms, rooms, shown)
+            yield Drawn(f"figure5-{ladder}", "Figure 5: where executions stopped", draw, {"ladder": ladder})
 
 
 def distance_bars(best: pd.DataFrame) -> Figure:
@@ -204,9 +171,8 @@ def distance_bars(best: pd.DataFrame) -> Figure:
         groups = best["sub_goal"] + "\n" + groups
     cells = best.assign(place=groups).set_index(["place", "method"])
     wide = cells[["mean", "standard_deviation"]].unstack(sort=False)
-    with plots.styled():
-        figure, axes = plots.bars("bar", wide["mean"], 3.1, yerr=wide["standard_deviation"])
-        axes.set(xlabel="", ylabel="distance to the true sub-goal\n(units of position)")
+    figure, axes = plots.bars("bar", wide["mean"], 3.1, yerr=wide["standard_deviation"])
+    axes.set(xlabel="", ylabel="distance to the true sub-goal\n(units of position)")
     return figure
 
 
@@ -218,24 +184,16 @@ def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, pd.DataFr
     """
     every = pd.concat(options.values())["room"].astype(int)
     shown = every.value_counts().index[:2]
-    with plots.styled():
-        figure, places = plots.pictures(len(options), len(shown))
-        for place, ((method, stops), room) in zip(
-            places,
-            product(options.items(), shown),
-            strict=True,
-        ):
-            name = method if room == shown[0] else ""
-            plots.show_picture(place, rooms[str(room)], f"{name}\nroom {room}")
-            for fate, (label, marker, colour) in FATES.items():
-                inside = stops[(stops["room"] == room) & (stops["fate"] == fate)]
-                place.scatter(
-                    inside["column"],
-                    inside["row"],
-                    marker=marker,
-                    color=colour,
-                    label=label,
-                    alpha=0.75,
-                )
-        plots.legend_below(figure, 3)
+    cells = [*product(options, shown)]
+    pictures = []
+    for method, room in cells:
+        name = method if room == shown[0] else ""
+        pictures.append((f"{name}\nroom {room}", rooms[str(room)]))
+    figure, places = plots.panels(pictures, len(shown))
+    for place, (method, room) in zip(places, cells, strict=True):
+        stops = options[method]
+        for fate, (label, marker, colour) in FATES.items():
+            inside = stops[(stops["room"] == room) & (stops["fate"] == fate)]
+            place.scatter(inside["column"], inside["row"], marker=marker, color=colour, label=label, alpha=0.75)
+    plots.legend_below(figure, 3)
     return figure

@@ -4,9 +4,10 @@ from pathlib import Path
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replacing
+from hypogoal.evaluation import page
 from hypogoal.evaluation.plots import UNDATED, slug, to_file
-from hypogoal.evaluation.questions import answers, captions, not_drawn
-from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
+from hypogoal.evaluation.questions import answers
+from hypogoal.evaluation.run import read_evaluation
 
 
 def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:
@@ -18,14 +19,18 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
     if kind not in UNDATED:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(UNDATED)}.")
     results = read_evaluation(run)
-    with fitting(evaluation_of(run).path):
-        figures = captions(answers(results, drawn=True))
-        missing = not_drawn(figures)
+    figures = {}
+    for context in answers(results):
+        words = page.words_of(context)
+        for drawn in context["figures"]:
+            caption = words.caption(drawn).unescape().split()
+            figures[drawn.name] = to_file(drawn.figure, kind), " ".join(caption)
+    missing = page.lines_of("needed.txt", drawn=[name.partition("-")[0] for name in figures])
     contents = {}
     texts = []
-    for name, (drawn, caption) in sorted(figures.items()):
+    for name, (content, caption) in sorted(figures.items()):
         path = folder / f"{slug(name)}.{kind}"
-        contents[path] = to_file(drawn.figure, kind)
+        contents[path] = content
         texts.append(f"## {path.name}\n\n{caption}")
     text = "\n\n".join([*texts, *missing])
     contents[folder / "captions.md"] = f"{text}\n".encode()

@@ -14,7 +14,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.pictures import coloured
 from hypogoal.evaluation.plots import GREY, INK, PALETTE
-from hypogoal.evaluation.run import find_artefacts
+from hypogoal.evaluation.run import choice_of, find_artefacts
 from hypogoal.observations import PICTURE
 
 if TYPE_CHECKING:
@@ -39,10 +39,8 @@ class Film:
 
 def agent_to_film(run: Path) -> Artefact | None:
     """The run's first agent that learned to choose among members' options."""
-    for artefact in find_artefacts(run, "meta"):
-        if artefact.config["chooser"] != "random" and artefact.config["termination"] != "oracle":
-            return artefact
-    return None
+    agents = [artefact for artefact in find_artefacts(run, "meta") if choice_of(artefact) == "learned"]
+    return agents[0] if agents else None
 
 
 def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
@@ -53,13 +51,27 @@ def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
     """
     from hypogoal.meta.episodes import agent_of, play_episode
 
-    loop = agent_of(agent, seed=0)
+    loop, config = agent_of(agent, seed=0), agent.config
     if loop.engine.observation_dtype != PICTURE:
         raise UserError("videos need an agent that sees pictures", agent.path, "Leave --videos out.")
-    members = agent.config["members"]
+    members = config["members"]
     if count is None:
-        return [_film(agent.config, path, *_telling(loop, members))]
-    return [_film(agent.config, path, number, play_episode(loop, members)) for number in range(count)]
+        episodes = dict([_telling(loop, members)])
+    else:
+        episodes = {number: play_episode(loop, members) for number in range(count)}
+    films = []
+    for number, frames in episodes.items():
+        gif = episode_gif(frames, config["sub_goals"], members, config["option_timeout"])
+        facts = {
+            "path": path,
+            "number": number,
+            "steps": frames[-1].step,
+            "options": sum(bool(frame.ended) for frame in frames),
+            "layout": config["layout_seed"],
+            "members": members,
+        }
+        films.append(Film(f"{path.replace('/', '-')}-episode-{number}.gif", gif, facts))
+    return films
 
 
 def _telling(loop, members):
@@ -80,24 +92,6 @@ def _telling(loop, members):
     return 0, played[0]
 
 
-def _film(
-    config,
-    path,
-    number,
-    frames,
-):
-    facts = {
-        "path": path,
-        "number": number,
-        "steps": frames[-1].step,
-        "options": sum(bool(frame.ended) for frame in frames),
-        "layout": config["layout_seed"],
-        "members": config["members"],
-    }
-    gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
-    return Film(f"{path.replace('/', '-')}-episode-{number}.gif", gif, facts)
-
-
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
     """What is written below a frame: the option that runs, each member's prediction, and why the option ended."""
     goal, running = divmod(frame.option, members)
@@ -111,12 +105,7 @@ def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[st
     return [*lines, f"step {frame.step}{end}"]
 
 
-def draw_frame(
-    frame: Frame,
-    sub_goals: Sequence[str],
-    members: int,
-    timeout: int,
-) -> Image.Image:
+def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> Image.Image:
     """A frame enlarged; a bar is as long as the steps that are left to the option, of ``timeout``.
 
     Option g*K + k is member k of sub-goal g, whose colour the bar has; positive predictions are written in white.
@@ -138,12 +127,7 @@ def draw_frame(
     return picture
 
 
-def episode_gif(
-    frames: Sequence[Frame],
-    sub_goals: Sequence[str],
-    members: int,
-    timeout: int,
-) -> bytes:
+def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int, timeout: int) -> bytes:
     """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1.
 
     It pauses where an option ends, and where its member comes to differ from others of its sub-goal.
@@ -159,13 +143,6 @@ def episode_gif(
         before = frame.predictions
     times[-1] = LAST
     buffer = io.BytesIO()
-    pictures[0].save(
-        buffer,
-        "GIF",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=times,
-        loop=0,
-        optimize=False,
-    )
+    first, *others = pictures
+    first.save(buffer, "GIF", save_all=True, append_images=others, duration=times, loop=0, optimize=False)
     return buffer.getvalue()

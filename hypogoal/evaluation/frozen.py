@@ -8,21 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hypogoal.core.arrays import (
-    Bools,
-    Columns,
-    Doubles,
-    Ints,
-)
+from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.curves import scores
-from hypogoal.options.choosers import (
-    Chooser,
-    Offered,
-    Outcome,
-    RandomChooser,
-)
-from hypogoal.options.loop import NONE, OptionLoop
+from hypogoal.options.choosers import Chooser, Offered, RandomChooser
+from hypogoal.options.loop import NONE, OptionLoop, offered_options
 from hypogoal.options.recording import Recorder
 
 ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout: 512 episodes,
@@ -51,25 +41,6 @@ class Play:
         return scores(self.succeeded, self.length, shortest) | {"length": self.length.astype(float)}
 
 
-class _Listener(Chooser):
-    """Passes a chooser's decisions on and keeps them, with the environments they were made in."""
-
-    def __init__(self, chooser: Chooser):
-        self.chooser = chooser
-        self.decisions: list[tuple[Ints, Choices]] = []
-
-    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
-        chosen = self.chooser.choose(environments, ids, offered)
-        self.decisions.append((environments.copy(), Choices(ids.copy(), chosen.copy(), offered.copy())))
-        return chosen
-
-    def record(self, outcome: Outcome) -> None:
-        self.chooser.record(outcome)
-
-    def begin_anew(self) -> None:
-        self.chooser.begin_anew()
-
-
 class Always(Chooser):
     """Chooses one option, whatever is offered."""
 
@@ -80,49 +51,32 @@ class Always(Chooser):
         return np.full(len(ids), self.option)
 
 
-def play_both(
-    loop: OptionLoop,
-    seed: int,
-    episodes: int = 0,
-) -> tuple[Play, Play]:
+def play_both(loop: OptionLoop, seed: int, episodes: int = 0) -> tuple[Play, Play]:
     """The agent itself, and uniform-random choice among its options, see :func:`play`."""
     own = play(loop, loop.chooser, episodes)
     return own, play(loop, RandomChooser(rng_for(seed, "uniform-choice")), episodes)
 
 
-def play(
-    loop: OptionLoop,
-    chooser: Chooser,
-    episodes: int = 0,
-) -> Play:
+def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
     """So many episodes in each environment, begun anew; options are greedy and choices are drawn as in training.
 
     By default as many as the cap alone decides: what comes of them must not.
     """
-    episodes = episodes or max(EPISODES, STEPS // loop.engine.max_steps)
-    listener = _Listener(chooser)
-    begin_anew(loop, listener)
-    try:
-        return _first_episodes(loop, listener, episodes)
-    finally:
-        loop.chooser = chooser
-
-
-def _first_episodes(
-    loop,
-    listener,
-    episodes,
-):
-    environments = loop.engine.count
-    ended = np.zeros(environments, dtype=np.int64)
-    length, succeeded = np.zeros((2, environments, episodes), dtype=np.int64)
+    engine = loop.engine
+    episodes = episodes or max(EPISODES, STEPS // engine.max_steps)
+    begin_anew(loop, chooser)
+    ended = np.zeros(engine.count, dtype=np.int64)
+    length, succeeded = np.zeros((2, engine.count, episodes), dtype=np.int64)
     decisions = []
     while ended.min() < episodes:
-        loop.advance(learning=False)
-        for places, choices in listener.decisions:
-            decisions.append(choices.at(ended[places] < episodes))
-        listener.decisions.clear()
-        over = np.flatnonzero(loop.engine.elapsed == 0)
+        free = np.flatnonzero((loop.option == NONE) & (ended < episodes))
+        ids = engine.ids[free]
+        offered = np.ones((len(ids), loop.terminations.options), dtype=np.bool_)
+        if loop.config.mask_reached:
+            offered = offered_options(loop.terminations.of(ids))
+        moved = loop.advance(learning=False)
+        decisions.append(Choices(ids, moved.options[free], offered))
+        over = np.flatnonzero(engine.elapsed == 0)
         for place, (_, steps, _, _, success) in zip(over, loop.recorder.episodes, strict=True):
             if ended[place] < episodes:
                 length[place, ended[place]], succeeded[place, ended[place]] = steps, success

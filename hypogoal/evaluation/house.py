@@ -36,11 +36,7 @@ TEXTS = [name for name, kind in TYPES.items() if kind == "str"]
 NUMBERS = [name for name, kind in TYPES.items() if kind != "str"]
 SHARED = ["layout", "ladder", "sub_goal", "seed"]  # of two runs that are a pair
 RUN = ["method", "artefact", "N", *SHARED]  # tells one run's numbers from another's
-MEMBERS = {
-    "best": "max",
-    "mean": "mean",
-    "worst": "min",
-}  # how the values of members become one
+MEMBERS = {"best": "max", "mean": "mean", "worst": "min"}  # how the values of members become one
 LOWER_IS_BETTER = ("length", "solved_length", "distance")
 DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
 ROUNDING = 10.0**-DIGITS
@@ -63,31 +59,21 @@ def tidy(numbers: Any, **place: Any) -> pd.DataFrame:
     return rows.assign(**place)
 
 
-def tidy_members(columns: Any, **place: Any) -> pd.DataFrame:
-    """A row for each of K members' value of each column, (K,)."""
-    return melted(pd.DataFrame(columns).rename_axis("member"), **place)
-
-
-def of_options(
-    columns: Any,
-    config: Any,
-    **place: Any,
-) -> pd.DataFrame:
-    """A row for each option's value of each column, (G*K,), by its sub-goal and member, of an artefact's ``config``."""
-    options = options_of(config)
-    return melted(pd.DataFrame(columns).set_axis(options), **place)
+def melted(columns: Any, index: Any = None, **place: Any) -> pd.DataFrame:
+    """A row for each value of each column, by the names of its ``index``; without any it is of each of K members."""
+    table = pd.DataFrame(columns)
+    if index is not None:
+        table = table.set_axis(index)
+    if table.index.names == [None]:
+        table = table.rename_axis("member")
+    rows = table.reset_index().melt(table.index.names, var_name="quantity")
+    return rows.assign(**place)
 
 
 def options_of(config: Any) -> pd.MultiIndex:
-    """The sub-goal and the member of each option of an artefact's ``config``, in order."""
+    """The sub-goal and the member of each option of an artefact's ``config``, in order: an index of (G*K,) rows."""
     goals, members = config["sub_goals"], range(config["members"])
     return pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])
-
-
-def melted(columns: pd.DataFrame, **place: Any) -> pd.DataFrame:
-    """A row for each value of each column, by its index."""
-    rows = columns.reset_index().melt(columns.index.names, var_name="quantity")
-    return rows.assign(**place)
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
@@ -131,10 +117,7 @@ def per_run(
         rows = rows.merge(picked, on=[*RUN, "member"])
     values = rows.groupby([*RUN, "quantity"], dropna=False, sort=False)["value"]
     runs = values.agg(MEMBERS.get(member, "mean")).reset_index()
-    return runs.assign(
-        of=runs["quantity"],
-        quantity=runs["quantity"].map(name.format),
-    )
+    return runs.assign(of=runs["quantity"], quantity=runs["quantity"].map(name.format))
 
 
 def student_interval(values: Any) -> tuple[float, float]:
@@ -172,6 +155,13 @@ def interquartile_mean(values: Any, axis: int = 0) -> Any:
     return np.sort(values, axis).take(middle, axis).mean(axis)
 
 
+def tables_of(runs: pd.DataFrame, by: Sequence[str], paired: Sequence[str] = ()) -> dict[str, pd.DataFrame]:
+    """What a question's template is given of :func:`per_run`: ``table``, and ``compared``; nothing without runs."""
+    if runs.empty:
+        return {}
+    return {"table": over(runs, by), "compared": runs[runs["quantity"].isin(paired)]}
+
+
 def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Spec F5: a row of statistics for each combination of ``by`` and each quantity of :func:`per_run`.
 
@@ -189,15 +179,9 @@ def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 def statistics(runs: pd.DataFrame) -> dict[str, float]:
     """See :func:`over`: of runs that are alike."""
-    several = runs["layout"].nunique() > 1
-    values = (
-        runs.groupby(
-            "layout",
-            sort=False,
-        )["value"].mean()
-        if several
-        else runs["value"]
-    )
+    values = runs["value"]
+    if runs["layout"].nunique() > 1:
+        values = values.groupby(runs["layout"], sort=False).mean()
     low, high = interval(values.to_numpy())
     if is_share(runs["of"].iloc[0]):
         low, high = np.clip([low, high], 0, 1)
@@ -220,11 +204,7 @@ def pairs(runs: pd.DataFrame) -> pd.DataFrame:
     quantity, first, second, and those of :func:`compare`.
     """
     rows = []
-    for (groups, quantity), cell in runs.groupby(
-        ["N", "quantity"],
-        dropna=False,
-        sort=False,
-    ):
+    for (groups, quantity), cell in runs.groupby(["N", "quantity"], dropna=False, sort=False):
         place = {"N": groups, "quantity": quantity}
         (_, first), *others = cell.groupby("method", sort=False)
         for _, second in others:
@@ -234,11 +214,7 @@ def pairs(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def paired(
-    first: pd.DataFrame,
-    second: pd.DataFrame,
-    on: Sequence[str],
-) -> pd.DataFrame:
+def paired(first: pd.DataFrame, second: pd.DataFrame, on: Sequence[str]) -> pd.DataFrame:
     """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
     return first.merge(second, on=list(on), suffixes=("", "_second"))
 
@@ -283,11 +259,7 @@ def compare(both: pd.DataFrame, unit: str = "layout") -> dict[str, Any]:
     }
     widest = 1 if is_share(quantity) else math.inf
     for name, least, most in (("probability", 0, 1), ("difference", -widest, widest)):
-        result[f"{name}_low"], result[f"{name}_high"] = np.clip(
-            student_interval(by_unit[name]),
-            least,
-            most,
-        )
+        result[f"{name}_low"], result[f"{name}_high"] = np.clip(student_interval(by_unit[name]), least, most)
     return result
 
 

@@ -4,24 +4,15 @@ Also whatever their thresholds, and without the luck of picking the best; and wh
 """
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import (
-    Bools,
-    Doubles,
-    Floats,
-    Ints,
-)
+from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import (
-    at_least,
-    per_run,
-    tidy,
-    tidy_members,
-)
+from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
 from hypogoal.evaluation.judging import Judged
 from hypogoal.evaluation.page import Drawn
 from hypogoal.hypotheses import scores
@@ -44,31 +35,19 @@ KNOWN = ("ranking", *CROSS_FITTED, "at_best_threshold", "calibration_gap")
 
 def look(work, judgement):
     """Spec F1, F2: what members know and how much they disagree, and which one labelled rooms pick."""
-    place = work.place_of(judgement)
-    labels, origins = judgement.split.labels, judgement.split.origins
-    for rows in rows_of(judgement.judged, labels, origins):
+    place, judged = work.place_of(judgement), judgement.judged
+    for rows in rows_of(judged):
         yield rows.assign(**place)
-    if "seen" in origins:
-        picked = choose(judgement.judged.predictions, labels, origins["seen"])
-        of_ensemble = work.validated.setdefault(judgement.case.ensemble.resolve(), {})
+    if "seen" in judged.origins:
+        picked = choose(judged.predictions, judged.labels, judged.origins["seen"])
+        of_ensemble = work.validated.setdefault(judgement.artefact.path.resolve(), {})
         of_ensemble[judgement.sub_goal] = picked[VALIDATED]
         yield tidy(picked, **place, scope=VALIDATION)
 
 
-def rows_of(
-    judged: Judged,
-    labels: Bools,
-    origins: Mapping[str, Ints],
-) -> Iterator[pd.DataFrame]:
-    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room.
-
-    ``origins`` (N,) may be ``seen`` (see ``SCOPES``), ``room``, ``layout_seed``, and planted features.
-    """
-    count = np.array(len(judged.unlabelled))
-    members = {
-        "threshold": judged.thresholds,
-        "positive_unlabelled": scores.ratio(judged.unlabelled.sum(axis=0), count),
-    }
+def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
+    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room."""
+    labels, origins = judged.labels, judged.origins
     numbers = {
         "layouts": len(np.unique(origins.get("layout_seed", []))),
         "disagreement": scores.mean_disagreement(judged.predictions),
@@ -76,7 +55,8 @@ def rows_of(
     planted = {name: values for name, values in origins.items() if name.startswith(PLANTED)}
     if planted:
         numbers["coverage"] = coverage(judged.probabilities, planted)
-    yield tidy_members(members, scope=HELDOUT)
+    positive = pd.DataFrame(judged.unlabelled).mean()
+    yield melted({"threshold": judged.thresholds, "positive_unlabelled": positive}, scope=HELDOUT)
     yield tidy(numbers, scope=HELDOUT)
     yield tidy({"disagreement": scores.mean_disagreement(judged.unlabelled)}, scope="unlabelled")
     scopes = {HELDOUT: labels | True}
@@ -88,22 +68,21 @@ def rows_of(
         counts = {"states": inside.sum(), "positives": labels[inside].sum()}
         if "room" in origins:
             counts["rooms"] = len(np.unique(origins["room"][inside]))
-        yield tidy_members(columns, scope=scope)
+        yield melted(columns, scope=scope)
         yield tidy(counts, scope=scope)
     scope, inside = next(iter(scopes.items()))
     contexts = origins.get("layout_seed", origins.get("room"))
-    columns, crossed = knowledge(judged, inside, labels, contexts)
-    yield tidy_members(columns, scope=scope)
+    columns, crossed = knowledge(judged, inside, contexts)
+    yield melted(columns, scope=scope)
     yield tidy(crossed, scope=scope)
 
 
 def knowledge(
     judged: Judged,
     inside: Bools,
-    labels: Bools,
     contexts: Ints | None,
 ) -> tuple[dict[str, Doubles], dict[str, float]]:
-    """What K members know of the states ``inside``, (N,) like ``labels`` and ``contexts``, layouts or rooms.
+    """What K members know of the states ``inside``, (N,) like ``contexts``, layouts or rooms.
 
     Returns of each member (K,) ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that its
     own threshold loses); and of the best member, picked on half of the contexts and scored on the other,
@@ -111,12 +90,12 @@ def knowledge(
     """
 
     def scored(states):
-        areas = scores.ranking(judged.probabilities[states], labels[states])
-        of_members = scores.member_scores(judged.predictions[states], labels[states])
-        return areas, of_members["balanced_accuracy"]
+        labels = judged.labels[states]
+        areas = scores.ranking(judged.probabilities[states], labels)
+        return areas, scores.member_scores(judged.predictions[states], labels)["balanced_accuracy"]
 
     _, accuracies = scored(inside)
-    _, best = scores.best_threshold(judged.probabilities[inside], labels[inside])
+    _, best = scores.best_threshold(judged.probabilities[inside], judged.labels[inside])
     columns = {"at_best_threshold": best, "calibration_gap": best - accuracies}
     first = None if contexts is None else scores.halves(contexts[inside])
     if first is None:
@@ -126,11 +105,7 @@ def knowledge(
     return columns, dict(zip(CROSS_FITTED, crossed, strict=True))
 
 
-def choose(
-    predictions: Bools,
-    labels: Bools,
-    seen: Ints,
-) -> dict[str, float | None]:
+def choose(predictions: Bools, labels: Bools, seen: Ints) -> dict[str, float | None]:
     """Spec F1: the member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
 
     The first of equally good ones, since their order is random; None where those rooms lack a class.
@@ -146,56 +121,38 @@ def coverage(probabilities: Floats, planted: Mapping[str, Ints]) -> float:
 
     Every combination of features is equally frequent, so an area under the ROC curve of .5 is blindness to a feature.
     """
-    areas = np.stack(
-        [scores.ranking(probabilities, values > 0) for values in planted.values()],
-        axis=1,
-    )
+    areas = np.stack([scores.ranking(probabilities, values > 0) for values in planted.values()], axis=1)
     ranks = at_least(areas, OWNED_FROM)
     ignored = at_least(IGNORED_TO - 0.5, np.abs(areas - 0.5))
     alone = ignored.sum(axis=1, keepdims=True) == areas.shape[1] - 1
     return float((ranks & alone).any(axis=0).mean())
 
 
-def runs(results):
-    """The numbers of ensembles but those judged room by room, which ``rooms`` has."""
+def context(results):
+    """The numbers of ensembles but those judged room by room, which ``rooms`` has; Figure 3's for one context."""
     by_room = results.of(scope="unseen")["artefact"]
     numbers = results.numbers[~results.numbers["artefact"].isin(by_room)]
-    values = [
-        per_run(
-            numbers,
-            "balanced_accuracy",
-            scope=HELDOUT,
-            member=which,
-            name=which,
-        )
-        for which in WHICH
-    ]
+    values = [per_run(numbers, "balanced_accuracy", scope=HELDOUT, member=which, name=which) for which in WHICH]
     values.append(per_run(numbers, *KNOWN, "coverage", scope=HELDOUT))
     for states in ("unlabelled", HELDOUT):
         values.append(per_run(numbers, "disagreement", scope=states, name=f"{{}}_{states}"))
-    return pd.concat(values)
-
-
-def figures(context):
-    """Figure 3's quantity for one labelled context."""
-    table = context["table"]
+    found = tables_of(pd.concat(values), BY, PAIRED)
+    if not found:
+        return {}
+    table = found["table"]
     means = table[table["quantity"].isin(WHICH)].pivot_table("mean", BY, "quantity", sort=False)
-    if len(means):
-        yield Drawn(
-            "members",
-            "Members' balanced accuracy on held-out states",
-            members_figure(means),
-        )
+    label = "Members' balanced accuracy on held-out states"
+    figure = Drawn("members", label, partial(members_figure, means))
+    return found | {"figures": [figure] if len(means) else []}
 
 
 def members_figure(means: pd.DataFrame) -> Figure:
     """Balanced accuracy by method and sub-goal, the index of ``best``, ``mean`` and ``worst``: a range of members."""
     wide = means.unstack("method", sort=False)
     ranges = np.stack([wide["mean"] - wide["worst"], wide["best"] - wide["mean"]])
-    with plots.styled():
-        height = 1 + 0.2 * wide["mean"].size
-        figure, axes = plots.bars("barh", wide["mean"], height, xerr=ranges.transpose(2, 0, 1))
-        axes.axvline(0.5, **plots.DOTTED)
-        axes.invert_yaxis()
-        axes.set(xlabel="balanced accuracy on held-out states", ylabel="")
+    height = 1 + 0.2 * wide["mean"].size
+    figure, axes = plots.bars("barh", wide["mean"], height, xerr=ranges.transpose(2, 0, 1))
+    axes.axvline(0.5, **plots.DOTTED)
+    axes.invert_yaxis()
+    axes.set(xlabel="balanced accuracy on held-out states", ylabel="")
     return figure

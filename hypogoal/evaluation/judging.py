@@ -3,76 +3,44 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import (
-    Callable,
-    Iterator,
-    Mapping,
-)
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    NamedTuple,
-)
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hypogoal.core.arrays import (
-    Bools,
-    Floats,
-    Ints,
-)
+from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.artefacts import Artefact
-from hypogoal.core.processes import (
-    cores,
-    in_processes,
-    prepare,
-)
+from hypogoal.core.processes import cores, in_processes, prepare
 from hypogoal.core.progress import Progress
 from hypogoal.data import States, open_dataset
 from hypogoal.evaluation.names import places_of, rank
 from hypogoal.evaluation.run import Contents, takes
 from hypogoal.observations import Observations
 
-if TYPE_CHECKING:
-    from hypogoal.hypotheses.ensemble import Ensemble
-
 SPREAD_FROM = 4e9  # bytes of states times members from which on more processes pay where each starts in 3 s
 WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"}  # values of the origin ``seen``
-
-
-class Case(NamedTuple):
-    """An ensemble artefact and the data file that it is judged on."""
-
-    data: Path
-    ensemble: Path
-    config: dict[str, Any]
-
-    def read(self, sub_goal: str) -> Ensemble:
-        """The ensemble of a sub-goal."""
-        from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report does not need
-
-        return read_ensemble(self.ensemble, self.config, sub_goal)
 
 
 class Judged(NamedTuple):
     """What K members say of N held-out and M unlabelled states."""
 
+    labels: Bools  # (N,)
+    origins: Mapping[str, Ints]  # (N,) each: ``seen``, ``room``, ``layout_seed``, planted features
     probabilities: Floats  # (N, K), that the sub-goal is reached
     predictions: Bools  # (N, K), each at its member's own threshold
     unlabelled: Bools  # (M, K), the predictions on unlabelled states
     thresholds: Floats  # (K,), each member's own, of the probability
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(NamedTuple):
     """What the members of one sub-goal say."""
 
-    case: Case
+    artefact: Artefact  # the ensemble
+    data: Path  # the file that it is judged on
     sub_goal: str
-    split: States  # the held-out states' labels and origins, without the states
     judged: Judged
 
 
@@ -107,16 +75,32 @@ class Work:
 
     def place_of(self, judgement: Judgement) -> dict[str, Any]:
         """Where the numbers of a sub-goal's members stand."""
-        return {**self.places[judgement.case.ensemble], "sub_goal": judgement.sub_goal}
+        return {**self.place(judgement.artefact), "sub_goal": judgement.sub_goal}
 
     def ranked(self, artefacts: list[Artefact]) -> list[Artefact]:
         """Some of the run's, the paper's method first."""
         return sorted(artefacts, key=lambda artefact: rank(self.place(artefact)["method"]))
 
-    def cases(self) -> list[Case]:
-        """Every ensemble, the paper's method first."""
-        ensembles = self.ranked(self.contents.ensembles)
-        return [Case(artefact.input("data"), artefact.path, artefact.config) for artefact in ensembles]
+    def judgements(self) -> Iterator[Judgement]:
+        """Every sub-goal of every ensemble judged, the paper's method first, in any number of processes.
+
+        Those on the same states are judged one after another, since each process keeps the last ones that it read.
+        """
+        ensembles = [(artefact, artefact.input("data")) for artefact in self.ranked(self.contents.ensembles)]
+        order = sorted(ensembles, key=lambda each: each[1])
+        found = {}
+
+        def keep(number: int, judged: dict[str, Judged]) -> None:
+            artefact, _ = order[number]
+            found[artefact.path] = judged
+            self.progress.advance()
+
+        tasks = [partial(judge, *each) for each in order]
+        in_processes(tasks, processes_for(order), keep, forked=True)
+        for artefact, data in ensembles:
+            for sub_goal, judged in found.pop(artefact.path).items():
+                yield Judgement(artefact, data, sub_goal, judged)
+        states_of.cache_clear()
 
 
 def most_used(contents: Contents) -> Path | None:
@@ -129,46 +113,26 @@ def most_used(contents: Contents) -> Path | None:
     return max(ranks, key=ranks.__getitem__, default=None)
 
 
-def processes_for(cases: list[Case]) -> int:
-    """How many processes are worth it: one where their start would take longer than it saves."""
+def processes_for(ensembles: list[tuple[Artefact, Path]]) -> int:
+    """How many processes are worth it, of ensembles on data: one where their start would take longer than it saves."""
     work = 0.0
-    for case in cases:
-        dataset = open_dataset(case.data)
+    for artefact, data in ensembles:
+        dataset = open_dataset(data)
         counts = dataset.counts()
-        for sub_goal in case.config["sub_goals"]:
+        for sub_goal in artefact.config["sub_goals"]:
             states = counts["heldout"][sub_goal]["states"] + counts["unlabelled"]
-            work += case.config["members"] * states * dataset.observation_bytes
+            work += artefact.config["members"] * states * dataset.observation_bytes
     return cores() if work >= SPREAD_FROM else 1
 
 
-def judgements(cases: list[Case], done: Callable[[], None]) -> Iterator[Judgement]:
-    """Every sub-goal of every case judged, in any number of processes; ``done`` is called after each case.
-
-    Those on the same states are judged one after another, since each process keeps the last ones that it read.
-    """
-    judged = {}
-    order = sorted(cases, key=lambda case: case.data)
-
-    def keep(index, result):
-        judged[order[index].ensemble] = result
-        done()
-
-    tasks = [partial(judge, case) for case in order]
-    in_processes(tasks, processes_for(cases), keep, forked=True)
-    for case in cases:
-        for sub_goal, (split, of_goal) in judged.pop(case.ensemble).items():
-            yield Judgement(case, sub_goal, split, of_goal)
-    states_of.cache_clear()
-
-
-def judge(case: Case) -> dict[str, tuple[States, Judged]]:
-    """Each sub-goal's held-out labels and origins, and what its members say."""
-    from hypogoal.hypotheses.ensemble import together
+def judge(artefact: Artefact, data: Path) -> dict[str, Judged]:
+    """What each sub-goal's members say, of an ensemble on a data file."""
+    from hypogoal.hypotheses.ensemble import read_ensemble, together  # with PyTorch, which a report does not need
 
     prepare()
-    heldout, unlabelled = states_of(case.data)
-    sub_goals = case.config["sub_goals"]
-    ensembles = [case.read(sub_goal) for sub_goal in sub_goals]
+    heldout, unlabelled = states_of(data)
+    sub_goals = artefact.config["sub_goals"]
+    ensembles = [read_ensemble(artefact.path, artefact.config, sub_goal) for sub_goal in sub_goals]
     every = together(ensembles)
 
     def predicted(observations):
@@ -180,10 +144,9 @@ def judge(case: Case) -> dict[str, tuple[States, Judged]]:
     on_unlabelled = predicted([unlabelled] * len(sub_goals))
     judged = {}
     for sub_goal, ensemble, probabilities, others in zip(sub_goals, ensembles, on_heldout, on_unlabelled, strict=True):
-        states = heldout[sub_goal]
-        above = ensemble.thresholds.numpy()
-        split = States(states.observations[:0].copy(), states.labels, states.origins)
-        judged[sub_goal] = split, Judged(probabilities, probabilities > above, others > above, above)
+        states, above = heldout[sub_goal], ensemble.thresholds.numpy()
+        predictions = probabilities > above
+        judged[sub_goal] = Judged(states.labels, states.origins, probabilities, predictions, others > above, above)
     return judged
 
 

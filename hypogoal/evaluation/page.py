@@ -5,7 +5,7 @@ Every sentence is in ``templates/``; a question gives its template what it compu
 
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from hashlib import sha256
@@ -15,14 +15,13 @@ from typing import Any
 import jinja2
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.table import Table
 
 from hypogoal.core.artefacts import versions
 from hypogoal.evaluation import pictures
 from hypogoal.evaluation.house import BOOTSTRAP_FROM
-from hypogoal.evaluation.plots import to_file
+from hypogoal.evaluation.plots import styled, to_file
 
 WIDTH = 80  # of tables in a terminal
 DASH = "–"
@@ -31,12 +30,18 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure; ``name`` is its file's, and the id on the page."""
+    """A figure, drawn once somebody looks; ``name`` is its file's, and the id on the page."""
 
     name: str
     label: str  # what it shows
-    figure: Figure
+    draw: Callable[[], Figure]
     about: Mapping[str, Any] = field(default_factory=dict)  # for its caption
+
+    @cached_property
+    def figure(self) -> Figure:
+        """What is drawn."""
+        with styled():
+            return self.draw()
 
     @cached_property
     def svg(self) -> bytes:
@@ -65,64 +70,39 @@ class Results:
         return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
 
-def fixed(
-    value: Any,
-    digits: int = 2,
-    scale: float = 1.0,
-    sign: str = "",
-) -> str:
+def fixed(value: Any, digits: int = 2, scale: float = 1.0, sign: str = "") -> str:
     """A number with a fixed number of decimals; a dash where there is none. ``sign``: as Python formats it."""
     return DASH if pd.isna(value) else f"{scale * value:{sign}.{digits}f}"
 
 
 def percent(value: Any) -> str:
-    """0.953 -> '95 %'; a dash where there is none."""
-    return DASH if pd.isna(value) else f"{100 * value:.0f} %"
+    """0.953 -> '95 %'."""
+    return f"{fixed(value, 0, 100)} %"
 
 
-def between(
-    low: Any,
-    high: Any,
-    digits: int,
-    scale: float = 1.0,
-) -> str:
-    """An interval; nothing where there is none."""
-    return "" if pd.isna(low) else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
+def between(low: Any, high: Any, *how: Any) -> str:
+    """An interval; nothing where there is none. ``how``, here and below: digits and scale, see :func:`fixed`."""
+    return "" if pd.isna(low) else f" [{fixed(low, *how)}, {fixed(high, *how)}]"
 
 
-def mean(
-    row: Any,
-    digits: int = 2,
-    scale: float = 1.0,
-) -> str:
+def mean(row: Any, *how: Any) -> str:
     """The mean."""
-    return fixed(row["mean"], digits, scale)
+    return fixed(row["mean"], *how)
 
 
-def spread(
-    row: Any,
-    digits: int = 2,
-    scale: float = 1.0,
-    error: str = "standard_error",
-) -> str:
+def spread(row: Any, *how: Any, error: str = "standard_error") -> str:
     """The mean and, where there are several values, beside it their standard error."""
-    wide = fixed(row[error], digits, scale)
-    around = "" if wide == DASH else f" ± {wide}"
-    return mean(row, digits, scale) + around
+    around = "" if pd.isna(row[error]) else f" ± {fixed(row[error], *how)}"
+    return mean(row, *how) + around
 
 
 deviation = partial(spread, error="standard_deviation")  # beside the mean the standard deviation over seeds
 
 
-def bounded(
-    row: Any,
-    digits: int = 2,
-    scale: float = 1.0,
-) -> str:
+def bounded(row: Any, *how: Any) -> str:
     """The mean or the interquartile mean, whichever the 95 % interval beside it is of."""
     value = row["mean"] if row["units"] < BOOTSTRAP_FROM else row["iqm"]
-    bounds = between(row["low"], row["high"], digits, scale)
-    return fixed(value, digits, scale) + bounds
+    return fixed(value, *how) + between(row["low"], row["high"], *how)
 
 
 def counted(row: Any) -> str:
@@ -130,11 +110,7 @@ def counted(row: Any) -> str:
     return str(row["n"])
 
 
-def displayed(
-    table: pd.DataFrame,
-    by: dict[str, str],
-    columns: Mapping[str, Sequence[Any]],
-) -> pd.DataFrame:
+def displayed(table: pd.DataFrame, by: dict[str, str], columns: Mapping[str, Any]) -> pd.DataFrame:
     """A table of :func:`house.over` as people read it: a row for each combination of ``by``, whose titles it gives.
 
     ``columns`` are by title a quantity, and a function that writes a row's statistics with its further arguments.
@@ -225,40 +201,24 @@ def templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= globals()
+    environment.globals |= globals() | {"version": versions().get("hypogoal", "unknown")}
     return environment
 
 
-def section(name: str, context: Mapping[str, Any]) -> Markup:
-    """A question's part of a page, from its template."""
-    return Markup(templates().get_template(f"{name}.html").render(context))
+def words_of(context: Mapping[str, Any]) -> Any:
+    """What a question's template sets, and its macros; figures are not drawn for it."""
+    return templates().get_template(f"{context['name']}.html").make_module({**context, "figures": []})
 
 
-def module(name: str, context: Mapping[str, Any]) -> Any:
-    """What a question's template sets, and its macros."""
-    return templates().get_template(f"{name}.html").make_module(dict(context))
-
-
-def draw_page(
-    title: str,
-    sections: Sequence[Mapping[str, Any]],
-    template: str,
-    **lead: Any,
-) -> str:
-    """One HTML file that needs nothing else; ``lead``: what stands above its sections.
+def render(template: str, /, **context: Any) -> str:
+    """A template's text. A page, of ``title`` and ``sections``, is one HTML file that needs nothing else.
 
     A section is what its template is given, with ``name``, its id, ``title``, and whether it is ``folded``;
     ``template``: where that is not called as the section.
     """
-    context = {
-        "title": title,
-        "sections": sections,
-        "version": versions().get("hypogoal", "unknown"),
-    }
-    return templates().get_template(template).render(context | lead)
+    return templates().get_template(template).render(context)
 
 
-def lines_of(template: str, context: Mapping[str, Any]) -> list[str]:
+def lines_of(template: str, /, **context: Any) -> list[str]:
     """What a template of lines says."""
-    text = templates().get_template(template).render(context)
-    return [line for line in text.splitlines() if line]
+    return [line for line in render(template, **context).splitlines() if line]

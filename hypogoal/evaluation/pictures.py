@@ -6,23 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap
 from PIL import Image
 
 from hypogoal.core.arrays import Bytes, Doubles
 from hypogoal.core.errors import UserError
-from hypogoal.data import (
-    SPLITS,
-    States,
-    open_dataset,
-)
+from hypogoal.data import SPLITS, States, open_dataset
 from hypogoal.evaluation.plots import BLUE, VERMILLION
-from hypogoal.observations import (
-    PICTURE,
-    fields_of,
-    spread_rows,
-)
+from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 MOST_SIDE = 128  # pixels of a picture on the page
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION], N=25)  # few: small files
@@ -35,19 +26,13 @@ GAP = 2  # pixels around each state
 PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
 
 
-def last_frame(
-    values: Any,
-    colours: int | None = None,
-) -> Any:
+def last_frame(values: Any, colours: int | None = None) -> Any:
     """Of pictures (..., C) the last frame's channels, so many ``colours``: by default 3 where C is 3, else 1."""
     default = 3 if values.shape[-1] == 3 else 1
     return values[..., -(colours or default) :]
 
 
-def coloured(
-    observations: Bytes,
-    colours: int | None = None,
-) -> Bytes:
+def coloured(observations: Bytes, colours: int | None = None) -> Bytes:
     """Observations (..., C) as they are shown, (..., 3): of the last frame."""
     shown: Bytes = last_frame(observations, colours)
     return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
@@ -78,11 +63,7 @@ def encoded(image: Bytes) -> bytes:
     return buffer.getvalue()
 
 
-def attribution_image(
-    values: Doubles,
-    state: Bytes,
-    colours: int | None = None,
-) -> Bytes:
+def attribution_image(values: Doubles, state: Bytes, colours: int | None = None) -> Bytes:
     """Figures 2 and 9: attributions (H, W, C) to the last frame of a state (H, W, C), uint8 (H, W, 3).
 
     Orange where positive, blue where negative, white where none; the state shows through as a light shade.
@@ -114,10 +95,7 @@ def overlay(states: Bytes) -> Bytes:
     return laid_over.round().astype(np.uint8)
 
 
-def write_sheets(
-    path: Path,
-    folder: Path,
-) -> list[Path]:
+def write_sheets(path: Path, folder: Path) -> list[Path]:
     """Draw a data file's labelled and held-out states, a picture for each room and label, to check labels by eye.
 
     The files are ``labelled/SUB_GOAL/room-01-positives.png`` and so on in ``folder``. A path that is no data file and
@@ -141,22 +119,15 @@ def write_sheets(
 
 def sheets(split: States) -> Iterator[tuple[str, Bytes]]:
     """A sheet of each room and label, with its name, such as ``room-01-positives``; states are spread over them."""
-    words = np.where(split.labels, "positives", "negatives")
-    table = pd.DataFrame(
-        {
-            "name": words,
-            "negative": ~split.labels,
-            "place": 0,
-        }
-    )
-    for place in PLACES:
-        if place in split.origins:
-            table["place"] = split.origins[place]
-            table["name"] = table["place"].map((place.replace("_", "-") + "-{:02d}-").format) + words
-            break
-    for _, alike in table.groupby(["place", "negative"]):
-        few = alike.index[spread_rows(len(alike), MOST_STATES)]
-        yield alike["name"].iloc[0], sheet(split.observations[few])
+    origin = next((name for name in PLACES if name in split.origins), "")
+    places = split.origins.get(origin, np.zeros(len(split.labels)))
+    for place in np.unique(places):
+        for word, labels in (("positives", split.labels), ("negatives", ~split.labels)):
+            alike = np.flatnonzero(labels & (places == place))
+            if len(alike):
+                few = alike[spread_rows(len(alike), MOST_STATES)]
+                name = f"{origin.replace('_', '-')}-{place:02d}-{word}" if origin else word
+                yield name, sheet(split.observations[few])
 
 
 def sheet(observations: Bytes) -> Bytes:
@@ -165,11 +136,5 @@ def sheet(observations: Bytes) -> Bytes:
     missing = -len(shown) % COLUMNS
     padded = np.pad(shown, ((0, missing), (GAP, GAP), (GAP, GAP), (0, 0)))
     _, height, width, _ = padded.shape
-    rows = padded.reshape(
-        -1,
-        COLUMNS,
-        height,
-        width,
-        3,
-    )
+    rows = padded.reshape(-1, COLUMNS, height, width, 3)
     return rows.swapaxes(1, 2).reshape(-1, COLUMNS * width, 3)

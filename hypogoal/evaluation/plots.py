@@ -2,6 +2,7 @@
 
 import io
 import re
+from collections.abc import Collection
 from contextlib import AbstractContextManager
 from hashlib import blake2b
 from typing import Any
@@ -23,11 +24,7 @@ UNDATED = {
     "pdf": ("CreationDate", "Producer", "Creator"),
     "png": ("Software",),
 }
-DOTTED: dict[str, Any] = {
-    "color": GREY,
-    "linestyle": ":",
-    "linewidth": 1.2,
-}  # a line of what is no method
+DOTTED: dict[str, Any] = {"color": GREY, "linestyle": ":", "linewidth": 1.2}  # a line of what is no method
 
 
 def styled() -> AbstractContextManager[None]:
@@ -59,37 +56,21 @@ def legend_below(figure: Figure, columns: int) -> None:
         columns = 1
     lines = -(-len(by_label) // columns)
     figure.set_figheight(figure.get_figheight() + 0.2 * lines + 0.1)
-    figure.legend(
-        by_label.values(),
-        by_label.keys(),
-        loc="outside lower left",
-        ncols=columns,
-    )
+    figure.legend(by_label.values(), by_label.keys(), loc="outside lower left", ncols=columns)
 
 
-def pictures(
-    rows: int,
-    columns: int,
-    titles: float = 0.34,
-) -> tuple[Figure, list[Axes]]:
-    """Places for pictures without axes, row by row; ``titles``: inches above each."""
+def panels(shown: Collection[tuple[str, Bytes]], columns: int, titles: float = 0.34) -> tuple[Figure, list[Axes]]:
+    """Pictures by their titles, row by row; ``titles``: inches above each. Of a stack of grey frames the last."""
     side = WIDTH / max(columns, 3)
+    rows = -(-len(shown) // columns)
     figure = Figure(figsize=(side * columns, rows * (side + titles)))
     places = list(figure.subplots(rows, columns, squeeze=False).flat)
     for place in places:
         place.set_axis_off()
+    for place, (title, image) in zip(places, shown, strict=False):
+        place.imshow(image if image.shape[2] == 3 else image[..., -1], vmin=0, vmax=255)
+        place.set_title(title, fontsize=9, loc="center")
     return figure, places
-
-
-def show_picture(
-    place: Axes,
-    image: Bytes,
-    title: str,
-) -> None:
-    """A picture; of a stack of grey frames the last."""
-    shown = image if image.shape[2] == 3 else image[..., -1]
-    place.imshow(shown, vmin=0, vmax=255)
-    place.set_title(title, fontsize=9, loc="center")
 
 
 def slug(text: str) -> str:

@@ -22,14 +22,8 @@ def provenance(contents: Contents) -> dict[str, Any]:
     collected = []
     for path in contents.data():
         dataset = open_dataset(path)
-        collected.append(
-            {
-                "path": path.name,
-                "config": dataset.config,
-                "counts": dataset.counts(),
-                "seed": dataset.seed,
-            }
-        )
+        facts = {"path": path.name, "config": dataset.config, "counts": dataset.counts(), "seed": dataset.seed}
+        collected.append(facts)
     return {"artefacts": artefacts, "data": collected}
 
 
@@ -53,10 +47,7 @@ def settings_of(results: Results) -> pd.DataFrame:
     for kind, settings in parts:
         settings.pop("domain_config", None)  # the data's own
         rows += [(kind, name, as_text(value)) for name, value in settings.items()]
-    return pd.DataFrame(
-        rows,
-        columns=["of", "setting", "text"],
-    ).drop_duplicates()
+    return pd.DataFrame(rows, columns=["of", "setting", "text"]).drop_duplicates()
 
 
 def context(results):

@@ -1,20 +1,17 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own, its template, and a line here.
 
-A question is a module with ``TITLE`` and any of:
+A question is a module with ``TITLE`` and ``context(results)``, of :class:`page.Results`: by name what its template
+needs, nothing where the run has nothing of it. These names are known here:
 
-- ``look(work, judgement)`` and ``rows(work)``: its numbers, rows of the table (DataFrames); ``facts(work)``: what else
-  it needs to know, by name; ``missing(work)``: lines about what the run has no artefacts for. :class:`judging.Work`
-  and :class:`judging.Judgement` say what these are.
-- ``runs(results)``, of :class:`page.Results`: each run's numbers, of :func:`house.per_run`. Its table is over these by
-  the columns ``BY``, and quantities that are ``PAIRED`` are compared, of ``compared(results)`` where these are other
-  runs.
-- ``context(results)``: what else its template needs, by name; None where the run has nothing of it.
-- ``figures(context)``, of what the template is given: :class:`page.Drawn` ones.
+- ``table``: each run's numbers, of :func:`house.per_run`, over which :func:`house.over` goes; written as a file.
+- ``compared``: those of each run's numbers whose pairs, ``pairs``, its table of pairs has.
+- ``figures``: :class:`page.Drawn` ones, of which its template's macro ``caption`` says what they show.
 
-Its template gets ``results``, ``table``, ``pairs`` and ``figures``, and sets ``shown``, what a terminal prints.
+Its template sets ``shown``, what a terminal prints, unless it is ``FOLDED``. What puts numbers of its own into the
+table is named in ``LOOKS`` or ``ROWS``.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -39,7 +36,7 @@ from hypogoal.evaluation import (
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.page import Drawn, Results
+from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.run import FORMAT
 
 Context = dict[str, Any]  # what a question's template is given
@@ -53,55 +50,35 @@ QUESTIONS: list[ModuleType] = [  # in the order of the page
     selection,
     choosing,
     zero_shot,
+    provenance,
 ]
 FOLDED = (exploits, saliency, selection, provenance)  # until asked for
+LOOKS = (hypotheses.look, saliency.look)  # rows (DataFrames) of :class:`judging.Work` and :class:`judging.Judgement`
+ROWS = (curves.rows, distance.rows, exploits.rows, selection.rows, choosing.rows, zero_shot.rows)  # of ``Work`` alone
 
 
-def answers(results: Results, *, drawn: bool = False) -> list[Context]:
-    """Of every question that the run has something of, in the order of the page; with its figures if ``drawn``."""
-    every = []
-    for question in (*QUESTIONS, provenance):
-        context = context_of(question, results)
-        if context is None:
-            continue
-        if drawn and hasattr(question, "figures"):
-            context["figures"] = list(question.figures(context))
-        every.append(context)
-    return every
+def answers(results: Results) -> list[Context]:
+    """Of every question that the run has something of, in the order of the page."""
+    contexts = [context_of(question, results) for question in QUESTIONS]
+    return [context for context in contexts if context]
 
 
 def context_of(question: ModuleType, results: Results) -> Context | None:
-    """A question's numbers, without its figures; None where the run has nothing of it."""
-    context = {
+    """What a question's template is given; None where the run has nothing of it."""
+    found = question.context(results)
+    if not found:
+        return None
+    compared = found.get("compared", pd.DataFrame())
+    return {
         "name": name_of(question),
         "title": question.TITLE,
         "folded": question in FOLDED,
         "results": results,
         "table": pd.DataFrame(),
-        "pairs": pd.DataFrame(),
+        "pairs": compared if compared.empty else house.pairs(compared),
         "figures": [],
+        **found,
     }
-    if hasattr(question, "runs"):
-        runs = question.runs(results)
-        if runs.empty:
-            return None
-        context["table"] = house.over(runs, question.BY)
-        if hasattr(question, "PAIRED"):
-            context["pairs"] = house.pairs(paired_runs(question, results, runs))
-    if not hasattr(question, "context"):
-        return context
-    more = question.context(results)
-    return None if more is None else context | more
-
-
-def paired_runs(
-    question: ModuleType,
-    results: Results,
-    runs: pd.DataFrame,
-) -> pd.DataFrame:
-    """Each run's numbers that are compared."""
-    every = question.compared(results) if hasattr(question, "compared") else runs
-    return every[every["quantity"].isin(question.PAIRED)]
 
 
 def name_of(question: ModuleType) -> str:
@@ -109,34 +86,27 @@ def name_of(question: ModuleType) -> str:
     return question.__name__.rpartition(".")[-1].replace("_", "-")
 
 
-def asked(name: str) -> Iterator[Any]:
-    """This part of every question that has it."""
-    for question in (*QUESTIONS, verdict):
-        if hasattr(question, name):
-            yield getattr(question, name)
-
-
 def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
     """Every number of a run, and what else its page needs: ensembles are judged, then all questions asked."""
     parts: list[pd.DataFrame] = []
-    for judgement in judging.judgements(work.cases(), work.progress.advance):
-        for look in asked("look"):
+    for judgement in work.judgements():
+        for look in LOOKS:
             parts += look(work, judgement)
         work.progress.advance()
-    for rows in asked("rows"):
+    for rows in ROWS:
         parts += rows(work)
+    missing = [] if work.contents.ensembles else ["no ensemble"]
     facts = {
         "format": FORMAT,
         "run": work.contents.run.resolve().name,
         "settings": settings,
         "provenance": provenance.provenance(work.contents),
-        "missing": [] if work.contents.ensembles else ["no ensemble"],
+        "missing": missing + selection.missing(work),
+        **curves.facts(work),
+        **verdict.facts(work),
+        **work.facts,
     }
-    for facts_of in asked("facts"):
-        facts |= facts_of(work)
-    for missing in asked("missing"):
-        facts["missing"] += missing(work)
-    return Results(house.joined(parts), facts | work.facts)
+    return Results(house.joined(parts), facts)
 
 
 def write(folder: Path, results: Results, every: list[Context]) -> None:
@@ -155,12 +125,8 @@ def write(folder: Path, results: Results, every: list[Context]) -> None:
 
 def summary(results: Results, every: list[Context]) -> Group:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
-    tables: list[Any] = []
-    for context in every:
-        words = page.module(context["name"], context)
-        shown = getattr(words, "shown", pd.DataFrame())
-        if not shown.empty:
-            tables.append(page.terminal(context["title"], shown))
+    open_ones = [context for context in every if not context["folded"]]
+    tables = [page.terminal(context["title"], page.words_of(context).shown) for context in open_ones]
     lines = Table.grid()
     lines.width = page.WIDTH
     if results.facts["missing"]:
@@ -172,28 +138,17 @@ def summary(results: Results, every: list[Context]) -> Group:
 
 def sentences(results: Results) -> list[str]:
     """The verdict, a sentence a line."""
-    return page.lines_of("verdict.txt", verdict.context(results))
+    return page.lines_of("verdict.txt", **verdict.context(results))
 
 
 def render(results: Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
-    """Spec F7: the page of a run, self-contained, with the figures of drawn :func:`answers`."""
-    sections = sorted(every, key=lambda context: context["folded"])  # what is open comes first
-    lead = verdict.context(results)
-    lead |= {"sentences": sentences(results), "films": films, "domains": provenance.domains_of(results)}
-    return page.draw_page(f"hypogoal: {results.facts['run']}", sections, "run.html", **lead)
-
-
-def captions(every: Iterable[Context]) -> dict[str, tuple[Drawn, str]]:
-    """Figures and their captions, by their names."""
-    by_name = {}
-    for context in every:
-        words = page.module(context["name"], context | {"figures": []})
-        for figure in context["figures"]:
-            caption = words.caption(figure).unescape()
-            by_name[figure.name] = figure, " ".join(caption.split())
-    return by_name
-
-
-def not_drawn(names: Iterable[str]) -> list[str]:
-    """A line for each of the paper's Figures 2 to 9 that is not among a run's figures."""
-    return page.lines_of("needed.txt", {"drawn": [name.partition("-")[0] for name in names]})
+    """Spec F7: the page of a run, self-contained, with the figures of :func:`answers`."""
+    return page.render(
+        "run.html",
+        title=f"hypogoal: {results.facts['run']}",
+        sections=sorted(every, key=lambda context: context["folded"]),  # what is open comes first
+        sentences=sentences(results),
+        films=films,
+        domains=provenance.domains_of(results),
+        **verdict.context(results),
+    )

@@ -3,8 +3,7 @@
 Where members disagree, which failures they take for a success, and which states to label next.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,22 +42,13 @@ NEXT = 100  # states to label next in the table
 CARDS, FAILURES = 20, 4  # on the page: of these, and of each member's failures
 
 
-@dataclass(frozen=True)
-class Findings:
-    """What is found of one sub-goal's classifier."""
+def findings_of(classifier: Classifier, dataset: Dataset, sub_goal: str) -> dict[str, Any]:
+    """What it says of a data file's states, and which to label next.
 
-    numbers: dict[str, Any]  # of ``audit.json``
-    thresholds: Doubles  # (K,)
-    # Unlabelled states to label next, best first: which they are, how much members disagree, what they say (n, K).
-    rows: Ints
-    disputed: Doubles
-    states: Observations
-    scores: Floats
-    failures: list[tuple[Observations, Floats]]  # of each member those that it scores highest, and all members' scores
-
-
-def findings_of(classifier: Classifier, dataset: Dataset, sub_goal: str) -> Findings:
-    """What it says of a data file's states, and which to label next."""
+    Returns ``numbers`` of ``audit.json``; ``thresholds`` (K,); of unlabelled states to label next, best first, ``rows``
+    (which they are), ``disputed`` (how much members disagree), ``states`` and ``scores``, what members say (n, K);
+    ``failures``: of each member those that it scores highest, a list of states and one of all members' scores.
+    """
     thresholds = np.array(classifier.thresholds.tolist())
     known = joined([dataset.labelled(sub_goal), dataset.heldout(sub_goal)])
     unlabelled = dataset.unlabelled()
@@ -88,28 +78,29 @@ def findings_of(classifier: Classifier, dataset: Dataset, sub_goal: str) -> Find
         "members": member_table(known.labels, known_scores, scores, thresholds).to_dict("records"),
         "next": rows[:CARDS].tolist(),
     }
-    return Findings(
-        numbers,
-        thresholds,
-        rows,
-        disputed[proposed],
-        unlabelled[rows],
-        scores[rows],
-        failures,
-    )
+    return {
+        "numbers": numbers,
+        "thresholds": thresholds,
+        "rows": rows,
+        "disputed": disputed[proposed],
+        "states": unlabelled[rows],
+        "scores": scores[rows],
+        "failures": failures,
+    }
 
 
-def write_next(folder: Path, columns: Sequence[str], findings: Findings) -> None:
+def write_next(folder: Path, columns: Sequence[str], findings: Mapping[str, Any]) -> None:
     """Write the states to label next: a table to fill in, and pictures ``001.png``, ... in its order, if they are."""
     folder.mkdir(parents=True)
     lines = []
-    for number, state in enumerate(findings.states):
+    each = zip(findings["rows"], findings["states"], findings["disputed"], strict=True)
+    for number, (row, state, disputed) in enumerate(each, 1):
         name = ""
         picture = picture_of(state)
         if picture is not None:
-            name = f"{number + 1:03d}.png"
+            name = f"{number:03d}.png"
             Image.fromarray(picture).save(folder / name)
-        lines.append([name, "", findings.rows[number], digest(state).hex(), findings.disputed[number]])
+        lines.append([name, "", row, digest(state).hex(), disputed])
     table = pd.DataFrame(lines, columns=[*columns])
     table.round(4).to_csv(folder / TO_FILL_IN, index=False)
 
@@ -172,12 +163,7 @@ def to_label(scores: Doubles, sketches: Doubles, count: int) -> Ints:
     return np.array(rows)
 
 
-def member_table(
-    labels: Bools,
-    known_scores: Floats,
-    scores: Floats,
-    thresholds: Doubles,
-) -> pd.DataFrame:
+def member_table(labels: Bools, known_scores: Floats, scores: Floats, thresholds: Doubles) -> pd.DataFrame:
     """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
     positive = scores > thresholds
     alone = positive & (positive.sum(axis=1, keepdims=True) == 1)

@@ -5,13 +5,14 @@ score stands on unseen rooms and on all rooms, and beside the best member are th
 rooms of the labelled groups, the only ones whose labels were to be had, would have picked.
 """
 
+from functools import partial
 from itertools import product
 
 import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import per_run
+from hypogoal.evaluation.house import per_run, tables_of
 from hypogoal.evaluation.hypotheses import KNOWN, VALIDATED
 from hypogoal.evaluation.page import Drawn
 
@@ -34,8 +35,8 @@ PANELS = {  # of Figure 3, and what it takes no seeing to score
 }
 
 
-def runs(results):
-    """Spec F1, F2: members' scores and disagreement, and what a member that is never positive has."""
+def context(results):
+    """Spec F1, F2: members' scores and disagreement, and what a member that is never positive has; Figure 3."""
     by_room = results.of(scope="unseen")["artefact"]
     numbers = results.of(artefact=[*by_room.unique()])
     states = per_run(numbers, "states", scope="all")
@@ -45,32 +46,20 @@ def runs(results):
     for scope in ("unlabelled", "heldout"):
         values.append(per_run(numbers, "disagreement", scope=scope, name=f"{{}}, {scope}"))
     for scope, (which, member) in product(("unseen", "all"), WHICH.items()):
-        values.append(
-            per_run(
-                numbers,
-                *SCORED,
-                scope=scope,
-                member=member,
-                name=f"{{}}, {scope}, {which}",
-            )
-        )
-    return pd.concat(values)
+        name = f"{{}}, {scope}, {which}"
+        values.append(per_run(numbers, *SCORED, scope=scope, member=member, name=name))
+    found = tables_of(pd.concat(values), BY, PAIRED)
+    return found and {**found, "figures": [*_figures(found["table"])]}
 
 
-def figures(context):
+def _figures(table):
     """Figure 3, and what it leaves out, of each sub-goal."""
-    table = context["table"]
     sub_goals = table["sub_goal"].unique()
     for sub_goal in sub_goals:
         rows = table[table["sub_goal"] == sub_goal].dropna(subset="N")
         suffix = f"-{sub_goal}" if len(sub_goals) > 1 else ""
-        figure = scores_over_groups(rows)
-        yield Drawn(
-            f"figure3{suffix}",
-            "Figure 3: members against labelled groups",
-            figure,
-            {"sub_goal": sub_goal},
-        )
+        label = "Figure 3: members against labelled groups"
+        yield Drawn(f"figure3{suffix}", label, partial(scores_over_groups, rows), {"sub_goal": sub_goal})
 
 
 def scores_over_groups(table: pd.DataFrame) -> Figure:
@@ -79,26 +68,18 @@ def scores_over_groups(table: pd.DataFrame) -> Figure:
     Of a table of :func:`house.over`, all of one sub-goal; dotted is a member that is never positive.
     """
     never = table[table["quantity"] == NEVER].drop_duplicates("N").set_index("N")["mean"]
-    with plots.styled():
-        figure = Figure(figsize=(plots.WIDTH, 4.55))
-        axes = figure.subplots(2, 2, sharex=True, sharey=True).flat
-        for place, (quantity, title) in zip(axes, PANELS.items(), strict=True):
-            shown = table[table["quantity"] == quantity].set_index("N")
-            for method in table["method"].unique():
-                rows = shown[shown["method"] == method]
-                place.errorbar(
-                    rows.index,
-                    rows["mean"],
-                    yerr=rows["standard_deviation"].fillna(0),
-                    label=method,
-                    marker="o",
-                    markersize=4,
-                    alpha=0.8,
-                )
-            blind = never if quantity.startswith("accuracy") else never * 0 + 0.5
-            place.plot(blind.index, blind, **plots.DOTTED, marker=".")
-            place.set_title(title, fontsize=9.5)
-            place.set(xlabel="labelled groups, N", ylabel="fraction", xticks=sorted(never.index))
-            place.label_outer()
-        plots.legend_below(figure, 3)
+    figure = Figure(figsize=(plots.WIDTH, 4.55))
+    axes = figure.subplots(2, 2, sharex=True, sharey=True).flat
+    for place, (quantity, title) in zip(axes, PANELS.items(), strict=True):
+        shown = table[table["quantity"] == quantity].set_index("N")
+        for method in table["method"].unique():
+            rows = shown[shown["method"] == method]
+            errors = rows["standard_deviation"].fillna(0)
+            place.errorbar(rows.index, rows["mean"], errors, label=method, marker="o", markersize=4, alpha=0.8)
+        blind = never if quantity.startswith("accuracy") else never * 0 + 0.5
+        place.plot(blind.index, blind, **plots.DOTTED, marker=".")
+        place.set_title(title, fontsize=9.5)
+        place.set(xlabel="labelled groups, N", ylabel="fraction", xticks=sorted(never.index))
+        place.label_outer()
+    plots.legend_below(figure, 3)
     return figure

@@ -3,13 +3,9 @@
 A damaged file is refused in one line (Spec G2).
 """
 
-import contextlib
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-from pydantic import BaseModel
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
@@ -84,28 +80,11 @@ def takes(artefact: Artefact) -> bool:
     return artefact.kind != "baseline" and artefact.config["termination"] != "oracle"
 
 
-class Layout(BaseModel, strict=True):
-    """``layout.json``: what is known of the layout that an agent was trained on."""
-
-    layout_seed: int
-    shortest_path: int | None  # steps
-    random_success: float | None  # share of random play's episodes
-    layouts: str | None = None  # where there were many
-
-
-def read_layout(path: Path) -> Layout:
-    """``layout.json``; a ``UserError`` where it is missing or damaged."""
-    with reading(path, subject="the layout's file"):
-        return Layout.model_validate_json(path.read_bytes())
-
-
-@contextlib.contextmanager
-def fitting(where: object) -> Iterator[None]:
-    """Drawing an evaluation, whose numbers are a file's: what does not fit is told in one line."""
-    try:
-        yield
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise UserError("the evaluation does not fit this hypogoal, or is damaged", where, EVALUATE_AGAIN) from error
+def choice_of(artefact: Artefact) -> str:
+    """How a meta artefact chooses among members' options: ``learned`` or ``random``; empty: it does not."""
+    if artefact.kind != "meta" or not takes(artefact):
+        return ""
+    return "random" if artefact.config["chooser"] == "random" else "learned"
 
 
 def evaluation_of(run: Path) -> Artefact:

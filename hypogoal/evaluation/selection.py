@@ -1,24 +1,20 @@
 """Figures 7 and 8: which members the meta-policy prefers, and where their options stop (Spec F6)."""
 
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hypogoal.core.arrays import (
-    Bytes,
-    Doubles,
-    Ints,
-)
+from hypogoal.core.arrays import Bytes, Doubles, Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import base
 from hypogoal.evaluation import page, plots
 from hypogoal.evaluation.curves import chosen_by
-from hypogoal.evaluation.house import of_options
-from hypogoal.evaluation.pictures import (
-    overlay,
-)
+from hypogoal.evaluation.house import melted, options_of
+from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.run import takes
 from hypogoal.hypotheses import scores
 from hypogoal.meta.config import layout_seeds
@@ -50,7 +46,7 @@ def rows(work):
             work.arrays[f"terminations/{name}/{option}"] = picture
         columns = numbers_of_choices(ChoiceCounts.read(artefact.path / ChoiceCounts.FILE), len(match))
         columns["match"] = match
-        yield of_options(columns, config, **work.place(artefact), scope=SCOPE)
+        yield melted(columns, options_of(config), **work.place(artefact), scope=SCOPE)
 
 
 def numbers_of_choices(choices: ChoiceCounts, options: int) -> dict[str, Doubles]:
@@ -76,11 +72,8 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> tuple[Doubles, dict[int, 
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
     config = Artefact(path).config
-    domain = base.load_domain(config["domain"])
-    world = domain.world(config["domain_config"])
-    if len(layouts) > 1:
-        world["layouts"] = base.Layouts(layouts)
-    engine = domain.make_engine(layouts[0], len(layouts), 500, **world)
+    known = base.load_domain(config["domain"]).sub_goals
+    engine = engine_on(config, layouts)
     ids = engine.reachable()
     if ids is None:
         ids = states_met(engine, 2_000, rng_for(0, "states-of-layout"))
@@ -89,8 +82,8 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> tuple[Doubles, dict[int, 
     for sub_goal in config["sub_goals"]:
         predictions = read_ensemble(path, config, sub_goal).predictions(images)
         match = np.full(predictions.shape[1], np.nan)
-        if sub_goal in domain.sub_goals:
-            truth = labels[:, domain.sub_goals.index(sub_goal)]
+        if sub_goal in known:
+            truth = labels[:, known.index(sub_goal)]
             match = scores.member_scores(predictions, truth)["balanced_accuracy"]
         matches.append(match)
         verdicts.append(predictions)
@@ -102,11 +95,16 @@ def on_layout(path: Path, layouts: tuple[int, ...]) -> tuple[Doubles, dict[int, 
     return np.concatenate(matches), sets
 
 
-def states_met(
-    engine: base.Engine,
-    steps: int,
-    rng: np.random.Generator,
-) -> Ints:
+def engine_on(config: Mapping[str, Any], layouts: Sequence[int]) -> base.Engine:
+    """A game on each of some layouts, in the world that an artefact's ``config`` says."""
+    domain = base.load_domain(config["domain"])
+    world = domain.world(config["domain_config"])
+    if len(layouts) > 1:
+        world["layouts"] = base.Layouts(layouts)
+    return domain.make_engine(layouts[0], len(layouts), 500, **world)
+
+
+def states_met(engine: base.Engine, steps: int, rng: np.random.Generator) -> Ints:
     """The states that random play of an engine meets in so many steps, each once."""
     met = [engine.ids]
     for _ in range(steps // engine.count):
@@ -116,12 +114,12 @@ def states_met(
 
 def missing(work):
     """Sub-goals of which the domain does not know where they are reached."""
-    lines = {}
+    lines = set()
     for artefact in filter(takes, work.contents.agents):
-        domain = base.load_domain(artefact.config["domain"])
-        for sub_goal in set(artefact.config["sub_goals"]).difference(domain.sub_goals):
-            has = f"{artefact.config['domain']} has {page.listed(domain.sub_goals)}"
-            lines[f"no truth of {sub_goal} to match members with: {has}"] = True
+        name = artefact.config["domain"]
+        known = base.load_domain(name).sub_goals
+        for sub_goal in set(artefact.config["sub_goals"]).difference(known):
+            lines.add(f"no truth of {sub_goal} to match members with: {name} has {page.listed(known)}")
     return sorted(lines)
 
 
@@ -129,24 +127,18 @@ def context(results):
     """A row of ``table`` for each run's member; ``members``: those of the first run that learned to choose, if any."""
     numbers = results.of(scope=SCOPE)
     if numbers.empty:
-        return None
+        return {}
     place = ["artefact", "method", "layout", "seed", "sub_goal", "member"]
-    wide = numbers.pivot_table(
-        index=place,
-        columns="quantity",
-        values="value",
-        sort=False,
-    ).reset_index()
+    wide = numbers.pivot_table("value", place, "quantity", sort=False).reset_index()
     table = wide.reindex(columns=[*place, *NUMBERS])
     learned = table["method"].isin([*chosen_by(results, "learned")])
     shown = table[learned] if learned.any() else table
-    members = shown[shown["artefact"] == shown["artefact"].min()]
-    return {"table": table, "members": members.reset_index(drop=True)}
+    members = shown[shown["artefact"] == shown["artefact"].min()].reset_index(drop=True)
+    return {"table": table, "members": members, "figures": [*_figures(members, results.arrays)]}
 
 
-def figures(context):
+def _figures(members, arrays):
     """Figures 7 and 8 and the other sub-goals': termination states of the most and of the least preferred member."""
-    members, arrays = context["members"], context["results"].arrays
     path = members["artefact"].min()
     for sub_goal, of_goal in members.dropna(subset="preference").groupby("sub_goal", sort=False):
         preference = of_goal["preference"]
@@ -155,16 +147,13 @@ def figures(context):
             states = arrays.get(f"terminations/{path}/{option}")
             if states is not None:
                 sides[f"{word} preferred\nmember {members['member'][option]}"] = states
-        if not sides:
-            continue
-        with plots.styled():
-            figure, places = plots.pictures(1, 2, titles=0.6)
-            for place, (title, image) in zip(places, sides.items(), strict=False):
-                plots.show_picture(place, image, title)
-        name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
-        yield page.Drawn(
-            name,
-            f"Termination states of {sub_goal}",
-            figure,
-            {"sub_goal": sub_goal},
-        )
+        if sides:
+            name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
+            label = f"Termination states of {sub_goal}"
+            yield page.Drawn(name, label, partial(side_by_side, sides), {"sub_goal": sub_goal})
+
+
+def side_by_side(sides):
+    """Two pictures at most, by their titles."""
+    figure, _ = plots.panels(sides.items(), 2, titles=0.6)
+    return figure

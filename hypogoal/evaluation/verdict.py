@@ -13,17 +13,9 @@ import pandas as pd
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN
 from hypogoal.evaluation.curves import chosen_by
-from hypogoal.evaluation.house import (
-    compare,
-    paired,
-    per_run,
-)
+from hypogoal.evaluation.house import compare, paired, per_run
 from hypogoal.evaluation.hypotheses import VALIDATED
-from hypogoal.evaluation.names import (
-    ONE,
-    ORACLE,
-    UNIFORM,
-)
+from hypogoal.evaluation.names import ONE, ORACLE, UNIFORM
 from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.zero_shot import SCOPE as OTHER_LAYOUTS
 
@@ -46,11 +38,7 @@ def facts(work):
     return {"tasks": [*tasks], "task_of": task_of, "cap": max(caps, default=0)}
 
 
-def outcome_of(
-    difference: float,
-    low: float,
-    high: float,
-) -> str:
+def outcome_of(difference: float, low: float, high: float) -> str:
     """What a difference of shares says; of one unit, whose bounds are NaN, the difference alone.
 
     An interval within ``MARGIN`` of 0 is no difference, one above or below 0 is a difference, any other undecided.
@@ -64,12 +52,7 @@ def outcome_of(
     return WORSE if high < 0 else UNDECIDED
 
 
-def finding(
-    subject: str,
-    first: pd.DataFrame,
-    second: pd.DataFrame,
-    on: list[str],
-) -> list[dict[str, Any]]:
+def finding(subject: str, first: pd.DataFrame, second: pd.DataFrame, on: list[str]) -> list[dict[str, Any]]:
     """Two shares, of runs that agree in ``on``; each layout or ladder counts once, or each run of one.
 
     Nothing without pairs.
@@ -78,12 +61,8 @@ def finding(
     if both.empty:
         return []
     result = compare(both.assign(of="success"), "ladder" if subject == OPTIONS else "layout")
-    outcome = outcome_of(
-        result["difference"],
-        result["difference_low"],
-        result["difference_high"],
-    )
-    return [{"subject": subject, **result, "outcome": outcome}]
+    bounds = [result[f"difference{end}"] for end in ("", "_low", "_high")]
+    return [{"subject": subject, **result, "outcome": outcome_of(*bounds)}]
 
 
 def findings(results: Results) -> list[dict[str, Any]]:
@@ -96,15 +75,15 @@ def findings(results: Results) -> list[dict[str, Any]]:
     learned = chosen_by(results, "learned")
     task_of = results.facts.get("task_of", {})
     result: list[dict[str, Any]] = []
-    for name in learned:
-        if learned[name]["members"] == 1:
+    for name, agent in learned.items():
+        if agent["members"] == 1:
             continue
         training, frozen = _of(name, trained), _of(name, played)
         of_choosing = finding(CHOOSING, frozen, _of(UNIFORM, played), ["artefact", "layout"])
         # random choice while learning has other options
         result += of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
-        for other in learned:
-            if learned[other]["members"] != 1 or task_of.get(name) != task_of.get(other):
+        for other, single in learned.items():
+            if single["members"] != 1 or task_of.get(name) != task_of.get(other):
                 continue
             both = frozen, _of(other, played)
             if min(map(len, both)) == 0:

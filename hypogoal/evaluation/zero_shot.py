@@ -16,7 +16,7 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation.choosing import with_choosers
 from hypogoal.evaluation.curves import scores
-from hypogoal.evaluation.house import options_of, per_run
+from hypogoal.evaluation.house import options_of, per_run, tables_of
 from hypogoal.evaluation.names import UNIFORM
 
 if TYPE_CHECKING:
@@ -48,12 +48,7 @@ def shortest_ways(engine: Engine) -> Doubles:
     return np.where(steps < FAR, steps, np.nan)
 
 
-def alone(
-    loop: OptionLoop,
-    option: int,
-    goal: int,
-    shortest: Doubles,
-) -> Played:
+def alone(loop: OptionLoop, option: int, goal: int, shortest: Doubles) -> Played:
     """Numbers of an option, begun where episodes begin and anew at each timeout until its member is positive.
 
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
@@ -72,10 +67,8 @@ def alone(
         steps[going] += 1
         ends = going & moved.reached
         positive |= ends
-        holds_now = engine.labels(moved.next_ids)[:, goal]
-        reached |= ends & holds_now
-        goes_on = engine.elapsed > 0  # the episode did not end
-        going &= ~moved.reached & goes_on
+        reached |= ends & engine.labels(moved.next_ids)[:, goal]
+        going &= ~moved.reached & (engine.elapsed > 0)  # else the episode ended
         if not going.any():
             break
     false_positives = positive & ~reached
@@ -115,20 +108,14 @@ def rows(work):
             if artefact.kind == "baseline":
                 continue
             for fields, numbers in played(artefact, layouts):
-                place = {
-                    **work.place(artefact),
-                    **fields,
-                    "layout": layouts,
-                    "scope": SCOPE,
-                }
-                table = pd.DataFrame({**place, **numbers})
-                yield table.melt([*place], var_name="quantity")
+                place = {**work.place(artefact), **fields, "layout": layouts, "scope": SCOPE}
+                yield pd.DataFrame({**place, **numbers}).melt([*place], var_name="quantity")
 
 
-def runs(results):
+def context(results):
     """Agents, uniform-random choice among their options, each option alone, and the mean member."""
     numbers = results.of(scope=SCOPE)
     values = [per_run(numbers, *QUANTITIES, scope=SCOPE)]
     for member, of_member in numbers.groupby("member"):
         values.append(per_run(of_member, *QUANTITIES, scope=SCOPE).assign(member=member))
-    return with_choosers(pd.concat(values))
+    return tables_of(with_choosers(pd.concat(values)), BY)

@@ -40,7 +40,7 @@ def report(
     from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
     from hypogoal.evaluation.page import source
     from hypogoal.evaluation.questions import answers, render
-    from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
+    from hypogoal.evaluation.run import evaluation_of, read_evaluation
 
     evaluation = evaluation_of(run)
     agent = None if videos == 0 else agent_to_film(run)
@@ -56,11 +56,10 @@ def report(
             if videos:
                 raise
             results.facts["missing"].append(f"no film of an episode: {error}")
-        with fitting(evaluation.path):
-            every = answers(results, drawn=True)
-            small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
-            shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
-            page = render(results, every, shown)
+        every = answers(results)
+        small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
+        shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
+        page = render(results, every, shown)
         index = draft.files / "index.html"
         index.write_text(page, encoding="utf-8")
         pictures = draft.files / "figures"

@@ -111,7 +111,7 @@ def _in_play(
     except Complete as complete:  # what was found stands, and may still fail
         say(complete, err=True)
     findings = json.loads((call.out / REPORT).read_text(encoding="utf-8"))
-    return lines_of("played.txt", findings), played.shares_of(findings)
+    return lines_of("played.txt", **findings), played.shares_of(findings)
 
 
 def _policies(config: Any, threshold: float) -> dict[str, float]:

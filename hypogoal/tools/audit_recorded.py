@@ -52,13 +52,13 @@ def audited(
             classifier, _ = classifier_of(source, goal, device)
             findings = recorded.findings_of(classifier, dataset, goal)
             recorded.write_next(draft.files / "next" / goal, COLUMNS, findings)
-            parts.append(findings.numbers)
+            parts.append(findings["numbers"])
             heading = {"name": slug(goal), "title": goal, "template": "audited", "folded": False}
-            sections.append(heading | vars(findings))
+            sections.append(heading | findings)
             progress.advance()
-        lines = page.lines_of("audited.txt", {"parts": parts})
+        lines = page.lines_of("audited.txt", parts=parts)
         title = f"hypogoal: audit of {Path(source).name}"
-        text = page.draw_page(title, sections, "lines.html", lines=lines, about="recorded data")
+        text = page.render("lines.html", title=title, sections=sections, lines=lines, about="recorded data")
         (draft.files / "index.html").write_text(text, encoding="utf-8")
         (draft.files / "audit.json").write_text(as_json({"sub_goals": parts}) + "\n", encoding="utf-8")
     shares = []

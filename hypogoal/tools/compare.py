@@ -7,7 +7,7 @@ from hypogoal.core.artefacts import create
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation import compare as beside
 from hypogoal.evaluation.plots import slug
-from hypogoal.evaluation.run import evaluation_of, fitting, read_evaluation
+from hypogoal.evaluation.run import evaluation_of, read_evaluation
 
 
 def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
@@ -30,12 +30,12 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
     ) as draft:
         labels = beside.labels_of([run.resolve().as_posix() for run in runs])
         results = dict(zip(labels, map(read_evaluation, runs), strict=True))
-        with fitting(where):
-            reason = beside.why_not(results)
-            if reason is not None:
-                do = "Choose runs of one experiment, evaluated alike."
-                raise UserError("these runs cannot be compared", reason, do)
-            page, figures, tables = beside.page_of(results, [str(run) for run in runs])
+        found = beside.shared(results)
+        reason = beside.why_not(results, found)
+        if reason is not None:
+            do = "Choose runs of one experiment, evaluated alike."
+            raise UserError("these runs cannot be compared", reason, do)
+        page, figures, tables = beside.page_of(results, found, [str(run) for run in runs])
         index = draft.files / "index.html"
         index.write_text(page, encoding="utf-8")
         for name, table in tables.items():

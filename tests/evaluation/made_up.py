@@ -31,11 +31,12 @@ def results_of(*rows: dict[str, Any], **facts: Any) -> Results:
 
 def shown(question: ModuleType, results: Results) -> pd.DataFrame:
     """The table that a terminal prints."""
-    words = page.module(question.__name__.rpartition(".")[-1], context_of(question, results) or {})
-    return words.shown
+    context = context_of(question, results)
+    assert context is not None
+    return page.words_of(context).shown
 
 
 def figures(question: ModuleType, results: Results) -> list[page.Drawn]:
     """A question's figures."""
     context = context_of(question, results)
-    return [] if context is None else list(question.figures(context))
+    return [] if context is None else context["figures"]

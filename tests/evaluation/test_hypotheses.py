@@ -17,12 +17,13 @@ LABELS = RNG.random(60) < 0.3
 PROBABILITIES = np.clip(RNG.random((60, 3)) + np.array([0.5, 0.1, -0.2]) * LABELS[:, None], 0, 1).astype(np.float32)
 CONTEXTS = np.repeat(np.arange(6), 10)
 EVERY = np.ones(60, dtype=np.bool_)
-JUDGED = Judged(PROBABILITIES, PROBABILITIES > 0.5, PROBABILITIES[:0] > 0.5, np.full(3, 0.5, np.float32))
+HALF = np.full(3, 0.5, np.float32)
+JUDGED = Judged(LABELS, {}, PROBABILITIES, PROBABILITIES > 0.5, PROBABILITIES[:0] > 0.5, HALF)
 
 
 def test_members_numbers_are_their_scores() -> None:
     """The best threshold, and what the own one loses."""
-    found, _ = knowledge(JUDGED, EVERY, LABELS, CONTEXTS)
+    found, _ = knowledge(JUDGED, EVERY, CONTEXTS)
     accuracy = member_scores(JUDGED.predictions, LABELS)["balanced_accuracy"]
     best = best_threshold(PROBABILITIES, LABELS)[1]
     assert found["at_best_threshold"].tolist() == best.tolist()
@@ -35,10 +36,10 @@ def test_the_best_is_picked_where_it_is_not_scored() -> None:
     first = CONTEXTS % 2 == 0
     ranked = [ranking(PROBABILITIES[half], LABELS[half]) for half in (first, ~first)]
     expected = (ranked[1][ranked[0].argmax()] + ranked[0][ranked[1].argmax()]) / 2
-    _, found = knowledge(JUDGED, EVERY, LABELS, CONTEXTS)
+    _, found = knowledge(JUDGED, EVERY, CONTEXTS)
     assert found["cross_fitted_ranking"] == pytest.approx(expected)
     for contexts in (None, CONTEXTS * 0):
-        assert knowledge(JUDGED, EVERY, LABELS, contexts)[1] == {}
+        assert knowledge(JUDGED, EVERY, contexts)[1] == {}
 
 
 CROSSED = np.array(list(product((0, 1), repeat=4)) * 20)  # (320, 4)

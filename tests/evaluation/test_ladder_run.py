@@ -76,13 +76,11 @@ def test_members_are_judged_room_by_room(ladders, results):
 def test_any_number_of_processes_gives_the_same_evaluation(small_ladders, tmp_path, monkeypatch):
     """Spec G1, G5: judged in two processes: the same numbers and arrays; this run is too small for more than one."""
     evaluate(small_ladders, tmp_path / "alone", **QUIET)
-    cases = [
-        judging.Case(each.input("data"), each.path, each.config) for each in find_artefacts(small_ladders, "ensemble")
-    ]
-    assert judging.processes_for(cases) == 1
+    ensembles = [(each, each.input("data")) for each in find_artefacts(small_ladders, "ensemble")]
+    assert judging.processes_for(ensembles) == 1
     monkeypatch.setattr(judging, "SPREAD_FROM", 0)
     monkeypatch.setenv("HYPOGOAL_CORES", "2")
-    assert judging.processes_for(cases) == 2
+    assert judging.processes_for(ensembles) == 2
     evaluate(small_ladders, tmp_path / "again", **QUIET)
     for name in ("numbers.csv", "run.json", "tables/rooms.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()

@@ -69,6 +69,6 @@ def test_the_line_names_members_that_hold_all_states_for_the_same() -> None:
         for member, share in enumerate((1.0, 0.25, 0.0))
     ]
     part = {"sub_goal": "door", "unlabelled": 8, "disagreement": 1.0, "members": rows}
-    several, alone = lines_of("audited.txt", {"parts": [part, part | {"members": rows[1:2]}]})
+    several, alone = lines_of("audited.txt", parts=[part, part | {"members": rows[1:2]}])
     assert "100.0% of 8 unlabelled states (the same prediction for all of them: member 0, 2)" in several
     assert "the classifier predicts 25.0% of 8 unlabelled states positive" in alone and "disagree" not in alone

@@ -28,8 +28,8 @@ VERDICTS = np.array(
 
 def judged() -> pd.DataFrame:
     """The rows of these members."""
-    sure = Judged(VERDICTS.astype(np.float32), VERDICTS, VERDICTS[:0], np.full(3, 0.5, np.float32))
-    return pd.concat(rows_of(sure, LABELS, {"room": ROOMS, "seen": SEEN}))
+    origins, thresholds = {"room": ROOMS, "seen": SEEN}, np.full(3, 0.5, np.float32)
+    return pd.concat(rows_of(Judged(LABELS, origins, VERDICTS.astype(np.float32), VERDICTS, VERDICTS[:0], thresholds)))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Spec F2: DeepLift against values worked by hand, and complete on both of the paper's networks."""
 
 import copy
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -11,8 +12,9 @@ from torch import nn
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.evaluation.attributing import look, pick_to_explain
 from hypogoal.evaluation.house import joined
-from hypogoal.evaluation.judging import Case, Judged, Judgement, Work
+from hypogoal.evaluation.judging import Judged, Judgement, Work
 from hypogoal.evaluation.run import Contents
+from hypogoal.hypotheses import ensemble as hypotheses
 from hypogoal.hypotheses.deep_lift import (
     DEEP_LIFT,
     INTEGRATED,
@@ -179,25 +181,22 @@ def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
         def see(self, observations):
             return observations[:, :, 1:]
 
-    class Here(Case):
-        def read(self, sub_goal):
-            return ensemble
-
     ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
     observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
     labels = np.array([True, False, False])
     yes = np.array([[True], [True], [False]])
     sure = np.array([[0.9], [0.8], [0.1]], np.float32)
-    judged = Judged(sure, yes, yes[2:], np.array([0.5], np.float32))
+    judged = Judged(labels, {}, sure, yes, yes[2:], np.array([0.5], np.float32))
     stored = States(observations, labels[:, None])
     data = Collected((1, 3, 1), ("down",), stored, States(observations[2:], np.zeros((1, 0), np.bool_)), stored)
     write_dataset(tmp_path / "data.h5", data, domain="x", config={}, seed=0)
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
-        here = Here(tmp_path / "data.h5", tmp_path, {"sub_goals": ["down"]})
+        here = SimpleNamespace(path=tmp_path, config={"sub_goals": ["down"]})
+        monkeypatch.setattr(hypotheses, "read_ensemble", lambda *_: ensemble)
         work = Work(Contents(tmp_path, [], [], [], []), arrays, None)
         work.browsed = tmp_path
         monkeypatch.setattr(Work, "place_of", lambda work, judgement: {"artefact": "ensemble"})
-        rows = joined(look(work, Judgement(here, "down", States(observations[:0], labels), judged)))
+        rows = joined(look(work, Judgement(here, tmp_path / "data.h5", "down", judged)))
         group = arrays["saliency/down"]
         assert group["observations"].shape == (3, 1, 3, 1)
         assert group["seen"].shape == (3, 1, 2, 1)

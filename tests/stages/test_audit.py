@@ -127,7 +127,7 @@ def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Pa
         assert drawn.n_frames == away[engine.labels(ids)[:, 0]].min() + 1, "from where it began"
     artefact = open_artefact(out, "audit")
     assert artefact.manifest.files.keys() - files_of("audit", artefact.config) == {film}
-    lines = lines_of("played.txt", report)
+    lines = lines_of("played.txt", **report)
     assert f"  {film} {before['fooled']:4d} x  while collect-blue-key holds" in lines and max(map(len, lines)) <= 80
 
 
@@ -162,7 +162,7 @@ def test_an_audit_fails_a_build(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_executions_that_begin_inside_are_said(tmp_path: Path) -> None:
     report, _ = audited(tmp_path / "audit", "everywhere", *CORRIDOR, *settings("steps=200", "mend=0", "warm_up=200"))
     assert report["before"]["positive_at_start"] == 100
-    lines = lines_of("played.txt", report)
+    lines = lines_of("played.txt", **report)
     assert "  100 begin where it is positive already, so that doing nothing is paid" in lines
 
 

@@ -97,7 +97,6 @@ def test_methods_side_by_side(runs, tmp_path):
     [
         ('"domain": "doorkey"', '"domain": "montezuma"', "other: montezuma)"),
         ('"agents": {', '"agents": {}, "others": {', "no kind of result in common"),
-        ('"agents": {', '"others": {', "does not fit this hypogoal, or is damaged"),
         ('"format": 5', '"format": 1', "another version of hypogoal evaluated this (format 1, needed: 5)"),
     ],
 )
