@@ -11,7 +11,13 @@ from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.house import melted
-from hypogoal.evaluation.judging import Judged, Judgement, Work, place_of, states_of
+from hypogoal.evaluation.judging import (
+    Judged,
+    Judgement,
+    Work,
+    place_of,
+    states_of,
+)
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 GALLERY = 40  # states of all sub-goals
@@ -28,7 +34,12 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
     numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
     """
-    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, mean_state, method_of
+    from hypogoal.hypotheses.deep_lift import (
+        DEEP_LIFT,
+        attributed,
+        mean_state,
+        method_of,
+    )
     from hypogoal.hypotheses.ensemble import read_ensemble
 
     artefact, data, sub_goal, judged = judgement
@@ -66,11 +77,18 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
         values = of_features(values.reshape(*error.shape, -1), seen.dtype)
     group.create_dataset("attributions", data=values.astype(np.float32), compression="gzip")
     for row, kind in enumerate(kinds):
-        columns = {"completeness_error": error[row], "log_odds": attributions.log_odds[row]}
+        columns = {
+            "completeness_error": error[row],
+            "log_odds": attributions.log_odds[row],
+        }
         yield melted(columns, **place, scope=f"state: {kind}")
 
 
-def states_to_show(judged: Judged, sub_goal: str, most: int) -> tuple[list[str], Ints]:
+def states_to_show(
+    judged: Judged,
+    sub_goal: str,
+    most: int,
+) -> tuple[list[str], Ints]:
     """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
     labels, origins = judged.labels, judged.origins
     allowed = origins.get("seen", np.zeros(len(labels))) == 0
@@ -78,7 +96,12 @@ def states_to_show(judged: Judged, sub_goal: str, most: int) -> tuple[list[str],
         allowed[:] = True
     kinds = pick_to_explain(judged.probabilities, judged.predictions, labels, allowed)
     places = {name: origins[name] for name in PLACES if name in origins}
-    browsed = pick_for_gallery(judged.predictions, labels, places, rng_for(0, "browse", sub_goal))
+    browsed = pick_for_gallery(
+        judged.predictions,
+        labels,
+        places,
+        rng_for(0, "browse", sub_goal),
+    )
     states = pd.unique(np.array([*kinds.values(), *browsed]))
     return [*kinds], states[:most]
 

@@ -59,7 +59,11 @@ def terminations_of(
     return rule(log_odds, len(policies), None, edges, engine.count)
 
 
-def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict[str, Any]:
+def random_play(
+    loop: OptionLoop,
+    column: int,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
     """The classifier's scores, of sub-goal number ``column``, on the states that random actions lead to, each once."""
     engine = loop.engine
     engine.reset()
@@ -128,7 +132,12 @@ def findings(
     }
 
 
-def _write_film(path, loop, name, run):
+def _write_film(
+    path,
+    loop,
+    name,
+    run,
+):
     """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
     ids = np.array([run.began, *run.states])
     engine, timeout = loop.engine, loop.config.option_timeout

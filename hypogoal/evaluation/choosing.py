@@ -36,7 +36,11 @@ TITLE = "What choosing is worth"
 BY = ["method", "chooser"]
 
 
-def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
+def qualities(
+    loop: OptionLoop,
+    goals: Ints,
+    states: Ints,
+) -> Doubles:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
     Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
@@ -77,7 +81,11 @@ def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
     return qualities
 
 
-def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
+def judge(
+    choices: Choices,
+    quality: Doubles,
+    members: int,
+) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
     ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
@@ -103,8 +111,17 @@ def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     }
 
 
-def _within_rho(quality, preference, goals):
-    both = pd.DataFrame({"quality": quality, "preference": preference}).dropna()
+def _within_rho(
+    quality,
+    preference,
+    goals,
+):
+    both = pd.DataFrame(
+        {
+            "quality": quality,
+            "preference": preference,
+        }
+    ).dropna()
     rhos = []
     for _, alike in both.groupby(goals[both.index]):
         differ = house.at_least(np.ptp(alike["quality"]), DIFFERENCE)
@@ -113,7 +130,12 @@ def _within_rho(quality, preference, goals):
     return pd.Series(rhos, dtype=float).mean()
 
 
-def _better_of_two(quality, taken, among, goals):
+def _better_of_two(
+    quality,
+    taken,
+    among,
+    goals,
+):
     better, both = 0, 0
     for pair in combinations(range(len(quality)), 2):
         bad, good = sorted(pair, key=quality.__getitem__)
@@ -124,7 +146,11 @@ def _better_of_two(quality, taken, among, goals):
     return better / both if both else math.nan
 
 
-def _score(quality, taken, among):
+def _score(
+    quality,
+    taken,
+    among,
+):
     known = pd.DataFrame(np.where(among, quality, np.nan))
     own = quality[taken]
     compared = (known.count(axis=1) > 1) & np.isfinite(own)
@@ -185,7 +211,14 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
         judged = judge(played.choices, quality, config["members"])
         preferences.append(judged.pop("preference"))
         numbers.append({name: scores[name].mean() for name in OF_PLAY} | judged)
-    return numbers[0], numbers[1], {"quality": quality, "conditional_preference": preferences[0]}
+    return (
+        numbers[0],
+        numbers[1],
+        {
+            "quality": quality,
+            "conditional_preference": preferences[0],
+        },
+    )
 
 
 def context(results):

@@ -9,9 +9,21 @@ from types import ModuleType
 import pandas as pd
 
 from hypogoal.core.files import reading
-from hypogoal.evaluation import curves, distance, hypotheses, rooms
+from hypogoal.evaluation import (
+    curves,
+    distance,
+    hypotheses,
+    rooms,
+)
 from hypogoal.evaluation.house import pairs
-from hypogoal.evaluation.page import DASH, Drawn, Results, lines_of, listed, render
+from hypogoal.evaluation.page import (
+    DASH,
+    Drawn,
+    Results,
+    lines_of,
+    listed,
+    render,
+)
 from hypogoal.evaluation.provenance import domains_of, settings_of
 from hypogoal.evaluation.questions import Context, context_of, name_of
 
@@ -37,7 +49,10 @@ def shared(runs: Runs) -> Shared:
     return found
 
 
-def of_runs(contexts: Mapping[str, Context], name: str) -> pd.DataFrame:
+def of_runs(
+    contexts: Mapping[str, Context],
+    name: str,
+) -> pd.DataFrame:
     """The tables of this name, one run's after another's, with a column ``run``."""
     return pd.concat([context[name].assign(run=label) for label, context in contexts.items()])
 
@@ -84,9 +99,16 @@ def winners(compared: pd.DataFrame) -> list[str]:
     return lines_of("winners.txt", pairs=rows.to_dict("records"))
 
 
-def page_of(runs: Runs, found: Shared, paths: Sequence[str]) -> tuple[str, list[Drawn], dict[str, pd.DataFrame]]:
+def page_of(
+    runs: Runs,
+    found: Shared,
+    paths: Sequence[str],
+) -> tuple[str, list[Drawn], dict[str, pd.DataFrame]]:
     """The page of a comparison, its figures, and its tables by name."""
-    tables = {"pairs": compare_runs(found), "differences": differences(runs)}
+    tables = {
+        "pairs": compare_runs(found),
+        "differences": differences(runs),
+    }
     titles = {}
     for question, contexts in found.items():
         name = name_of(question)
@@ -123,5 +145,9 @@ def _curves(runs: Runs) -> Iterator[Drawn]:
     for (name, quantity), drawn in every.groupby(["method", "quantity"]):
         if drawn["run"].nunique() == len(runs) and drawn["value"].nunique() > 1:
             _, label, _ = curves.FIGURES[str(quantity)]
-            draw = partial(curves.learning_curves, drawn.assign(method=drawn["run"]), label)
+            draw = partial(
+                curves.learning_curves,
+                drawn.assign(method=drawn["run"]),
+                label,
+            )
             yield Drawn(f"{quantity}-{name}", f"{name}: {label.lower()}", draw)

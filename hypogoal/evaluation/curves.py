@@ -10,7 +10,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.core.arrays import Bools, Doubles, Ints
-from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
+from hypogoal.evaluation.house import (
+    at_least,
+    melted,
+    per_run,
+    tables_of,
+    tidy,
+)
 from hypogoal.evaluation.page import Drawn, Results
 from hypogoal.evaluation.plots import DOTTED, legend_below, plot
 from hypogoal.evaluation.run import choice_of
@@ -42,7 +48,11 @@ FIGURES = {  # file, label, and what is dotted across
 }
 
 
-def scores(succeeded: Bools, steps: Ints, shortest: float | Doubles | None) -> dict[str, Doubles]:
+def scores(
+    succeeded: Bools,
+    steps: Ints,
+    shortest: float | Doubles | None,
+) -> dict[str, Doubles]:
     """``success``, and success within so many times the shortest path, ``WITHIN``: 1 or 0 of each episode (E, ...).
 
     ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
@@ -161,7 +171,11 @@ def _figures(results):
         yield Drawn(name, label, draw, {"dotted": reference if len(references) else ""})
 
 
-def learning_curves(drawn: pd.DataFrame, label: str, reference: float = np.nan) -> Figure:
+def learning_curves(
+    drawn: pd.DataFrame,
+    label: str,
+    reference: float = np.nan,
+) -> Figure:
     """Figure 6: a quantity of episodes against environment steps, a line per method, a ``reference`` dotted across.
 
     ``drawn`` are rows of the table of numbers. The mean over layouts, or runs of one layout, and a band of one standard
@@ -175,7 +189,14 @@ def learning_curves(drawn: pd.DataFrame, label: str, reference: float = np.nan) 
         middle, wide = values.mean(axis=1), values.sem(axis=1)
         [line] = axes.plot(steps, middle, label=method)
         colour = line.get_color()
-        axes.fill_between(steps, middle - wide, middle + wide, color=colour, alpha=0.18, linewidth=0)
+        axes.fill_between(
+            steps,
+            middle - wide,
+            middle + wide,
+            color=colour,
+            alpha=0.18,
+            linewidth=0,
+        )
     axes.axhline(reference, **DOTTED)
     axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
     legend_below(figure, 2)

@@ -12,7 +12,13 @@ from matplotlib.figure import Figure
 from hypogoal.core.arrays import Bytes
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import melted, options_of, per_run, tables_of, tidy
+from hypogoal.evaluation.house import (
+    melted,
+    options_of,
+    per_run,
+    tables_of,
+    tidy,
+)
 from hypogoal.evaluation.hypotheses import VALIDATED
 from hypogoal.evaluation.names import ORACLE
 from hypogoal.evaluation.page import Drawn
@@ -79,7 +85,12 @@ def rows(work):
         executions = Executions.read(artefact.path / Executions.FILE)
         source = artefact.input("ensemble").resolve() if takes(artefact) else None
         validated = work.validated.get(source, {})
-        yield from rows_of_ladder(executions, artefact.config, validated, work.place(artefact))
+        yield from rows_of_ladder(
+            executions,
+            artefact.config,
+            validated,
+            work.place(artefact),
+        )
         if artefact.seed == first:
             _write_stops(work, artefact, executions)
         work.progress.advance()
@@ -108,7 +119,11 @@ def rows_of_ladder(
         yield tidy(picked, **place, sub_goal=sub_goal)
 
 
-def _write_stops(work, artefact, executions):
+def _write_stops(
+    work,
+    artefact,
+    executions,
+):
     """Figure 5: ``STOP`` of each execution of each sub-goal's best option, and pictures of the rooms."""
     domain = installed_domain(artefact.config["domain"])
     if domain is None or not domain.pictures:
@@ -132,7 +147,15 @@ def context(results):
     ladder by ladder, but oracle terminations, which have no members to choose among.
     """
     numbers = results.numbers[results.numbers["ladder"] != ""]
-    values = [per_run(numbers, "distance", member=member, name=which) for which, member in PICKED.items()]
+    values = [
+        per_run(
+            numbers,
+            "distance",
+            member=member,
+            name=which,
+        )
+        for which, member in PICKED.items()
+    ]
     values.append(per_run(numbers, "executions_deviation", *SHARES, member=BEST))
     ladders = pd.concat(values)
     seeds = ladders.groupby([*BY, "quantity", "of", "seed"], dropna=False, sort=False)
@@ -161,7 +184,12 @@ def _figures(results, table):
                 shown[option["method"] + groups] = pd.DataFrame(stops, columns=STOP)
         if shown:
             draw = partial(stops_over_rooms, rooms, shown)
-            yield Drawn(f"figure5-{ladder}", "Figure 5: where executions stopped", draw, {"ladder": ladder})
+            yield Drawn(
+                f"figure5-{ladder}",
+                "Figure 5: where executions stopped",
+                draw,
+                {"ladder": ladder},
+            )
 
 
 def distance_bars(best: pd.DataFrame) -> Figure:
@@ -194,6 +222,13 @@ def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, pd.DataFr
         stops = options[method]
         for fate, (label, marker, colour) in FATES.items():
             inside = stops[(stops["room"] == room) & (stops["fate"] == fate)]
-            place.scatter(inside["column"], inside["row"], marker=marker, color=colour, label=label, alpha=0.75)
+            place.scatter(
+                inside["column"],
+                inside["row"],
+                marker=marker,
+                color=colour,
+                label=label,
+                alpha=0.75,
+            )
     plots.legend_below(figure, 3)
     return figure

@@ -10,7 +10,13 @@ from hypogoal.evaluation.questions import answers
 from hypogoal.evaluation.run import read_evaluation
 
 
-def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:
+def draw_figures(
+    run: Path,
+    folder: Path,
+    kind: str = "svg",
+    *,
+    force: bool = False,
+) -> tuple[list[Path], list[str]]:
     """Draw the paper's figures, those that the run has artefacts for, as files of their own, and ``captions.md``.
 
     Returns the files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs. A run

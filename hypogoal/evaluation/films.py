@@ -127,7 +127,12 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     return picture
 
 
-def episode_gif(frames: Sequence[Frame], sub_goals: Sequence[str], members: int, timeout: int) -> bytes:
+def episode_gif(
+    frames: Sequence[Frame],
+    sub_goals: Sequence[str],
+    members: int,
+    timeout: int,
+) -> bytes:
     """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1.
 
     It pauses where an option ends, and where its member comes to differ from others of its sub-goal.

@@ -47,17 +47,30 @@ class Always(Chooser):
     def __init__(self, option: int):
         self.option = option
 
-    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
+    def choose(
+        self,
+        environments: Ints,
+        ids: Ints,
+        offered: Offered,
+    ) -> Ints:
         return np.full(len(ids), self.option)
 
 
-def play_both(loop: OptionLoop, seed: int, episodes: int = 0) -> tuple[Play, Play]:
+def play_both(
+    loop: OptionLoop,
+    seed: int,
+    episodes: int = 0,
+) -> tuple[Play, Play]:
     """The agent itself, and uniform-random choice among its options, see :func:`play`."""
     own = play(loop, loop.chooser, episodes)
     return own, play(loop, RandomChooser(rng_for(seed, "uniform-choice")), episodes)
 
 
-def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
+def play(
+    loop: OptionLoop,
+    chooser: Chooser,
+    episodes: int = 0,
+) -> Play:
     """So many episodes in each environment, begun anew; options are greedy and choices are drawn as in training.
 
     By default as many as the cap alone decides: what comes of them must not.

@@ -36,7 +36,11 @@ TEXTS = [name for name, kind in TYPES.items() if kind == "str"]
 NUMBERS = [name for name, kind in TYPES.items() if kind != "str"]
 SHARED = ["layout", "ladder", "sub_goal", "seed"]  # of two runs that are a pair
 RUN = ["method", "artefact", "N", *SHARED]  # tells one run's numbers from another's
-MEMBERS = {"best": "max", "mean": "mean", "worst": "min"}  # how the values of members become one
+MEMBERS = {
+    "best": "max",
+    "mean": "mean",
+    "worst": "min",
+}  # how the values of members become one
 LOWER_IS_BETTER = ("length", "solved_length", "distance")
 DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
 ROUNDING = 10.0**-DIGITS
@@ -59,7 +63,11 @@ def tidy(numbers: Any, **place: Any) -> pd.DataFrame:
     return rows.assign(**place)
 
 
-def melted(columns: Any, index: Any = None, **place: Any) -> pd.DataFrame:
+def melted(
+    columns: Any,
+    index: Any = None,
+    **place: Any,
+) -> pd.DataFrame:
     """A row for each value of each column, by the names of its ``index``; without any it is of each of K members."""
     table = pd.DataFrame(columns)
     if index is not None:
@@ -155,11 +163,18 @@ def interquartile_mean(values: Any, axis: int = 0) -> Any:
     return np.sort(values, axis).take(middle, axis).mean(axis)
 
 
-def tables_of(runs: pd.DataFrame, by: Sequence[str], paired: Sequence[str] = ()) -> dict[str, pd.DataFrame]:
+def tables_of(
+    runs: pd.DataFrame,
+    by: Sequence[str],
+    paired: Sequence[str] = (),
+) -> dict[str, pd.DataFrame]:
     """What a question's template is given of :func:`per_run`: ``table``, and ``compared``; nothing without runs."""
     if runs.empty:
         return {}
-    return {"table": over(runs, by), "compared": runs[runs["quantity"].isin(paired)]}
+    return {
+        "table": over(runs, by),
+        "compared": runs[runs["quantity"].isin(paired)],
+    }
 
 
 def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
@@ -214,7 +229,11 @@ def pairs(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def paired(first: pd.DataFrame, second: pd.DataFrame, on: Sequence[str]) -> pd.DataFrame:
+def paired(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    on: Sequence[str],
+) -> pd.DataFrame:
     """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
     return first.merge(second, on=list(on), suffixes=("", "_second"))
 
@@ -281,4 +300,9 @@ def above(values: Any, bound: Any) -> Any:
 
 def as_json(facts: Any) -> str:
     """Text of facts and numbers, NumPy's too; NaN becomes null."""
-    return to_json(facts, indent=1, inf_nan_mode="null", fallback=np.generic.item).decode()
+    return to_json(
+        facts,
+        indent=1,
+        inf_nan_mode="null",
+        fallback=np.generic.item,
+    ).decode()

@@ -143,7 +143,13 @@ def judge(artefact: Artefact, data: Path) -> dict[str, Judged]:
     on_heldout = predicted([heldout[sub_goal].observations for sub_goal in sub_goals])
     on_unlabelled = predicted([unlabelled] * len(sub_goals))
     judged = {}
-    for sub_goal, ensemble, probabilities, others in zip(sub_goals, ensembles, on_heldout, on_unlabelled, strict=True):
+    for sub_goal, ensemble, probabilities, others in zip(
+        sub_goals,
+        ensembles,
+        on_heldout,
+        on_unlabelled,
+        strict=True,
+    ):
         states, above = heldout[sub_goal], ensemble.thresholds.numpy()
         predictions = probabilities > above
         judged[sub_goal] = Judged(states.labels, states.origins, probabilities, predictions, others > above, above)

@@ -25,7 +25,11 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     labels, shape = engine.labels(engine.ids[:1]), (1, len(domain.sub_goals))
     if labels.shape != shape or labels.dtype != np.bool_:
         fault = f"the engine's labels of one state are {labels.dtype} {labels.shape}, not bool {shape}"
-        raise UserError(fault, type(engine).__name__, "Give a truth value for each state and sub-goal.")
+        raise UserError(
+            fault,
+            type(engine).__name__,
+            "Give a truth value for each state and sub-goal.",
+        )
     if setup.config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
         return None
     columns = np.repeat(columns_of(domain, sub_goals), setup.members)
@@ -40,7 +44,11 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     return near
 
 
-def distances_of(domain: Domain, sub_goals: Sequence[str], members: int) -> Distances:
+def distances_of(
+    domain: Domain,
+    sub_goals: Sequence[str],
+    members: int,
+) -> Distances:
     """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
 
     def away(positions: Ints, options: Ints) -> Ints:

@@ -70,7 +70,12 @@ class Results:
         return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
 
-def fixed(value: Any, digits: int = 2, scale: float = 1.0, sign: str = "") -> str:
+def fixed(
+    value: Any,
+    digits: int = 2,
+    scale: float = 1.0,
+    sign: str = "",
+) -> str:
     """A number with a fixed number of decimals; a dash where there is none. ``sign``: as Python formats it."""
     return DASH if pd.isna(value) else f"{scale * value:{sign}.{digits}f}"
 
@@ -80,7 +85,11 @@ def percent(value: Any) -> str:
     return f"{fixed(value, 0, 100)} %"
 
 
-def between(low: Any, high: Any, *how: Any) -> str:
+def between(
+    low: Any,
+    high: Any,
+    *how: Any,
+) -> str:
     """An interval; nothing where there is none. ``how``, here and below: digits and scale, see :func:`fixed`."""
     return "" if pd.isna(low) else f" [{fixed(low, *how)}, {fixed(high, *how)}]"
 
@@ -90,7 +99,11 @@ def mean(row: Any, *how: Any) -> str:
     return fixed(row["mean"], *how)
 
 
-def spread(row: Any, *how: Any, error: str = "standard_error") -> str:
+def spread(
+    row: Any,
+    *how: Any,
+    error: str = "standard_error",
+) -> str:
     """The mean and, where there are several values, beside it their standard error."""
     around = "" if pd.isna(row[error]) else f" ± {fixed(row[error], *how)}"
     return mean(row, *how) + around
@@ -110,7 +123,11 @@ def counted(row: Any) -> str:
     return str(row["n"])
 
 
-def displayed(table: pd.DataFrame, by: dict[str, str], columns: Mapping[str, Any]) -> pd.DataFrame:
+def displayed(
+    table: pd.DataFrame,
+    by: dict[str, str],
+    columns: Mapping[str, Any],
+) -> pd.DataFrame:
     """A table of :func:`house.over` as people read it: a row for each combination of ``by``, whose titles it gives.
 
     ``columns`` are by title a quantity, and a function that writes a row's statistics with its further arguments.
@@ -207,7 +224,16 @@ def templates() -> jinja2.Environment:
 
 def words_of(context: Mapping[str, Any]) -> Any:
     """What a question's template sets, and its macros; figures are not drawn for it."""
-    return templates().get_template(f"{context['name']}.html").make_module({**context, "figures": []})
+    return (
+        templates()
+        .get_template(f"{context['name']}.html")
+        .make_module(
+            {
+                **context,
+                "figures": [],
+            }
+        )
+    )
 
 
 def render(template: str, /, **context: Any) -> str:

@@ -16,7 +16,11 @@ from hypogoal.evaluation.plots import BLUE, VERMILLION
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 MOST_SIDE = 128  # pixels of a picture on the page
-SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION], N=25)  # few: small files
+SIGNED = LinearSegmentedColormap.from_list(
+    "against-for",
+    [BLUE, "white", VERMILLION],
+    N=25,
+)  # few: small files
 STRONGEST = 0.995  # the quantile of absolute attributions that has full colour
 SHADE = 0.28  # how dark the brightest pixels of a state make the attributions over them
 FEW = 200  # states whose median is taken for what is usual
@@ -26,13 +30,19 @@ GAP = 2  # pixels around each state
 PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
 
 
-def last_frame(values: Any, colours: int | None = None) -> Any:
+def last_frame(
+    values: Any,
+    colours: int | None = None,
+) -> Any:
     """Of pictures (..., C) the last frame's channels, so many ``colours``: by default 3 where C is 3, else 1."""
     default = 3 if values.shape[-1] == 3 else 1
     return values[..., -(colours or default) :]
 
 
-def coloured(observations: Bytes, colours: int | None = None) -> Bytes:
+def coloured(
+    observations: Bytes,
+    colours: int | None = None,
+) -> Bytes:
     """Observations (..., C) as they are shown, (..., 3): of the last frame."""
     shown: Bytes = last_frame(observations, colours)
     return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
@@ -63,7 +73,11 @@ def encoded(image: Bytes) -> bytes:
     return buffer.getvalue()
 
 
-def attribution_image(values: Doubles, state: Bytes, colours: int | None = None) -> Bytes:
+def attribution_image(
+    values: Doubles,
+    state: Bytes,
+    colours: int | None = None,
+) -> Bytes:
     """Figures 2 and 9: attributions (H, W, C) to the last frame of a state (H, W, C), uint8 (H, W, 3).
 
     Orange where positive, blue where negative, white where none; the state shows through as a light shade.
@@ -102,10 +116,18 @@ def write_sheets(path: Path, folder: Path) -> list[Path]:
     states that are not pictures are a ``UserError``.
     """
     if not path.is_file():
-        raise UserError("sheets of states need a data file", path, "Give the .h5 file of the states.")
+        raise UserError(
+            "sheets of states need a data file",
+            path,
+            "Give the .h5 file of the states.",
+        )
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE:
-        raise UserError("the states are not pictures", path, "Read them with h5py, see docs/formats.md.")
+        raise UserError(
+            "the states are not pictures",
+            path,
+            "Read them with h5py, see docs/formats.md.",
+        )
     written = []
     for split in SPLITS:
         for sub_goal in dataset.sub_goals:

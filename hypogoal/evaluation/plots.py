@@ -24,7 +24,11 @@ UNDATED = {
     "pdf": ("CreationDate", "Producer", "Creator"),
     "png": ("Software",),
 }
-DOTTED: dict[str, Any] = {"color": GREY, "linestyle": ":", "linewidth": 1.2}  # a line of what is no method
+DOTTED: dict[str, Any] = {
+    "color": GREY,
+    "linestyle": ":",
+    "linewidth": 1.2,
+}  # a line of what is no method
 
 
 def styled() -> AbstractContextManager[None]:
@@ -38,7 +42,12 @@ def plot(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
     return figure, figure.subplots()
 
 
-def bars(kind: Any, means: Any, height: float, **errors: Any) -> tuple[Figure, Axes]:
+def bars(
+    kind: Any,
+    means: Any,
+    height: float,
+    **errors: Any,
+) -> tuple[Figure, Axes]:
     """Bars of each method (a column) side by side at each place (a row), ``bar`` or ``barh``, with their errors."""
     figure, axes = plot(height)
     means.plot(kind=kind, ax=axes, alpha=0.8, rot=0, legend=False, **errors)
@@ -59,7 +68,11 @@ def legend_below(figure: Figure, columns: int) -> None:
     figure.legend(by_label.values(), by_label.keys(), loc="outside lower left", ncols=columns)
 
 
-def panels(shown: Collection[tuple[str, Bytes]], columns: int, titles: float = 0.34) -> tuple[Figure, list[Axes]]:
+def panels(
+    shown: Collection[tuple[str, Bytes]],
+    columns: int,
+    titles: float = 0.34,
+) -> tuple[Figure, list[Axes]]:
     """Pictures by their titles, row by row; ``titles``: inches above each. Of a stack of grey frames the last."""
     side = WIDTH / max(columns, 3)
     rows = -(-len(shown) // columns)

@@ -22,7 +22,12 @@ def provenance(contents: Contents) -> dict[str, Any]:
     collected = []
     for path in contents.data():
         dataset = open_dataset(path)
-        facts = {"path": path.name, "config": dataset.config, "counts": dataset.counts(), "seed": dataset.seed}
+        facts = {
+            "path": path.name,
+            "config": dataset.config,
+            "counts": dataset.counts(),
+            "seed": dataset.seed,
+        }
         collected.append(facts)
     return {"artefacts": artefacts, "data": collected}
 
@@ -36,7 +41,16 @@ def domains_of(results: Results) -> list[str]:
 def settings_of(results: Results) -> pd.DataFrame:
     """Each value that a setting has in a run: columns ``of`` (a kind of artefact, data, versions), setting, text."""
     recorded = results.facts["provenance"]
-    parts = [("data", {"seed": data["seed"], **data["config"]}) for data in recorded["data"]]
+    parts = [
+        (
+            "data",
+            {
+                "seed": data["seed"],
+                **data["config"],
+            },
+        )
+        for data in recorded["data"]
+    ]
     for artefact in recorded["artefacts"]:
         parts.append((artefact["kind"], {"seed": artefact["seed"], **artefact["config"]}))
         parts.append(("versions", artefact["versions"]))

@@ -42,7 +42,11 @@ NEXT = 100  # states to label next in the table
 CARDS, FAILURES = 20, 4  # on the page: of these, and of each member's failures
 
 
-def findings_of(classifier: Classifier, dataset: Dataset, sub_goal: str) -> dict[str, Any]:
+def findings_of(
+    classifier: Classifier,
+    dataset: Dataset,
+    sub_goal: str,
+) -> dict[str, Any]:
     """What it says of a data file's states, and which to label next.
 
     Returns ``numbers`` of ``audit.json``; ``thresholds`` (K,); of unlabelled states to label next, best first, ``rows``
@@ -89,7 +93,11 @@ def findings_of(classifier: Classifier, dataset: Dataset, sub_goal: str) -> dict
     }
 
 
-def write_next(folder: Path, columns: Sequence[str], findings: Mapping[str, Any]) -> None:
+def write_next(
+    folder: Path,
+    columns: Sequence[str],
+    findings: Mapping[str, Any],
+) -> None:
     """Write the states to label next: a table to fill in, and pictures ``001.png``, ... in its order, if they are."""
     folder.mkdir(parents=True)
     lines = []
@@ -163,7 +171,12 @@ def to_label(scores: Doubles, sketches: Doubles, count: int) -> Ints:
     return np.array(rows)
 
 
-def member_table(labels: Bools, known_scores: Floats, scores: Floats, thresholds: Doubles) -> pd.DataFrame:
+def member_table(
+    labels: Bools,
+    known_scores: Floats,
+    scores: Floats,
+    thresholds: Doubles,
+) -> pd.DataFrame:
     """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
     positive = scores > thresholds
     alone = positive & (positive.sum(axis=1, keepdims=True) == 1)

@@ -59,7 +59,12 @@ def _figures(table):
         rows = table[table["sub_goal"] == sub_goal].dropna(subset="N")
         suffix = f"-{sub_goal}" if len(sub_goals) > 1 else ""
         label = "Figure 3: members against labelled groups"
-        yield Drawn(f"figure3{suffix}", label, partial(scores_over_groups, rows), {"sub_goal": sub_goal})
+        yield Drawn(
+            f"figure3{suffix}",
+            label,
+            partial(scores_over_groups, rows),
+            {"sub_goal": sub_goal},
+        )
 
 
 def scores_over_groups(table: pd.DataFrame) -> Figure:
@@ -75,7 +80,15 @@ def scores_over_groups(table: pd.DataFrame) -> Figure:
         for method in table["method"].unique():
             rows = shown[shown["method"] == method]
             errors = rows["standard_deviation"].fillna(0)
-            place.errorbar(rows.index, rows["mean"], errors, label=method, marker="o", markersize=4, alpha=0.8)
+            place.errorbar(
+                rows.index,
+                rows["mean"],
+                errors,
+                label=method,
+                marker="o",
+                markersize=4,
+                alpha=0.8,
+            )
         blind = never if quantity.startswith("accuracy") else never * 0 + 0.5
         place.plot(blind.index, blind, **plots.DOTTED, marker=".")
         place.set_title(title, fontsize=9.5)

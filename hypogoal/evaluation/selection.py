@@ -62,7 +62,10 @@ def numbers_of_choices(choices: ChoiceCounts, options: int) -> dict[str, Doubles
     return columns
 
 
-def on_layout(path: Path, layouts: tuple[int, ...]) -> tuple[Doubles, dict[int, Bytes]]:
+def on_layout(
+    path: Path,
+    layouts: tuple[int, ...],
+) -> tuple[Doubles, dict[int, Bytes]]:
     """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met.
 
     Returns of each option (G*K,) its balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal but
@@ -104,7 +107,11 @@ def engine_on(config: Mapping[str, Any], layouts: Sequence[int]) -> base.Engine:
     return domain.make_engine(layouts[0], len(layouts), 500, **world)
 
 
-def states_met(engine: base.Engine, steps: int, rng: np.random.Generator) -> Ints:
+def states_met(
+    engine: base.Engine,
+    steps: int,
+    rng: np.random.Generator,
+) -> Ints:
     """The states that random play of an engine meets in so many steps, each once."""
     met = [engine.ids]
     for _ in range(steps // engine.count):
@@ -134,7 +141,11 @@ def context(results):
     learned = table["method"].isin([*chosen_by(results, "learned")])
     shown = table[learned] if learned.any() else table
     members = shown[shown["artefact"] == shown["artefact"].min()].reset_index(drop=True)
-    return {"table": table, "members": members, "figures": [*_figures(members, results.arrays)]}
+    return {
+        "table": table,
+        "members": members,
+        "figures": [*_figures(members, results.arrays)],
+    }
 
 
 def _figures(members, arrays):
@@ -150,7 +161,12 @@ def _figures(members, arrays):
         if sides:
             name = NUMBERED.get(str(sub_goal), f"terminations-{sub_goal}")
             label = f"Termination states of {sub_goal}"
-            yield page.Drawn(name, label, partial(side_by_side, sides), {"sub_goal": sub_goal})
+            yield page.Drawn(
+                name,
+                label,
+                partial(side_by_side, sides),
+                {"sub_goal": sub_goal},
+            )
 
 
 def side_by_side(sides):

@@ -48,7 +48,12 @@ def shortest_ways(engine: Engine) -> Doubles:
     return np.where(steps < FAR, steps, np.nan)
 
 
-def alone(loop: OptionLoop, option: int, goal: int, shortest: Doubles) -> Played:
+def alone(
+    loop: OptionLoop,
+    option: int,
+    goal: int,
+    shortest: Doubles,
+) -> Played:
     """Numbers of an option, begun where episodes begin and anew at each timeout until its member is positive.
 
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
@@ -95,7 +100,10 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[
     for option, (sub_goal, member) in enumerate(options_of(config)):
         if sub_goal in in_domain:  # else the user's own labels said it: its truth here is not known
             goal = in_domain.index(sub_goal)
-            fields = {"sub_goal": sub_goal, "member": member}
+            fields = {
+                "sub_goal": sub_goal,
+                "member": member,
+            }
             yield fields, alone(loop, option, goal, ways[:, goal])
 
 
@@ -108,8 +116,18 @@ def rows(work):
             if artefact.kind == "baseline":
                 continue
             for fields, numbers in played(artefact, layouts):
-                place = {**work.place(artefact), **fields, "layout": layouts, "scope": SCOPE}
-                yield pd.DataFrame({**place, **numbers}).melt([*place], var_name="quantity")
+                place = {
+                    **work.place(artefact),
+                    **fields,
+                    "layout": layouts,
+                    "scope": SCOPE,
+                }
+                yield pd.DataFrame(
+                    {
+                        **place,
+                        **numbers,
+                    }
+                ).melt([*place], var_name="quantity")
 
 
 def context(results):

@@ -11,12 +11,14 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import judge, qualities
 from hypogoal.evaluation.frozen import Choices, play
+from hypogoal.evaluation.selection import numbers_of_choices
 from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
+from hypogoal.options.tables import ChoiceCounts
 
 MEMBERS, GOALS = 3, np.repeat(np.arange(5), 3)
 RIGHT = [0, 3, 6, 9, 12]  # the first member of every sub-goal knows it
@@ -152,3 +154,28 @@ def test_the_order_of_decisions_does_not_matter() -> None:
         judged = judge(decisions([taken[row] for row in order], [offered[row] for row in order], 3), quality, 3)
         assert judged["within_rho"] == expected["within_rho"]
         assert judged["preference"].tolist() == expected["preference"].tolist()
+
+
+def test_preference_of_an_uncaring_chooser_is_one():
+    """Spec F6: however unevenly options are offered."""
+    rng = np.random.default_rng(0)
+    offered = rng.random((40_000, 3)) < np.array([0.1, 0.5, 1.0])
+    expected = (offered / offered.sum(1, keepdims=True)).sum(0)
+    choices = np.where(offered, rng.random(offered.shape), -1).argmax(1)
+    chosen = np.bincount(choices, minlength=3)
+    none = np.zeros(3, np.int64)
+    table = ChoiceCounts(none, np.arange(3), offered.sum(0), chosen, expected, none, none)
+    np.testing.assert_allclose(numbers_of_choices(table, 3)["preference"], 1, atol=0.05)
+
+
+def test_counts_by_hand():
+    """Spec F6: two windows of four options; one is never offered, one never chosen in the first."""
+    rows = [
+        (100, 0, 40, 10, 20.0, 5, 50), (100, 1, 40, 20, 10.0, 20, 40), (100, 2, 0, 0, 0.0, 0, 0),
+        (100, 3, 10, 0, 5.0, 0, 0), (200, 0, 40, 0, 10.0, 0, 0), (200, 1, 40, 30, 10.0, 30, 60),
+        (200, 2, 0, 0, 0.0, 0, 0), (200, 3, 10, 10, 5.0, 9, 20),
+    ]  # fmt: skip
+    found = numbers_of_choices(ChoiceCounts.of_rows(rows), 4)
+    np.testing.assert_allclose(found["preference"], [10 / 30, 50 / 20, np.nan, 1])
+    np.testing.assert_allclose(found["chosen"], [10, 50, 0, 10])
+    np.testing.assert_allclose(found["duration"], [5, 2, np.nan, 2])

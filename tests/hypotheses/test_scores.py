@@ -1,13 +1,10 @@
-"""Spec F1, F2, F6: scores, disagreement and preference against values worked by hand."""
+"""Spec F1, F2: scores and disagreement against values worked by hand."""
 
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.pictures import overlay
-from hypogoal.evaluation.selection import numbers_of_choices
 from hypogoal.hypotheses import scores
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, mean_disagreement, member_scores, ranking
-from hypogoal.options.tables import ChoiceCounts
 
 YES, NO = True, False
 LABELS = np.array([YES, YES, YES, YES, NO, NO])
@@ -69,47 +66,11 @@ def test_disagreement_by_hand():
     assert np.isnan(mean_disagreement(VERDICTS[:0]))
 
 
-def test_preference_of_an_uncaring_chooser_is_one():
-    """Spec F6: however unevenly options are offered."""
-    rng = np.random.default_rng(0)
-    offered = rng.random((40_000, 3)) < np.array([0.1, 0.5, 1.0])
-    expected = (offered / offered.sum(1, keepdims=True)).sum(0)
-    choices = np.where(offered, rng.random(offered.shape), -1).argmax(1)
-    chosen = np.bincount(choices, minlength=3)
-    none = np.zeros(3, np.int64)
-    table = ChoiceCounts(none, np.arange(3), offered.sum(0), chosen, expected, none, none)
-    np.testing.assert_allclose(numbers_of_choices(table, 3)["preference"], 1, atol=0.05)
-
-
-def test_choices_by_hand():
-    """Spec F6: two windows of four options; one is never offered, one never chosen in the first."""
-    rows = [
-        (100, 0, 40, 10, 20.0, 5, 50), (100, 1, 40, 20, 10.0, 20, 40), (100, 2, 0, 0, 0.0, 0, 0),
-        (100, 3, 10, 0, 5.0, 0, 0), (200, 0, 40, 0, 10.0, 0, 0), (200, 1, 40, 30, 10.0, 30, 60),
-        (200, 2, 0, 0, 0.0, 0, 0), (200, 3, 10, 10, 5.0, 9, 20),
-    ]  # fmt: skip
-    found = numbers_of_choices(ChoiceCounts.of_rows(rows), 4)
-    np.testing.assert_allclose(found["preference"], [10 / 30, 50 / 20, np.nan, 1])
-    np.testing.assert_allclose(found["chosen"], [10, 50, 0, 10])
-    np.testing.assert_allclose(found["duration"], [5, 2, np.nan, 2])
-
-
 def test_the_most_and_the_least_preferred_member():
     """Spec F6: of those that were offered; nobody where none was."""
     assert scores.most_and_least(np.array([1.0, 2.0])) == (1, 0)
     assert scores.most_and_least(np.array([np.nan, 3.0])) == (1, 1)
     assert scores.most_and_least(np.array([np.nan])) == (None, None)
-
-
-def test_overlay_keeps_what_is_shared():
-    """Figures 7 and 8: what all states share stays; one agent is whole, the others are half transparent."""
-    states = np.zeros((4, 1, 6, 3), np.uint8)
-    states[:, 0, 0] = 200
-    for index, cell in enumerate((2, 3, 4, 5)):
-        states[index, 0, cell] = (100, 0, 0)
-    states[1, 0, 1] = (100, 0, 0)
-    assert overlay(states)[0, :, 0].tolist() == [200, 50, 100, 50, 50, 50]
-    assert overlay(states[:1])[0, :, 0].tolist() == [200, 0, 100, 0, 0, 0]
 
 
 def test_ranking_is_the_share_of_pairs_in_order():

@@ -1,20 +1,12 @@
 """Spec F2: DeepLift against values worked by hand, and complete on both of the paper's networks."""
 
 import copy
-from types import SimpleNamespace
 
-import h5py
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from hypogoal.data import Collected, States, write_dataset
-from hypogoal.evaluation.attributing import look, pick_to_explain
-from hypogoal.evaluation.house import joined
-from hypogoal.evaluation.judging import Judged, Judgement, Work
-from hypogoal.evaluation.run import Contents
-from hypogoal.hypotheses import ensemble as hypotheses
 from hypogoal.hypotheses.deep_lift import (
     DEEP_LIFT,
     INTEGRATED,
@@ -172,51 +164,3 @@ def test_the_state_that_is_the_baseline_has_no_attribution():
     ensemble = trained("montezuma", 1)
     state = np.full(SHAPES["montezuma"], 7, np.uint8)
     assert np.abs(attributed(ensemble, state[None], state).values).max() < BOUND
-
-
-def test_attributions_are_to_what_members_see(tmp_path, monkeypatch):
-    """Spec F2: of an ensemble that sees a window, what is attributed to, drawn and averaged is the window."""
-
-    class Windowed(Members):
-        def see(self, observations):
-            return observations[:, :, 1:]
-
-    ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
-    observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
-    labels = np.array([True, False, False])
-    yes = np.array([[True], [True], [False]])
-    sure = np.array([[0.9], [0.8], [0.1]], np.float32)
-    judged = Judged(labels, {}, sure, yes, yes[2:], np.array([0.5], np.float32))
-    stored = States(observations, labels[:, None])
-    data = Collected((1, 3, 1), ("down",), stored, States(observations[2:], np.zeros((1, 0), np.bool_)), stored)
-    write_dataset(tmp_path / "data.h5", data, domain="x", config={}, seed=0)
-    with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
-        here = SimpleNamespace(path=tmp_path, config={"sub_goals": ["down"]})
-        monkeypatch.setattr(hypotheses, "read_ensemble", lambda *_: ensemble)
-        work = Work(Contents(tmp_path, [], [], [], []), arrays, None)
-        work.browsed = tmp_path
-        monkeypatch.setattr(Work, "place_of", lambda work, judgement: {"artefact": "ensemble"})
-        rows = joined(look(work, Judgement(here, tmp_path / "data.h5", "down", judged)))
-        group = arrays["saliency/down"]
-        assert group["observations"].shape == (3, 1, 3, 1)
-        assert group["seen"].shape == (3, 1, 2, 1)
-        np.testing.assert_allclose(group["attributions"][:, 0, 0, :, 0], [[0, 2], [1, 0], [0, 0]])
-    assert work.facts["looked_at"]["sub_goals"]["down"]["kinds"] == ["true positive", "false positive"]
-    errors = rows[rows["quantity"] == "completeness_error"]
-    assert (
-        errors["scope"].tolist() == ["state: true positive", "state: false positive"] and errors["value"].max() < BOUND
-    )
-
-
-def test_the_states_that_are_explained():
-    """Figures 2 and 9: a true positive that most see, one that members disagree about, a false positive; none twice."""
-    probabilities = np.array([[0.9, 0.1], [0.8, 0.9], [0.7, 0.2], [0.6, 0.8], [0.1, 0.1]], np.float32)
-    labels = np.array([True, True, False, False, False])
-    verdicts = probabilities > 0.5
-    everywhere = np.ones_like(labels)
-    picked = pick_to_explain(probabilities, verdicts, labels, everywhere)
-    assert picked == {"true positive": 1, "disagree": 0, "false positive": 3}
-    assert pick_to_explain(probabilities, np.zeros_like(verdicts), labels, everywhere) == {}
-    alone = pick_to_explain(probabilities[:, :1], verdicts[:, :1], labels, everywhere)
-    assert alone == {"true positive": 0, "false positive": 2}
-    assert pick_to_explain(probabilities, verdicts, labels, labels) == {"true positive": 1, "disagree": 0}
