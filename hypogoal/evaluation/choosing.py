@@ -126,7 +126,8 @@ def _within_rho(
     for _, alike in both.groupby(goals[both.index]):
         differ = house.at_least(np.ptp(alike["quality"]), DIFFERENCE)
         if differ and alike["preference"].nunique() > 1:
-            rhos.append(alike["quality"].corr(alike["preference"], method="spearman"))
+            ranks = alike.rank()  # whose correlation is Spearman's
+            rhos.append(ranks["quality"].corr(ranks["preference"]))
     return pd.Series(rhos, dtype=float).mean()
 
 

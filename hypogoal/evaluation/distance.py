@@ -131,10 +131,9 @@ def _write_stops(
     distances = option_numbers(executions)["distance"]
     best = distances.groupby(distances.index // artefact.config["members"]).idxmin()
     last = last_executions(executions)
-    stops = last[last["option"].isin(best)]
-    pixels = np.asarray(domain.pixel(stops[["room", "x", "y"]].to_numpy())).reshape(-1, 2)
-    shown = stops.assign(column=pixels[:, 0], row=pixels[:, 1])
-    work.arrays[f"stops/{work.contents.name(artefact)}"] = shown[STOP].to_numpy(float)
+    stops = last[last["option"].isin(best)].copy()
+    stops[["column", "row"]] = domain.pixel(stops[["room", "x", "y"]].to_numpy())
+    work.arrays[f"stops/{work.contents.name(artefact)}"] = stops[STOP].to_numpy(float)
     for room in stops["room"].unique():
         if f"pictures/{room}" not in work.arrays:
             work.arrays.create_dataset(f"pictures/{room}", data=domain.picture(room), compression="gzip")
@@ -147,6 +146,8 @@ def context(results):
     ladder by ladder, but oracle terminations, which have no members to choose among.
     """
     numbers = results.numbers[results.numbers["ladder"] != ""]
+    if numbers.empty:
+        return {}
     values = [
         per_run(
             numbers,

@@ -50,11 +50,10 @@ BOOTSTRAP_FROM = 8  # values: of 2 a bootstrap would hold in 49 % of cases, of 5
 
 
 @cache
-def is_share(quantity: str) -> bool:
-    """Whether it lies within 0 and 1."""
+def shares() -> set[str]:
+    """The quantities that lie within 0 and 1."""
     text = resources.files("hypogoal.evaluation").joinpath("quantities.toml").read_text(encoding="utf-8")
-    unit, _ = tomllib.loads(text).get(quantity, ("", ""))
-    return unit == "fraction"
+    return {name for name, (unit, _) in tomllib.loads(text).items() if unit == "fraction"}
 
 
 def tidy(numbers: Any, **place: Any) -> pd.DataFrame:
@@ -198,7 +197,7 @@ def statistics(runs: pd.DataFrame) -> dict[str, float]:
     if runs["layout"].nunique() > 1:
         values = values.groupby(runs["layout"], sort=False).mean()
     low, high = interval(values.to_numpy())
-    if is_share(runs["of"].iloc[0]):
+    if runs["of"].iloc[0] in shares():
         low, high = np.clip([low, high], 0, 1)
     return {
         "mean": values.mean(),
@@ -220,7 +219,10 @@ def pairs(runs: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (groups, quantity), cell in runs.groupby(["N", "quantity"], dropna=False, sort=False):
-        place = {"N": groups, "quantity": quantity}
+        place = {
+            "N": groups,
+            "quantity": quantity,
+        }
         (_, first), *others = cell.groupby("method", sort=False)
         for _, second in others:
             both = paired(first, second, SHARED)
@@ -276,7 +278,7 @@ def compare(both: pd.DataFrame, unit: str = "layout") -> dict[str, Any]:
         "higher": higher,
         **by_unit.mean(),
     }
-    widest = 1 if is_share(quantity) else math.inf
+    widest = 1 if quantity in shares() else math.inf
     for name, least, most in (("probability", 0, 1), ("difference", -widest, widest)):
         result[f"{name}_low"], result[f"{name}_high"] = np.clip(student_interval(by_unit[name]), least, most)
     return result

@@ -86,7 +86,8 @@ class Work:
 
         Those on the same states are judged one after another, since each process keeps the last ones that it read.
         """
-        ensembles = [(artefact, artefact.input("data")) for artefact in self.ranked(self.contents.ensembles)]
+        ranked = self.ranked(self.contents.ensembles)
+        ensembles = [(artefact, self.contents.data_of[artefact.path]) for artefact in ranked]
         order = sorted(ensembles, key=lambda each: each[1])
         found = {}
 

@@ -7,7 +7,7 @@ import re
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -139,7 +139,11 @@ def displayed(
         rows = table[table["quantity"] == quantity]
         if not rows.empty:
             texts = rows.apply(show, axis=1, args=how)
-            shown = shown.merge(rows[names].assign(**{title: texts}), on=names, how="left")
+            shown = shown.merge(
+                rows[names].assign(**{title: texts}),
+                on=names,
+                how="left",
+            )
     shown = shown.astype(object).fillna(DASH)
     return shown.rename(columns=by).set_index([by[name] for name in names])
 
@@ -209,10 +213,11 @@ def digest(text: str) -> str:
     return f"'sha256-{b64encode(hashed).decode()}'"
 
 
-def templates() -> jinja2.Environment:
+@cache
+def templates(folder: Path) -> jinja2.Environment:
     """All templates; they may call whatever is in this module. Pages escape every text but our style and script."""
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
+        loader=jinja2.FileSystemLoader(folder),
         autoescape=jinja2.select_autoescape(),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -224,15 +229,12 @@ def templates() -> jinja2.Environment:
 
 def words_of(context: Mapping[str, Any]) -> Any:
     """What a question's template sets, and its macros; figures are not drawn for it."""
-    return (
-        templates()
-        .get_template(f"{context['name']}.html")
-        .make_module(
-            {
-                **context,
-                "figures": [],
-            }
-        )
+    template = templates(TEMPLATES).get_template(f"{context['name']}.html")
+    return template.make_module(
+        {
+            **context,
+            "figures": [],
+        }
     )
 
 
@@ -242,7 +244,7 @@ def render(template: str, /, **context: Any) -> str:
     A section is what its template is given, with ``name``, its id, ``title``, and whether it is ``folded``;
     ``template``: where that is not called as the section.
     """
-    return templates().get_template(template).render(context)
+    return templates(TEMPLATES).get_template(template).render(context)
 
 
 def lines_of(template: str, /, **context: Any) -> list[str]:

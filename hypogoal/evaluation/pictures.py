@@ -101,15 +101,20 @@ def overlay(states: Bytes) -> Bytes:
     usual = np.partition(few, middle, axis=0)[middle]
     unusual = states != usual
     if states.shape[-1] == 3:  # a colour is one thing, a stack's frames are several
-        unusual[:] = unusual.any(axis=-1, keepdims=True)
+        red, green, blue = np.split(unusual, 3, axis=-1)
+        unusual = red | green | blue
     whole = unusual.sum(axis=(1, 2, 3)).argmin()
-    shown = states[whole]
-    others = np.ma.array(states, mask=~unusual).mean(axis=0).filled(shown)
+    shown, count = states[whole], unusual.sum(axis=0)
+    total = np.where(unusual, states, 0).sum(axis=0)
+    others = np.where(count, total / np.maximum(count, 1), shown)
     laid_over = np.where(unusual[whole], shown, (shown + others) / 2)
     return laid_over.round().astype(np.uint8)
 
 
-def write_sheets(path: Path, folder: Path) -> list[Path]:
+def write_sheets(
+    path: Path,
+    folder: Path,
+) -> list[Path]:
     """Draw a data file's labelled and held-out states, a picture for each room and label, to check labels by eye.
 
     The files are ``labelled/SUB_GOAL/room-01-positives.png`` and so on in ``folder``. A path that is no data file and

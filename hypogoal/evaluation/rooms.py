@@ -38,6 +38,8 @@ PANELS = {  # of Figure 3, and what it takes no seeing to score
 def context(results):
     """Spec F1, F2: members' scores and disagreement, and what a member that is never positive has; Figure 3."""
     by_room = results.of(scope="unseen")["artefact"]
+    if by_room.empty:
+        return {}
     numbers = results.of(artefact=[*by_room.unique()])
     states = per_run(numbers, "states", scope="all")
     never = per_run(numbers, "positives", scope="all", name=NEVER)
@@ -49,7 +51,7 @@ def context(results):
         name = f"{{}}, {scope}, {which}"
         values.append(per_run(numbers, *SCORED, scope=scope, member=member, name=name))
     found = tables_of(pd.concat(values), BY, PAIRED)
-    return found and {**found, "figures": [*_figures(found["table"])]}
+    return {**found, "figures": [*_figures(found["table"])]}
 
 
 def _figures(table):

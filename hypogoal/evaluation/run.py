@@ -5,6 +5,7 @@ A damaged file is refused in one line (Spec G2).
 
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, open_artefact, sha256_of
@@ -34,9 +35,14 @@ class Contents:
         """All of them."""
         return [*self.ensembles, *self.agents, *self.ladders]
 
+    @cached_property
+    def data_of(self) -> dict[Path, Path]:
+        """The data file that each ensemble was trained on, by the ensemble's path; each is read to the end once."""
+        return {artefact.path: artefact.input("data") for artefact in self.ensembles}
+
     def data(self) -> list[Path]:
         """The data files that ensembles were trained on."""
-        return sorted({artefact.input("data") for artefact in self.ensembles})
+        return sorted({*self.data_of.values()})
 
     def name(self, artefact: Artefact) -> str:
         """Its path within the run."""

@@ -51,15 +51,16 @@ def ranking(
     Takes probabilities (N, K) and labels (N,). Returns float64 (K,): the share of pairs of a positive and a negative in
     which the positive has the higher probability, ties counted half; NaN without such pairs.
     """
-    from scipy.stats import rankdata  # takes longer to import than most stages need it
-
-    positives = int(labels.sum())
-    pairs = positives * (len(labels) - positives)
-    if not pairs:
+    positives = probabilities[labels]
+    negatives = np.sort(probabilities[~labels], axis=0)
+    if not (len(positives) and len(negatives)):
         return np.full(probabilities.shape[1], np.nan)
-    ranks = rankdata(probabilities, axis=0)  # from 1; ties share their mean
-    won = ranks[labels].sum(axis=0) - positives * (positives + 1) / 2
-    return won / pairs
+    won = []
+    for own, others in zip(positives.T, negatives.T, strict=True):
+        below = np.searchsorted(others, own, side="left")
+        not_above = np.searchsorted(others, own, side="right")
+        won.append((below + not_above).sum() / 2)
+    return np.array(won) / (len(positives) * len(negatives))
 
 
 def best_threshold(
