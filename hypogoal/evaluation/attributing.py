@@ -69,8 +69,9 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
         facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
         facts["places"] = [place_of(judged.origins, state) for state in states]
         group["observations"] = observations[states]
-        for name in ("labels", "probabilities", "predictions"):
-            group[name] = getattr(judged, name)[states]
+        group["labels"] = judged.labels[states]
+        group["probabilities"] = judged.probabilities[states]
+        group["predictions"] = judged.predictions[states]
         group["seen"] = seen
     else:
         facts["features"] = dataset.features()

@@ -43,8 +43,12 @@ def shared(runs: Runs) -> Shared:
     """The questions of which every run has results, and what these are, by the run's label."""
     found = {}
     for question in QUESTIONS:
-        contexts = {label: context_of(question, results) for label, results in runs.items()}
-        if all(contexts.values()):
+        contexts = {}
+        for label, results in runs.items():
+            context = context_of(question, results)
+            if context is not None:
+                contexts[label] = context
+        if len(contexts) == len(runs):
             found[question] = contexts
     return found
 
