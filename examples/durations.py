@@ -14,11 +14,11 @@ def context(results):
     """Of each run the mean member's seconds, from the steps that question 'distance' has put into the table."""
     numbers = results.numbers[results.numbers["ladder"] != ""]
     runs = per_run(numbers, "duration", name="seconds")
-    found = tables_of(runs.assign(value=runs["value"] / STEPS), ["method"], ["seconds"])
-    if not found:
+    tables = tables_of(runs.assign(value=runs["value"] / STEPS), ["method"], ["seconds"])
+    if not tables:
         return {}
-    figure = Drawn("durations", TITLE, partial(bars_of, found["table"]))
-    return found | {"figures": [figure]}
+    figure = Drawn("durations", TITLE, partial(bars_of, tables["table"]))
+    return tables | {"figures": [figure]}
 
 
 def bars_of(table):

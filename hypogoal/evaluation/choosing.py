@@ -152,11 +152,11 @@ def _score(
     taken,
     among,
 ):
-    known = pd.DataFrame(np.where(among, quality, np.nan))
+    offered = pd.DataFrame(np.where(among, quality, np.nan))
     own = quality[taken]
-    compared = (known.count(axis=1) > 1) & np.isfinite(own)
-    average = known.mean(axis=1)
-    gain = (known.max(axis=1) - average)[compared].sum()
+    compared = (offered.count(axis=1) > 1) & np.isfinite(own)
+    average = offered.mean(axis=1)
+    gain = (offered.max(axis=1) - average)[compared].sum()
     gained = (own - average)[compared].sum()
     return gained / gain if house.above(gain, 0.0) else math.nan
 

@@ -41,7 +41,7 @@ def labels_of(paths: Sequence[str]) -> list[str]:
 
 def shared(runs: Runs) -> Shared:
     """The questions of which every run has results, and what these are, by the run's label."""
-    found = {}
+    questions = {}
     for question in QUESTIONS:
         contexts = {}
         for label, results in runs.items():
@@ -49,8 +49,8 @@ def shared(runs: Runs) -> Shared:
             if context is not None:
                 contexts[label] = context
         if len(contexts) == len(runs):
-            found[question] = contexts
-    return found
+            questions[question] = contexts
+    return questions
 
 
 def of_runs(
@@ -61,7 +61,7 @@ def of_runs(
     return pd.concat([context[name].assign(run=label) for label, context in contexts.items()])
 
 
-def why_not(runs: Runs, found: Shared) -> str | None:
+def why_not(runs: Runs, questions: Shared) -> str | None:
     """Why runs cannot be compared, in a few words; None where they can.
 
     They must be of one domain and have at least one kind of result in common.
@@ -70,7 +70,7 @@ def why_not(runs: Runs, found: Shared) -> str | None:
     if len({*domains.values()}) > 1:
         each = "; ".join(map(": ".join, domains.items()))
         return f"they are of different domains ({each})"
-    return None if found else "they have no kind of result in common"
+    return None if questions else "they have no kind of result in common"
 
 
 def differences(runs: Runs) -> pd.DataFrame:
@@ -81,10 +81,10 @@ def differences(runs: Runs) -> pd.DataFrame:
     return by_run[by_run.nunique(axis=1) > 1].rename_axis(columns=None).reset_index()
 
 
-def compare_runs(found: Shared) -> pd.DataFrame:
+def compare_runs(questions: Shared) -> pd.DataFrame:
     """Spec F5: the first run against each other, ``agent`` by agent and method by method, over what they share."""
     parts = []
-    for contexts in found.values():
+    for contexts in questions.values():
         for method, alike in of_runs(contexts, "compared").groupby("method", sort=False):
             if alike["run"].nunique() == len(contexts):
                 parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))
@@ -105,16 +105,16 @@ def winners(compared: pd.DataFrame) -> list[str]:
 
 def page_of(
     runs: Runs,
-    found: Shared,
+    questions: Shared,
     paths: Sequence[str],
 ) -> tuple[str, list[Drawn], dict[str, pd.DataFrame]]:
     """The page of a comparison, its figures, and its tables by name."""
     tables = {
-        "pairs": compare_runs(found),
+        "pairs": compare_runs(questions),
         "differences": differences(runs),
     }
     titles = {}
-    for question, contexts in found.items():
+    for question, contexts in questions.items():
         name = name_of(question)
         titles[name] = question.TITLE
         tables[name] = of_runs(contexts, "table").sort_values(question.BY, kind="stable")

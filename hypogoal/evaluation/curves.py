@@ -154,8 +154,8 @@ def chosen_by(results: Results, choice: str) -> dict[str, dict[str, Any]]:
 def context(results):
     """Every agent's numbers; Figure 6."""
     agents = results.of(method=[*results.facts["agents"]])
-    found = tables_of(per_run(agents, *QUANTITIES), BY, PAIRED)
-    return found and {**found, "figures": [*_figures(results)]}
+    tables = tables_of(per_run(agents, *QUANTITIES), BY, PAIRED)
+    return tables and {**tables, "figures": [*_figures(results)]}
 
 
 def _figures(results):

@@ -162,12 +162,12 @@ def context(results):
     seeds = ladders.groupby([*BY, "quantity", "of", "seed"], dropna=False, sort=False)
     means = seeds.agg(value=("value", "mean"), ladders=("ladder", "nunique")).reset_index()
     whole = means[means["ladders"] == ladders["ladder"].nunique()]
-    found = tables_of(whole.assign(layout=None).sort_values("N", kind="stable"), BY)
-    if not found:
+    tables = tables_of(whole.assign(layout=None).sort_values("N", kind="stable"), BY)
+    if not tables:
         return {}
     has_members = ~ladders["method"].str.startswith(ORACLE)
     compared = ladders[has_members & ladders["quantity"].isin(PAIRED)]
-    return {**found, "compared": compared, "figures": [*_figures(results, found["table"])]}
+    return {**tables, "compared": compared, "figures": [*_figures(results, tables["table"])]}
 
 
 def _figures(results, table):

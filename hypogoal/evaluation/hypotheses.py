@@ -166,10 +166,10 @@ def context(results):
     values.append(per_run(numbers, *KNOWN, "coverage", scope=HELDOUT))
     for states in ("unlabelled", HELDOUT):
         values.append(per_run(numbers, "disagreement", scope=states, name=f"{{}}_{states}"))
-    found = tables_of(pd.concat(values), BY, PAIRED)
-    if not found:
+    tables = tables_of(pd.concat(values), BY, PAIRED)
+    if not tables:
         return {}
-    table = found["table"]
+    table = tables["table"]
     means = table[table["quantity"].isin(WHICH)].pivot_table(
         "mean",
         BY,
@@ -178,7 +178,7 @@ def context(results):
     )
     label = "Members' balanced accuracy on held-out states"
     figure = Drawn("members", label, partial(members_figure, means))
-    return found | {"figures": [figure] if len(means) else []}
+    return tables | {"figures": [figure] if len(means) else []}
 
 
 def members_figure(means: pd.DataFrame) -> Figure:

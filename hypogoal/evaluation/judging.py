@@ -89,17 +89,17 @@ class Work:
         ranked = self.ranked(self.contents.ensembles)
         ensembles = [(artefact, self.contents.data_of[artefact.path]) for artefact in ranked]
         order = sorted(ensembles, key=lambda each: each[1])
-        found = {}
+        by_path = {}
 
         def keep(number: int, judged: dict[str, Judged]) -> None:
             artefact, _ = order[number]
-            found[artefact.path] = judged
+            by_path[artefact.path] = judged
             self.progress.advance()
 
         tasks = [partial(judge, *each) for each in order]
         in_processes(tasks, processes_for(order), keep, forked=True)
         for artefact, data in ensembles:
-            for sub_goal, judged in found.pop(artefact.path).items():
+            for sub_goal, judged in by_path.pop(artefact.path).items():
                 yield Judgement(artefact, data, sub_goal, judged)
         states_of.cache_clear()
 

@@ -50,8 +50,8 @@ def context(results):
     for scope, (which, member) in product(("unseen", "all"), WHICH.items()):
         name = f"{{}}, {scope}, {which}"
         values.append(per_run(numbers, *SCORED, scope=scope, member=member, name=name))
-    found = tables_of(pd.concat(values), BY, PAIRED)
-    return {**found, "figures": [*_figures(found["table"])]}
+    tables = tables_of(pd.concat(values), BY, PAIRED)
+    return {**tables, "figures": [*_figures(tables["table"])]}
 
 
 def _figures(table):

@@ -75,7 +75,7 @@ def on_layout(
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
     config = Artefact(path).config
-    known = base.load_domain(config["domain"]).sub_goals
+    in_domain = base.load_domain(config["domain"]).sub_goals
     engine = engine_on(config, layouts)
     ids = engine.reachable()
     if ids is None:
@@ -85,8 +85,8 @@ def on_layout(
     for sub_goal in config["sub_goals"]:
         predictions = read_ensemble(path, config, sub_goal).predictions(images)
         match = np.full(predictions.shape[1], np.nan)
-        if sub_goal in known:
-            truth = labels[:, known.index(sub_goal)]
+        if sub_goal in in_domain:
+            truth = labels[:, in_domain.index(sub_goal)]
             match = scores.member_scores(predictions, truth)["balanced_accuracy"]
         matches.append(match)
         verdicts.append(predictions)
@@ -124,9 +124,9 @@ def missing(work):
     lines = set()
     for artefact in filter(takes, work.contents.agents):
         name = artefact.config["domain"]
-        known = base.load_domain(name).sub_goals
-        for sub_goal in set(artefact.config["sub_goals"]).difference(known):
-            lines.add(f"no truth of {sub_goal} to match members with: {name} has {page.listed(known)}")
+        in_domain = base.load_domain(name).sub_goals
+        for sub_goal in set(artefact.config["sub_goals"]).difference(in_domain):
+            lines.add(f"no truth of {sub_goal} to match members with: {name} has {page.listed(in_domain)}")
     return sorted(lines)
 
 

@@ -56,9 +56,9 @@ def ranking(
     if not (len(positives) and len(negatives)):
         return np.full(probabilities.shape[1], np.nan)
     won = []
-    for own, others in zip(positives.T, negatives.T, strict=True):
-        below = np.searchsorted(others, own, side="left")
-        not_above = np.searchsorted(others, own, side="right")
+    for positive, negative in zip(positives.T, negatives.T, strict=True):
+        below = np.searchsorted(negative, positive, side="left")
+        not_above = np.searchsorted(negative, positive, side="right")
         won.append((below + not_above).sum() / 2)
     return np.array(won) / (len(positives) * len(negatives))
 

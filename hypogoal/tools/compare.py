@@ -30,12 +30,12 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
     ) as draft:
         labels = beside.labels_of([run.resolve().as_posix() for run in runs])
         results = dict(zip(labels, map(read_evaluation, runs), strict=True))
-        found = beside.shared(results)
-        reason = beside.why_not(results, found)
+        questions = beside.shared(results)
+        reason = beside.why_not(results, questions)
         if reason is not None:
             do = "Choose runs of one experiment, evaluated alike."
             raise UserError("these runs cannot be compared", reason, do)
-        page, figures, tables = beside.page_of(results, found, [str(run) for run in runs])
+        page, figures, tables = beside.page_of(results, questions, [str(run) for run in runs])
         index = draft.files / "index.html"
         index.write_text(page, encoding="utf-8")
         for name, table in tables.items():
