@@ -71,24 +71,20 @@ def spread(stops: NDArray[np.int64]) -> float:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """What the stops say, as lines of Markdown."""
-    stops = read(path)
-    yield from table(
-        ["", "seed", "at a base", "began inside", "spread", "rooms"],
-        (
-            [
-                title,
-                str(seed),
-                f"{(places[:, 3] == HIT).mean():.2f}",
-                f"{(places[:, 3] == BEGAN_INSIDE).mean():.2f}",
-                f"{spread(places):.1f}",
-                ", ".join(f"{room} ({count})" for room, count in Counter(places[:, 0].tolist()).most_common(3)),
-            ]
-            for method, title in METHODS.items()
-            for (name, seed), places in sorted(stops.items())
-            if name == method
-        ),
-    )
+    """What the stops say, as lines of Markdown, the seeds side by side."""
+    every = read(path)
+    rows = []
+    for method, title in METHODS.items():
+        seeds = sorted(seed for name, seed in every if name == method)
+        if not seeds:
+            continue
+        stops = [every[method, seed] for seed in seeds]
+        at_base = [f"{(places[:, 3] == HIT).mean():.2f}" for places in stops]
+        inside = [f"{(places[:, 3] == BEGAN_INSIDE).mean():.2f}" for places in stops]
+        spreads = [f"{spread(places):.1f}" for places in stops]
+        columns = ([*map(str, seeds)], at_base, inside, spreads)
+        rows.append([title, *[", ".join(column) for column in columns]])
+    yield from table(["", "seeds", "at a base", "began inside", "spread"], rows)
 
 
 def draw(path: Path, seed: int, picture: Path) -> None:
