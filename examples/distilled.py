@@ -203,7 +203,7 @@ class Learner(LightLearner):
         fallen = min(1.0, self.steps / self.last)
         networks.optimiser.lr = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
         where = f"in the batch of update {networks.updates}, step {self.steps}"
-        descend(loss, networks.online, networks.optimiser, "the options", where, GRADIENT_NORM)
+        descend(loss, networks.optimiser, "the options", where, GRADIENT_NORM)
         networks.updates += 1
         planned = int((self.kind >= PLANNED).sum())
         return {"option_loss": float(loss.detach()), "planned_states": float(planned)}

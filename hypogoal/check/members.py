@@ -15,7 +15,7 @@ from hypogoal.domains.base import Domain, load_domain
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import train
-from hypogoal.hypotheses.views import StateOrigins, changed_by, own_view
+from hypogoal.hypotheses.views import StateOrigins, changed_by, view_of
 
 FEW = 8  # states
 SMALL: dict[str, Any] = {"members": 2, "steps": 2, "batch_size": 16, "network": "mlp"}
@@ -78,7 +78,7 @@ class _Trained:
         """What it learned is in its parameters and buffers."""
         view = self.ensemble().view
         observations = self.states.labelled.observations
-        fresh = own_view(self.name, (), observations.shape[1:])
+        fresh = view_of(self.name, (), observations.shape[1:], observations.dtype)
         fresh.load_state_dict(view.state_dict())
         seen = view.see(observations)
         is_same = np.array_equal(fresh.see(observations), seen)

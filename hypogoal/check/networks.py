@@ -13,7 +13,7 @@ from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import inputs_of
-from hypogoal.hypotheses.views import full_view
+from hypogoal.hypotheses.views import FullView, StateOrigins
 from hypogoal.observations import PICTURE, Observations
 
 COUNT = 8  # states
@@ -36,7 +36,8 @@ class _Network:
     states: Observations
 
     def ensemble(self) -> Ensemble:
-        view = full_view(self.states)
+        view = FullView(self.states.shape[1:], self.states.dtype)
+        view.fit(self.states, self.states, StateOrigins(), 0)
         return Ensemble(self.name, view.shape, 2, torch_generator(0, "check"), view)
 
     def inputs(self, ensemble: Ensemble) -> Tensor:

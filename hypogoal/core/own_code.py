@@ -6,6 +6,7 @@ environment. Installed packages with an entry point need neither.
 """
 
 import errno
+import inspect
 import os
 import re
 import shlex
@@ -16,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, TypeVar
 
 from hypogoal.core.errors import NumericalError, UserError
 
@@ -32,6 +33,7 @@ REMEDIES = {
     errno.ENOSPC: "Free some disk space and run it again.",
     errno.EACCES: "Ask for permission, or choose another path.",
 }
+Kind = TypeVar("Kind")
 _allowed: set[str] = set()  # what the user typed in this process
 
 
@@ -87,6 +89,17 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
     except (Exception, SystemExit) as error:
         where = f"{name} {place_of(error)}".strip()
         raise UserError(f"the {role} cannot be loaded: {_line(error)}", where, "--debug shows more.") from error
+
+
+def load_class(name: str, role: str, base: type[Kind], built_in: Mapping[str, str], group: str = "") -> type[Kind]:
+    """The subclass of ``base`` called ``name``, see :func:`load`; anything else is a ``UserError``."""
+    kind = load(name, role, group, built_in)
+    do = f"Give a subclass of {base.__module__}.{base.__name__}."
+    if not (inspect.isclass(kind) and issubclass(kind, base)):
+        raise UserError(f"this is no {role}", name, do)
+    if missing := sorted(getattr(kind, "__abstractmethods__", ())):
+        raise UserError(f"this {role} lacks {', '.join(missing)}", name, do)
+    return kind
 
 
 def place_of(error: BaseException) -> str:

@@ -88,11 +88,11 @@ def by_key(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[Any]:
     return parts
 
 
-def method_of(member: nn.Module) -> str:
+def method_of(member: Any) -> str:
     """How a member is explained: by DeepLift if it is a chain of layers with valid rules, each used once."""
     layers = list(member.children())
     ruled = all(type(layer) in RULED or _separable(layer) for layer in layers)
-    return DEEP_LIFT if ruled and len(layers) == len(member._modules) else INTEGRATED
+    return DEEP_LIFT if ruled and len(layers) == len(member) else INTEGRATED
 
 
 def attributed(

@@ -29,13 +29,14 @@ from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.hypotheses.views import (
     FullView,
     View,
-    saved_view,
+    view_of,
 )
 from hypogoal.observations import (
     NUMBERS,
     Observations,
     Shape,
     packed,
+    type_of,
     type_text,
     values_in,
 )
@@ -220,7 +221,7 @@ class Ensemble(nn.Module):
 
 
 def together(ensembles: Sequence[Ensemble]) -> Ensemble | None:
-    """All members of ensembles with one network as one, in order; None unless all see whole pictures."""
+    """All members of ensembles with one network as one, in order; None unless all see whole pictures alone."""
     first = ensembles[0]
     if any(type(each.view) is not FullView or each.view.standard is not None for each in ensembles):
         return None
@@ -260,7 +261,8 @@ def read_ensemble(
     state = load_tensors(path)
     try:
         shape = tuple(config["observation_shape"])
-        view = saved_view(shape, config)
+        dtype = type_of(config["observation_dtype"])
+        view = view_of(config["view"], config.get("view_settings", ()), shape, dtype)
         make = partial(Ensemble, config["network"], shape, config["members"], torch.Generator(), view)
         return load_fitting(make, state, str(path)).eval()
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):

@@ -173,29 +173,11 @@ def load_network(name: str) -> Callable[[Shape], Parts]:
     def parts(shape: Shape) -> Parts:
         by_shape = "observation_shape" in inspect.signature(function).parameters
         network = function(shape if by_shape else shape[-1])
-        if isinstance(network, nn.Module):
-            return _encoder(name, network, shape)
+        if isinstance(network, nn.Module):  # an encoder
+            return [network], ()
         return _layers(name, network)
 
     return parts
-
-
-def _encoder(name: str, network: nn.Module, shape: Shape) -> Parts:
-    """A user's encoder, :func:`as_input` -> (N, F), as parts."""
-    try:
-        with torch.no_grad():
-            features = network.eval()(as_input(torch.zeros(1, *shape)))
-    except (RuntimeError, NotImplementedError) as error:
-        if place_of(error):
-            raise
-        fault = f"the network takes no such input: {error}"
-        raise UserError(fault, name, "Have it take float32 (N, C, H, W) on the CPU, or (N, *shape).") from None
-    kind = getattr(features, "dtype", type(features))
-    size = tuple(getattr(features, "shape", ()))
-    if kind != torch.float32 or size[:-1] != (1,) or not all(size):
-        fault = f"the network is an encoder that makes {kind} {size} of a state"
-        raise UserError(fault, name, "Make features, float32 (N, F).")
-    return [network], ()
 
 
 def _layers(name: str, network: Any) -> Parts:
@@ -230,20 +212,10 @@ def build_network(
     """
     by_key = _by_key(name, generator, dtype) if dtype.names else None
     example = torch.zeros(1, values_in((), dtype)) if by_key else as_input(torch.zeros(1, *observation_shape))
-    changes = example._version  # counts what is done in place
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with DrawsFrom(torch.Generator().manual_seed(seed)):
         layers, hidden = ([by_key], (JOINT,)) if by_key else load_network(name)(observation_shape)
-        features = _features(layers, example)
-        if features is None:
-            raise UserError(
-                f"the network {name!r} does not take these observations",
-                f"observation shape {tuple(observation_shape)}",
-                "Give another network (mlp takes any), larger pictures, or a network of your own.",
-            )
-        if example._version > changes:
-            raise UserError("the network changes its input, which all members see", name, "Have it change a copy.")
-        widths = [features.numel(), *hidden]
+        widths = [_features(name, layers, example, observation_shape), *hidden]
         dense: list[nn.Module] = []
         for inputs, outputs in pairwise(widths):
             dense += [nn.Linear(inputs, outputs), nn.ReLU()]
@@ -265,14 +237,25 @@ def _by_key(
     return ByKey(shapes, encoders)
 
 
-def _features(layers: Iterable[nn.Module], example: Tensor) -> Tensor | None:
-    """A convolutional part's output for an input; None if it does not take it."""
+def _features(name: str, layers: Iterable[nn.Module], example: Tensor, shape: Shape) -> int:
+    """How many features a convolutional part makes of an input; a ``UserError`` where it makes none of such a shape."""
+    changes = example._version  # counts what is done in place
     try:
         with torch.no_grad():
-            features: Tensor = nn.Sequential(*layers).eval()(example)
-            return features
-    except (RuntimeError, ValueError):
-        return None
+            features = nn.Sequential(*layers).eval()(example)
+    except (RuntimeError, NotImplementedError, ValueError) as error:
+        if place_of(error):
+            raise
+        fault = f"the network {name!r} does not take these observations"
+        do = "Give another (mlp takes any), larger pictures, or your own, of float32 (N, C, H, W) or (N, *shape)."
+        raise UserError(fault, f"observation shape {tuple(shape)}: {error}", do) from None
+    if example._version > changes:
+        raise UserError("the network changes its input, which all members see", name, "Have it change a copy.")
+    kind = getattr(features, "dtype", type(features))
+    size = tuple(getattr(features, "shape", ()))
+    if kind != torch.float32 or size[:1] != (1,) or len(size) < 2 or not all(size):
+        raise UserError(f"the network makes {kind} {size} of a state", name, "Make features, float32 (N, F).")
+    return prod(size)
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from hypogoal.core.arrays import Ints
 from hypogoal.observations import spread_rows
@@ -50,8 +51,8 @@ class PatchBatch:
     BatchNorm sees each group on its own; all other layers see all groups at once.
     """
 
-    first: Tensor  # float32 (U, k * k, C), the patches of the first level
-    parts: list[Tensor]  # for each level above it int64 (U * k * k,), indices of the level below
+    colours: Tensor  # float32 (colours, C)
+    parts: list[Tensor]  # for each level int64 (U, k * k), indices of the level below, at first of the colours
     # For each level and group float32 (1, U), each patch's share of the group's places, which sum to 1; their number.
     shares: list[list[tuple[Tensor, int]]]
     last: Tensor  # int64 (B, H * W), the last level's patch at each place of all images
@@ -100,7 +101,8 @@ def make_tables(network: nn.Sequential, *parts: NDArray[Any]) -> Tables | None:
     pixels = prod(parts[0].shape[1:3])
     count = max(1, min(SAMPLE, SAMPLE_PIXELS // pixels))
     some = [part[spread_rows(len(part), count)] for part in parts]
-    if not _worthwhile(_tables(np.concatenate(some), windows), network):
+    sample = _tables(np.concatenate(some), windows)
+    if not _worthwhile(sample, network):
         return None
     return _tables(np.concatenate(parts), windows)
 
@@ -205,21 +207,21 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
         used = np.arange(len(tables.colours))  # ids of the level below; every group has all colours
         offset = 0
         for number, level in enumerate(tables.levels):
-            ids = level.rows[level.lines[images]]
+            rows = level.lines[images]
+            ids = level.rows[rows]
             ranks, occurring = _rank(ids, len(level.parts))
             share = np.bincount(ranks.ravel()) / ids.size
             of_group = torch.from_numpy(share.astype(np.float32))
             shares[number].append((of_group[None], ids.size))
-            parts[number].append(_positions(level.parts[occurring], used) + offset)
+            below = _positions(level.parts[occurring], used)
+            parts[number].append(below + offset)
             used, offset = occurring, before[number]
             before[number] += len(occurring)
         places = ranks.reshape(len(images), -1)
         last.append(places.astype(np.int64) + offset)
-    first, *above = [torch.from_numpy(np.concatenate(of_groups)) for of_groups in parts]
-    patches = tables.colours[first]
     return PatchBatch(
-        patches,
-        [part.flatten() for part in above],
+        tables.colours,
+        [torch.from_numpy(np.concatenate(of_groups)) for of_groups in parts],
         shares,
         torch.from_numpy(np.concatenate(last)),
     )
@@ -244,26 +246,16 @@ def forward(
     ``windows_of`` must support its layers. In training mode, BatchNorm's running statistics include the first group,
     and the others where they are ``counted``.
     """
-    rows, level = batch.first, -1
+    rows, level = batch.colours, -1
     for layer in network:
         if isinstance(layer, nn.Conv2d | nn.MaxPool2d):
             level += 1
-            windows = rows
-            if level:
-                size = _side(layer.kernel_size) ** 2
-                windows = rows.index_select(0, batch.parts[level - 1]).view(
-                    -1,
-                    size,
-                    rows.shape[1],
-                )
-            rows = (
-                _convolved(layer, windows)
-                if isinstance(
-                    layer,
-                    nn.Conv2d,
-                )
-                else _pooled(windows)
-            )
+            parts = batch.parts[level]
+            windows = rows.index_select(0, parts.flatten()).view(*parts.shape, -1)
+            if isinstance(layer, nn.Conv2d):
+                rows = _convolved(layer, windows)
+            else:
+                rows = _pooled(windows)
         elif isinstance(layer, nn.BatchNorm2d):
             rows = _batch_norm(layer, rows, batch.shares[level], counted)
         elif isinstance(layer, nn.Flatten):
@@ -280,10 +272,7 @@ def _convolved(layer: nn.Conv2d, windows: Tensor) -> Tensor:
     """A convolution of windows (U, k * k, C) -> (U, features)."""
     ordered = layer.weight.permute(2, 3, 1, 0)
     weight = ordered.reshape(-1, layer.out_channels)
-    flat = windows.view(-1, len(weight))
-    if layer.bias is None:
-        return flat @ weight
-    return torch.addmm(layer.bias, flat, weight)
+    return functional.linear(windows.flatten(1), weight.T, layer.bias)
 
 
 def _pooled(windows: Tensor) -> Tensor:

@@ -9,16 +9,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.arrays import Bytes, Floats, tensor
-from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble, predicting
+from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble, predicting, together
 from hypogoal.hypotheses.networks import (
     as_input,
     at_once,
     folded,
 )
-from hypogoal.hypotheses.views import FullView
-from hypogoal.observations import PICTURE, Observations
+from hypogoal.observations import Observations
 
-MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
+MANY = 256  # states from which an ensemble's own prediction, which computes distinct patches once, is faster
 WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
 
 
@@ -27,20 +26,20 @@ class StackedMembers:
 
     The first convolution's filters are concatenated, later ones grouped; dense layers are batched products. Up to
     rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers, and ensembles
-    that do not see whole pictures, are not ``joined``: each ensemble predicts by itself, as it does of many states.
+    that do not see whole pictures, are not ``joined``: they predict as ensembles do, as all do of many states.
 
     The G ensembles have K members each, one network and observation shape, and one device.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble]):
         self.ensembles = tuple(ensembles)
+        self.every = together(ensembles)
         self.device = ensembles[0].thresholds.device
-        whole_pictures = all(type(each.view) is FullView and each.view.dtype == PICTURE for each in ensembles)
         self.networks: list[nn.Sequential] = []
         for ensemble in ensembles:
             self.networks += map(folded, ensemble.eval().networks)
         self.count = len(self.networks)
-        self.joined = whole_pictures and _can_be_joined(self.networks[0])
+        self.joined = self.every is not None and _can_be_joined(self.networks[0])
         self._layers: list[tuple[nn.Module, dict[str, Tensor]]] = []
         if self.joined:
             for layers in zip(*self.networks, strict=True):
@@ -48,18 +47,13 @@ class StackedMembers:
 
     def log_odds(self, observations: Observations) -> Floats:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
+        if self.every is None:
+            each = [ensemble.log_odds(observations) for ensemble in self.ensembles]
+            return np.concatenate(each, axis=1)
         if not self.joined or len(observations) >= MANY:
-            return np.concatenate(
-                [ensemble.log_odds(observations) for ensemble in self.ensembles],
-                axis=1,
-            )
-        seen = self.ensembles[0].see(observations)
-        rows = [
-            np.empty(
-                (0, self.count),
-                np.float32,
-            )
-        ]
+            return self.every.log_odds(observations)
+        seen = self.every.see(observations)
+        rows = []
         size = at_once(IMAGES_AT_ONCE, seen.shape[1:])
         with predicting(self.device):
             for start in range(0, len(seen), size):
@@ -122,6 +116,8 @@ def _stack(layers: Sequence[nn.Module]) -> dict[str, Tensor]:
         each = [layer.state_dict()[name] for layer in layers]
         if isinstance(layers[0], nn.Conv2d):
             weights[name] = torch.cat(each)
+            if name == "weight":  # in the memory order of pictures; else each call would copy it
+                weights[name] = weights[name].contiguous(memory_format=torch.channels_last)
         elif name == "weight":
             weights[name] = torch.stack([weight.T for weight in each]).contiguous()
         else:

@@ -31,10 +31,9 @@ def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembl
     thresholds.threshold_rule(config.threshold)
     if config.teacher:
         teacher.load_teacher(config.teacher)
-    shape = dataset.observation_shape
-    if config.view != views.FULL:
-        shape = views.own_view(config.view, config.view_settings, shape).shape
-    network = networks.network_for(config.network, shape, dataset.observation_dtype)
+    dtype = dataset.observation_dtype
+    view = views.view_of(config.view, config.view_settings, dataset.observation_shape, dtype)
+    network = networks.network_for(config.network, view.shape, dtype)
     config = config.model_copy(update={"network": network})
     for name in networks.names_in(config.network):
         networks.load_network(name)

@@ -16,6 +16,7 @@ from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Bools
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.hypotheses import views
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
@@ -30,7 +31,6 @@ from hypogoal.hypotheses.thresholds import (
     SPLIT,
     thresholds,
 )
-from hypogoal.hypotheses.views import StateOrigins, view_of
 from hypogoal.observations import Observations
 
 CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
@@ -69,30 +69,22 @@ class EnsembleTraining(Resumable):
         config: EnsembleConfig,
         seed: int,
         *,
-        origins: StateOrigins | None = None,
+        origins: views.StateOrigins | None = None,
         device: torch.device | str = "cpu",
         saved: Mapping[str, Any] | None = None,
     ):
         if not len(unlabelled) and (objective_of(config) or config.teacher or config.threshold == SPLIT):
             do = "Give some, or set diversity=none, threshold=0.5 and no teacher."
-            raise UserError(
-                "unlabelled states are needed to make members differ",
-                None,
-                do,
-            )
-        origins = origins or StateOrigins()
+            raise UserError("unlabelled states are needed to make members differ", None, do)
+        origins = origins or views.StateOrigins()
         self.config, self.seed = config, seed
         self.observations, self.labels, self.unlabelled = observations, labels, unlabelled
-        view = view_of(
-            observations,
-            unlabelled,
-            config,
-            origins,
-            seed,
-            fitted=saved is None,
-        )
+        shape = observations.shape[1:]
+        view = views.view_of(config.view, config.view_settings, shape, observations.dtype)
+        if saved is None:
+            views.learn_from(view, observations, unlabelled, origins, seed)
         weights = seeding.torch_generator(seed, "weights")
-        self.ensemble = Ensemble(config.network, observations.shape[1:], config.members, weights, view).to(device)
+        self.ensemble = Ensemble(config.network, shape, config.members, weights, view).to(device)
         self.taught: Tensor | None = None
         if saved:
             self.ensemble.load_state_dict(saved["ensemble"])  # with what the view has learned

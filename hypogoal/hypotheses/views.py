@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
@@ -15,8 +14,8 @@ from torch import Tensor, nn
 from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.config import Config, assigned, resolve
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load
-from hypogoal.hypotheses.config import FULL, EnsembleConfig
+from hypogoal.core.own_code import load_class
+from hypogoal.hypotheses.config import FULL
 from hypogoal.observations import (
     NUMBERS,
     PICTURE,
@@ -28,7 +27,6 @@ from hypogoal.observations import (
     numbers_of,
     standard_of,
     standardised,
-    type_of,
 )
 
 ENTRY_POINTS = "hypogoal.views"  # with which other packages add views
@@ -93,29 +91,41 @@ class View(nn.Module):
 
 
 class FullView(View):
-    """All of an observation: a picture as it is, the paper's view; numbers standardised by ``standard``.
+    """All of an observation: a picture as it is, the paper's view; numbers standardised by what it learned of them.
 
-    Of a mixed observation, of type ``dtype``, ``standard`` is that of all its numbers, (D,).
+    ``standard`` (*shape) is what it has learned already. Of a mixed observation it is that of all its numbers, (D,).
     """
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, observation_shape: Shape, standard: Standard | None = None, dtype: DType | None = None):
+    def __init__(self, observation_shape: Shape, dtype: DType = PICTURE, standard: Standard | None = None):
         super().__init__()
-        self.shape = observation_shape
-        self.dtype = dtype or (NUMBERS if standard else PICTURE)
-        if standard:
-            mean, deviation = standard
+        self.shape, self.dtype = observation_shape, dtype
+        fields = fields_of(observation_shape, dtype).values()
+        counts = [prod(shape) for kind, shape in fields if kind == NUMBERS]
+        self.numbers = (sum(counts),) if dtype.names else observation_shape
+        self.standardises = bool(counts)
+        if self.standardises:
+            mean, deviation = standard or standard_of(self.numbers)
             self.register_buffer("mean", torch.from_numpy(mean.copy()))
             self.register_buffer("deviation", torch.from_numpy(deviation.copy()))
 
     @property
     def standard(self) -> Standard | None:
         """Mean and deviation (*shape) of numbers; None for pictures."""
-        if "mean" not in self._buffers:
+        if not self.standardises:
             return None
         return self.mean.cpu().numpy(), self.deviation.cpu().numpy()
+
+    def fit(self, labelled: Observations, unlabelled: Observations, origins: StateOrigins, seed: int) -> None:
+        """Learn the mean and deviation of numbers."""
+        if not self.standardises:
+            return
+        rows = [numbers_of(states).reshape(-1, *self.numbers) for states in (labelled, unlabelled)]
+        mean, deviation = standard_of(self.numbers, *rows)
+        self.mean.copy_(torch.from_numpy(mean))
+        self.deviation.copy_(torch.from_numpy(deviation))
 
     def see(self, observations: Observations) -> Observations:
         """The observations (N, *shape)."""
@@ -124,7 +134,8 @@ class FullView(View):
         if not self.dtype.names:
             return standardised(observations, *self.standard)
         seen = observations.copy()
-        numbers, place = standardised(numbers_of(observations), *self.standard), 0
+        numbers = standardised(numbers_of(observations), *self.standard)
+        place = 0
         for key, (dtype, shape) in fields_of((), self.dtype).items():
             if dtype == NUMBERS:
                 of_key = numbers[:, place : place + prod(shape)]
@@ -133,60 +144,38 @@ class FullView(View):
         return seen
 
 
-def full_view(*observations: Observations) -> FullView:
-    """All of observations like these, their numbers standardised by the mean and deviation that they have here."""
-    shape, dtype = observations[0].shape[1:], observations[0].dtype
-    numbers = [numbers_of(some) for some in observations]
-    count = numbers[0].shape[1]
-    if not count:
-        return FullView(shape, None, dtype)
-    size = shape if dtype == NUMBERS else (count,)
-    rows = [some.reshape(len(some), *size) for some in numbers]
-    return FullView(shape, standard_of(size, *rows), dtype)
-
-
-def own_view(name: str, settings: Sequence[str], observation_shape: Shape) -> View:
-    """The view ``module:Class`` with its settings, ``KEY=VALUE``.
+def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype: DType) -> View:
+    """The view ``full``, or ``module:Class`` with its settings, ``KEY=VALUE``, of such observations; it learns later.
 
     No such view or setting, and code that the user did not allow, are a ``UserError``.
     """
-    kind = load(name, "view", ENTRY_POINTS, {})
-    if not (inspect.isclass(kind) and issubclass(kind, View)):
-        raise UserError("this is no view", name, f"Give a subclass of {__name__}.View.")
-    view: View = kind(observation_shape, resolve(kind.Settings, assigned(settings), stage=name))
-    if "_modules" not in vars(view) or not hasattr(view, "shape"):
-        raise UserError("the view is not ready", name, "Call super().__init__() and set self.shape in its __init__.")
+    if name == FULL:
+        return FullView(observation_shape, dtype)
+    kind: type[Any] = load_class(name, "view", View, {}, ENTRY_POINTS)
+    chosen = resolve(kind.Settings, assigned(settings), stage=name)
+    view: View = kind(observation_shape, chosen)
+    try:
+        _ = view.state_dict(), view.shape
+    except AttributeError:
+        do = "Call super().__init__() and set self.shape in its __init__."
+        raise UserError("the view is not ready", name, do) from None
+    if view.dtype != dtype:
+        raise UserError(f"the view is of {view.dtype}, these observations are {dtype}", name)
     return view
 
 
-def saved_view(observation_shape: Shape, config: Mapping[str, Any]) -> View:
-    """The view that the settings ask for, before it has learned, to load what it learned into."""
-    if config.get("view", FULL) != FULL:
-        return own_view(config["view"], config["view_settings"], observation_shape)
-    one_state = np.zeros((1, *observation_shape), type_of(config["observation_dtype"]))
-    return full_view(one_state)
-
-
-def view_of(
-    observations: Any, unlabelled: Any, config: EnsembleConfig, origins: StateOrigins, seed: int, *, fitted: bool
-) -> View:
-    """The members' view; ``fitted``: it has learned from the states, else what it learned is to be loaded."""
-    if config.view == FULL:
-        return full_view(observations, unlabelled)
-    view = own_view(config.view, config.view_settings, observations.shape[1:])
-    if observations.dtype != view.dtype:
-        raise UserError(f"the view is of {view.dtype}, these observations are {observations.dtype}", config.view)
-    if fitted:
-        view.fit(observations, unlabelled, origins, seed)
-    two = observations[:2].copy()
+def learn_from(view: View, labelled: Any, unlabelled: Any, origins: StateOrigins, seed: int) -> None:
+    """:meth:`View.fit`; a view that then shows other than it says, or changes what it gets, is a ``UserError``."""
+    view.fit(labelled, unlabelled, origins, seed)
+    name = type(view).__name__
+    two = labelled[:2].copy()
     seen = np.asarray(view.see(two))
     wanted = (len(two), *view.shape)
     if seen.dtype != view.dtype or seen.shape != wanted:
         fault = f"the view shows {seen.dtype} {seen.shape} of {len(two)} states"
-        raise UserError(fault, config.view, f"Show {view.dtype} {wanted}.")
-    if not np.array_equal(two, observations[:2]):
-        raise UserError("the view changes the observations", config.view, "Have it change a copy.")
-    return view
+        raise UserError(fault, name, f"Show {view.dtype} {wanted}.")
+    if two.tobytes() != labelled[:2].tobytes():
+        raise UserError("the view changes the observations", name, "Have it change a copy.")
 
 
 def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
@@ -204,7 +193,9 @@ def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
 def pools_of(view: View, labels: Bools, origins: Origins) -> tuple[list[Ints], float]:
     """:meth:`View.pools`; pools that are empty or not of positives, or another share, are a ``UserError``."""
     pools, share = view.pools(labels, origins)
-    numbers = np.concatenate(pools) if all(map(len, pools)) and pools else np.zeros(0)
+    numbers = np.zeros(0)
+    if pools and all(map(len, pools)):
+        numbers = np.concatenate(pools)
     are_positives = np.isin(numbers, np.flatnonzero(labels)).all()
     if numbers.dtype.kind not in "iu" or not are_positives or not 0 < share < 1:
         do = "Give lists of numbers of positives, none empty, and their share of a batch, between 0 and 1."

@@ -111,7 +111,7 @@ class DoubleDQN(Resumable):
             finite = losses.isfinite().all(0).tolist()
             options = [option for option, fine in zip(options, finite, strict=True) if not fine]
         where = f"in the batch of update {self.updates}, step {step}"
-        descend(loss, self.online, self.optimiser, f"options {list(options)}", where, self.largest)
+        descend(loss, self.optimiser, f"options {list(options)}", where, self.largest)
         self.updates += 1
         self._follow()
         return float(loss.detach()), errors.detach().abs().amax(1).cpu().numpy()
@@ -136,21 +136,20 @@ class DoubleDQN(Resumable):
 
 def descend(
     loss: Tensor,
-    network: nn.Module,
     optimiser: Adam,
     owner: str,
     where: str,
     largest: float = math.inf,
 ) -> None:
-    """Spec G3: a step of ``optimiser`` down a loss, with the network's gradients cut to the norm ``largest``.
+    """Spec G3: a step of ``optimiser`` down a loss, with its weights' gradients cut to the norm ``largest``.
 
     A loss or gradient with NaN or Inf is a ``NumericalError`` that names ``owner`` and ``where``; the weights stay.
     """
     if not torch.isfinite(loss):
         raise NumericalError(f"the loss of {owner} is {float(loss.detach())} {where}")
-    network.zero_grad()
+    optimiser.zero_grad()
     loss.backward()
-    norm = clip_grad_norm_(network.parameters(), largest)
+    norm = clip_grad_norm_(optimiser.weights, largest)
     if not torch.isfinite(norm):
         raise NumericalError(f"a gradient of {owner} is {float(norm)} {where}")
     optimiser.step()

@@ -171,14 +171,7 @@ class MetaPolicy(Chooser):
                 loss = loss + VALUE_WEIGHT * (out[:, -1] - goals[pick]).square().mean()
                 loss = loss - ENTROPY_WEIGHT * entropy.mean()
                 where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"
-                descend(
-                    loss,
-                    self.policy,
-                    self.optimiser,
-                    "the meta-policy",
-                    where,
-                    GRADIENT_NORM,
-                )
+                descend(loss, self.optimiser, "the meta-policy", where, GRADIENT_NORM)
         self.updates += 1
         return {"value": float(values.mean())}
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 import numpy as np
 
 from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
+from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
-from hypogoal.options.parts import Part, load_part
+from hypogoal.options.parts import Part
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -116,4 +117,4 @@ class EvenChooser(RandomChooser):
 
 def load_chooser(name: str) -> type[Chooser]:
     """The class that the setting ``chooser`` names; a ``UserError`` where it names none."""
-    return load_part(name, "chooser", Chooser, CHOOSERS)  # type: ignore[type-abstract]
+    return load_class(name, "chooser", Chooser, CHOOSERS)  # type: ignore[type-abstract]

@@ -253,15 +253,8 @@ class PaperLearner(Learner):
         following = np.where(length[:, None] < most, now, shifted)
         lengths = torch.from_numpy(length)
         later_lengths = torch.from_numpy(np.minimum(length + 1, most))
-        images, places = self._seen(
-            np.stack(
-                [
-                    now,
-                    following,
-                ]
-            )
-        )  # each image once; BatchNorm counts it once (DEV-51)
-        before, after = places
+        both = np.stack([now, following])
+        images, (before, after) = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
         online, target = member.online.train(), member.target
         features = online.see(images)
         values = online(features, before, lengths)

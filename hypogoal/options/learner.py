@@ -11,12 +11,13 @@ from torch import Tensor
 
 from hypogoal.core.arrays import Bools, Columns, Doubles, Floats, Ints
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
-from hypogoal.options.parts import Part, answer_of, load_part, saved_row
+from hypogoal.options.parts import Part, answer_of, saved_row
 from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.termination import ORACLE, Terminations
 
@@ -151,7 +152,7 @@ class Learner(Part, ABC):
 
 def load_learner(name: str) -> type[Learner]:
     """The class that the setting ``network`` names; a ``UserError`` where it names none."""
-    return load_part(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]
+    return load_class(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]
 
 
 def make_policies(

@@ -103,8 +103,8 @@ class LightLearner(Learner):
         )
         rows = self.ahead.add(steps, moved.ended)
         self.replay.add(rows)
-        inside, reached = self._judged(rows)
-        for row, option in zip(*np.nonzero(reached & ~inside), strict=True):
+        learns, reached = self._judged(rows)
+        for row, option in zip(*np.nonzero(learns & reached), strict=True):
             self.positive.put((option, self.positives[option] % POSITIVES_KEPT), rows.at(row))
             self.positives[option] += 1
         self.count(moved.options)
@@ -112,16 +112,16 @@ class LightLearner(Learner):
         self.due += len(moved.ids)
 
     def _judged(self, rows: Lessons) -> tuple[Bools, Bools]:
-        """Which options' sub-goals hold in ``state`` and in ``next_state`` of transitions, bool (m, O) each.
+        """Which options learn from transitions, and which sub-goals hold where these lead to, bool (m, O) each.
 
-        With own experience, False for all options but the one that was running.
+        None learns from a state inside its sub-goal. With own experience both are of the option that was running alone.
         """
         if not self.running_only:
-            return self.terminations.of(rows.state), self.terminations.of(rows.next_state)
+            return ~self.terminations.of(rows.state), self.terminations.of(rows.next_state)
         owner = rows.option[:, None] == np.arange(self.options)
         inside = self.terminations.of_running(rows.state, rows.option)
         reached = self.terminations.of_running(rows.next_state, rows.option)
-        return owner & inside[:, None], owner & reached[:, None]
+        return owner & ~inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
         if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
@@ -135,10 +135,7 @@ class LightLearner(Learner):
     def _update(self) -> float:
         """One update of all policies; returns the loss."""
         lessons, indices, weights = self._batch()
-        inside, reached = self._judged(lessons)
-        learns = ~inside
-        if self.running_only:
-            learns &= lessons.option[:, None] == np.arange(self.options)
+        learns, reached = self._judged(lessons)
         batch = ReplayBatch(
             lessons.action,
             lessons.steps,

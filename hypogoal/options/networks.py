@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
-from hypogoal.observations import PICTURE, Standard, standardised
+from hypogoal.observations import NUMBERS, PICTURE, Standard, standardised
 
 CELL = 8  # pixels
 WIDTH = 128  # of dense layers
@@ -128,7 +128,7 @@ class OwnEmbedding(FullView):
         observation_shape: tuple[int, ...],
         standard: Standard | None = None,
     ):
-        super().__init__(observation_shape, standard)
+        super().__init__(observation_shape, NUMBERS if standard else PICTURE, standard)
         network = build_network(name, observation_shape, None)
         last = network[-1]
         assert isinstance(last, nn.Linear)
@@ -153,7 +153,7 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
     if name != AUTO:
         return OwnEmbedding(name, observation_shape, standard)
     if standard is not None:
-        return NumberEmbedding(observation_shape, standard)
+        return NumberEmbedding(observation_shape, NUMBERS, standard)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -58,20 +56,3 @@ def saved_row(weights: Mapping[str, Tensor], name: str, options: int, dtype: Any
         fault = f"the weights do not fit the manifest (at {name})"
         raise UserError(fault, f"{options} options", AGAIN)
     return row.numpy().copy()
-
-
-Kind = TypeVar("Kind", bound=Part)
-
-
-def load_part(name: str, kind: str, base: type[Kind], built_in: Mapping[str, str]) -> type[Kind]:
-    """The subclass of ``base`` called ``name``: built-in, or ``module:Class``.
-
-    Anything else, and code that the user did not allow, is a ``UserError`` that says which ``kind`` of part is meant.
-    """
-    part = load(name, kind, "", built_in)
-    do = f"Give a subclass of {base.__module__}.{base.__name__}."
-    if not (inspect.isclass(part) and issubclass(part, base)):
-        raise UserError(f"this is no {kind}", name, do)
-    if missing := sorted(getattr(part, "__abstractmethods__", ())):
-        raise UserError(f"this {kind} lacks {', '.join(missing)}", name, do)
-    return part

@@ -14,7 +14,6 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.data import create_hdf5
 from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import LAST, EpisodeRecorder
-from hypogoal.observations import Observations
 from hypogoal.options.choosers import Outcome
 from hypogoal.options.tables import ChoiceCounts, Episodes, Executions, Exploits
 
@@ -38,18 +37,17 @@ class Execution(NamedTuple):
 class Recorder(Resumable):
     """Counts choices per ``WINDOW`` of steps, lists episodes, keeps the last executions and stops of each of O options.
 
-    Of an engine that forgets states, stops are kept as pictures.
+    Stops are states, of an engine that forgets these their pictures.
     """
 
-    CHANGING = ("episodes", "choices", "stops", "executions", "pictures", "paths", "counts", "counted_from")
+    CHANGING = ("episodes", "choices", "stops", "executions", "paths", "counts", "counted_from")
 
     def __init__(self, options: int, engine: Engine):
         self.options, self.engine = options, engine
         self.episodes = EpisodeRecorder(engine.count)
         self.choices: list[tuple[float, ...]] = []
-        self.stops: list[deque[int]] = latest(options, STOPS_KEPT)
+        self.stops: list[deque[Any]] = latest(options, STOPS_KEPT)
         self.executions: list[deque[Execution]] = latest(options, LAST)
-        self.pictures: list[deque[Observations]] = latest(options, STOPS_KEPT)
         self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # states that running executions came to
         self.counts = np.zeros((options, 5))  # in the window: offered, chosen, expected, reached, duration
         self.counted_from = 0  # the step at which the window began
@@ -110,10 +108,10 @@ class Recorder(Resumable):
             self.paths[environment] = []
             if not run.reached:
                 continue
-            self.stops[run.option].append(run.states[-1])
+            stop: Any = run.states[-1]
             if self.engine.memory is not None:
-                [picture] = self.engine.images(np.array(run.states[-1:]))
-                self.pictures[run.option].append(picture)
+                [stop] = self.engine.images(np.array([stop]))
+            self.stops[run.option].append(stop)
 
     def recent(self, *, restarted: bool) -> dict[str, float]:
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
@@ -150,8 +148,9 @@ class Recorder(Resumable):
         with create_hdf5(folder / "terminations.h5") as file:
             for option, stops in enumerate(self.stops):
                 if stops:
-                    kept = self.pictures[option]
-                    states = np.stack(kept) if kept else self.engine.images(np.array(stops))
+                    states = np.array(stops)
+                    if self.engine.memory is None:
+                        states = self.engine.images(states)
                     file.create_dataset(
                         str(option),
                         data=states,
@@ -162,13 +161,7 @@ class Recorder(Resumable):
     def write_executions(
         self,
         folder: Path,
-        distances: Callable[
-            [
-                Ints,
-                Ints,
-            ],
-            Ints,
-        ],
+        distances: Callable[[Ints, Ints], Ints],
     ) -> None:
         """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
 

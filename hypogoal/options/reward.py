@@ -165,7 +165,7 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Like the environment's own; nothing is paid."""
         observation, info = self.env.reset(**kwargs)
         self._age = self._negatives = 0
-        inside = self._positive(self._log_odds(observation))
+        [inside] = self.reward.holds(self._reader.read(observation)[None]).tolist()
         if inside:
             self._meet_start_inside()
         self._pays = not inside or self.start == "paid"
@@ -174,13 +174,14 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step with reward and end changed."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        log_odds = self._log_odds(observation)
+        [log_odds] = self.reward.ensemble.log_odds(self._reader.read(observation)[None])
         members = np.arange(len(log_odds))
         reached = self._rule.reached(log_odds, members, np.full_like(members, self._age))
         self._age += 1
         [predicted] = self.reward.decide(reached[None]).tolist()
         if not self._pays:
-            self._negatives = 0 if self._positive(log_odds) else self._negatives + 1
+            [positive] = self.reward.decide(self._rule.positive(log_odds)[None]).tolist()
+            self._negatives = 0 if positive else self._negatives + 1
             self._pays = self._negatives >= self.away
         holds = predicted and self._pays
         of_sub_goal = self.scale if holds else 0.0
@@ -188,17 +189,6 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         terminated = bool(terminated) or (holds and self.ends)
         shown = {"predicted": predicted, "paid": of_sub_goal}
         return observation, paid, terminated, truncated, info | {"subgoal": shown}
-
-    def _log_odds(self, observation: Any) -> Floats:
-        """Of each member, float32 (K,)."""
-        seen = self._reader.read(observation)[None]
-        [log_odds] = self.reward.ensemble.log_odds(seen)
-        return log_odds
-
-    def _positive(self, log_odds: Floats) -> bool:
-        """The prediction of one state, whatever the rule says of executions."""
-        [positive] = self.reward.decide(self._rule.positive(log_odds)[None]).tolist()
-        return bool(positive)
 
     def _meet_start_inside(self) -> None:
         fault = "an episode begins where the sub-goal's prediction is positive"

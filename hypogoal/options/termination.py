@@ -19,11 +19,12 @@ import numpy as np
 import torch
 
 from hypogoal.core.arrays import Bools, Floats, Ints, tensor
+from hypogoal.core.own_code import load_class
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.options.parts import Part, load_part, saved_row
+from hypogoal.options.parts import Part, saved_row
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
 ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
@@ -58,19 +59,9 @@ class Terminations(Part):
         self.classify = classify
         self.classify_one = classify_one
         self.options = options
-        self.thresholds = (
-            np.zeros(
-                options,
-                np.float32,
-            )
-            if thresholds is None
-            else thresholds
-        )
+        self.thresholds = np.zeros(options, np.float32) if thresholds is None else thresholds
         self.environments = environments
-        self.judged = np.zeros(
-            (0, options),
-            np.float32,
-        )  # log-odds of states by id; NaN: not judged yet
+        self.judged = np.zeros((0, options), np.float32)  # log-odds of states by id; NaN: not judged yet
 
     def reached(
         self,
@@ -144,11 +135,7 @@ class Terminations(Part):
         missing = ids.max(initial=-1) + 1 - size
         if missing > 0:
             more = max(missing, size, 1024)
-            self.judged = np.pad(
-                self.judged,
-                ((0, more), (0, 0)),
-                constant_values=np.nan,
-            )
+            self.judged = np.pad(self.judged, ((0, more), (0, 0)), constant_values=np.nan)
 
 
 RULES = {"learned": f"{__name__}:Terminations"}
@@ -156,7 +143,7 @@ RULES = {"learned": f"{__name__}:Terminations"}
 
 def load_rule(name: str) -> type[Terminations]:
     """The class that the setting ``termination`` names; a ``UserError`` where it names none."""
-    return load_part(name, "termination rule", Terminations, RULES)
+    return load_class(name, "termination rule", Terminations, RULES)
 
 
 def saved_terminations(termination: str, weights: Mapping[str, torch.Tensor], options: int) -> Terminations:

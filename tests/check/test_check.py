@@ -236,7 +236,7 @@ NETWORK_FAULTS = [
     (lambda channels: convolution(kind=Detached), "gradients", "0.0.weight gets no gradient"),
     (lambda channels: convolution(nn.Softmax(0)), "answers", "among others differ"),
     (lambda channels: convolution(Lost()), "answers", "probabilities are not finite"),
-    (lambda channels: convolution().double(), "logits", "the network takes no such input: Input type"),
+    (lambda channels: convolution().double(), "logits", "observation shape (64, 64, 3): Input type"),
 ]
 
 

@@ -138,7 +138,7 @@ def broken(observation_shape: tuple[int, ...]) -> nn.Module:
 def test_an_encoder_that_makes_no_features_of_each_state_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G2."""
     monkeypatch.setenv("HYPOGOAL_TRUST", "1")
-    with pytest.raises(UserError, match="the network is an encoder that makes"):
+    with pytest.raises(UserError, match="the network makes torch"):
         build_network("test_encoders:broken", (16, 16, 3), torch.Generator())
 
 

@@ -60,7 +60,7 @@ def test_autocast_around_changes_nothing() -> None:
 
 def config_of(members: int = 3) -> dict[str, object]:
     """Of an artefact."""
-    kind = {"network": "doorkey", "observation_shape": SHAPE, "observation_dtype": "uint8"}
+    kind = {"network": "doorkey", "view": "full", "observation_shape": SHAPE, "observation_dtype": "uint8"}
     return {"sub_goals": ["goal"], "members": members, **kind}
 
 

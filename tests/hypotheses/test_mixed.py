@@ -17,7 +17,7 @@ import hypogoal
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.hypotheses.networks import as_input, build_network, inputs_of, network_for
-from hypogoal.hypotheses.views import full_view
+from hypogoal.hypotheses.views import FullView, StateOrigins
 from hypogoal.observations import packed, type_of, type_text
 from tests.mixed import FRONT, GOAL, STATE, WRIST, DoorEnv, arrays, states
 
@@ -65,7 +65,8 @@ def test_a_network_sees_what_the_keys_hold() -> None:
         torch.testing.assert_close(inputs[:, first : first + own.shape[1]], own, rtol=0, atol=0)
         one = inputs_of(mixed[3:4])
         torch.testing.assert_close(one, inputs[3:4], rtol=0, atol=0)
-    view = full_view(mixed)
+    view = FullView((), mixed.dtype)
+    view.fit(mixed, mixed[:0], StateOrigins(), 0)
     np.testing.assert_allclose(view.see(mixed)["state"].mean(0), 0, atol=1e-5)
     np.testing.assert_array_equal(view.see(mixed)["front"], seen["front"])
 

@@ -53,7 +53,7 @@ def double_batch(images: NDArray[np.uint8], network: nn.Sequential, *groups: NDA
     """A batch in double precision."""
     batch = patches.take(patches._tables(images, patches.windows_of(network) or []), *groups)
     shares = [[(share.double(), places) for share, places in level] for level in batch.shares]
-    return dataclasses.replace(batch, first=batch.first.double(), shares=shares)
+    return dataclasses.replace(batch, colours=batch.colours.double(), shares=shares)
 
 
 def plain_or_not(network: nn.Sequential, images: NDArray[np.uint8], counted: bool) -> torch.Tensor:

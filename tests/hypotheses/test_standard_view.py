@@ -37,11 +37,11 @@ def test_members_learn_numbers_of_any_size_and_shape(shape: tuple[int, ...], tmp
     assert ((ensemble.predictions(seen) == labels[:, None]).mean(0) > 0.93).all()
     np.testing.assert_array_equal(ensemble.predict(seen.astype(np.float64)), ensemble.predict(seen))
     write_ensemble(tmp_path, "up", ensemble)
-    about = {"sub_goals": ["up"], "network": "mlp", "members": 2, "observation_shape": list(shape)}
+    about = {"sub_goals": ["up"], "network": "mlp", "members": 2, "observation_shape": list(shape), "view": "full"}
     again = read_ensemble(tmp_path, {**about, "observation_dtype": "float32"}, "up")
     np.testing.assert_array_equal(again.predict(seen), ensemble.predict(seen))
     with pytest.raises(UserError, match="the weights do not fit"):
-        read_ensemble(tmp_path, {**about, "observation_dtype": "uint8", "view": "full"}, "up")
+        read_ensemble(tmp_path, {**about, "observation_dtype": "uint8"}, "up")
     with pytest.raises(UserError, match=r"Give float32 \(N, "):
         ensemble.predict(seen.astype(np.uint8))
 

@@ -96,7 +96,7 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
     """Spec F6: the last stops can be drawn although their states are forgotten."""
     engine = LongCorridor(1, memory=5)
     _, recorder = play(engine, [LEFT, LEFT, *[STAY] * 40], [0] * 12)
-    (stop,) = recorder.stops[0]
+    (stop,) = [run.states[-1] for run in recorder.executions[0] if run.reached]
     assert not engine.remembers(np.array([stop])).any()
     with pytest.raises(ValueError, match="forgotten"):
         engine.images(np.array([stop]))

@@ -24,6 +24,7 @@ from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 from hypogoal.learners.config import WorldConfig
+from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.learners.world import make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
@@ -96,9 +97,15 @@ def test_block_convolution_is_a_convolution():
 def test_epsilon_waits_for_the_first_goal():
     """Spec E7, Table 4: 1 -> 0.01 over 8,000 steps from the start; the tuned one falls from its first goal on."""
     paper, tuned = HYPERPARAMETERS["dqn", "paper"], HYPERPARAMETERS["dqn", "tuned"]
-    assert [round(epsilon(paper, step, None), 3) for step in (0, 4_000, 8_000, 9_000)] == [1.0, 0.505, 0.01, 0.01]
-    assert epsilon(tuned, 200_000, None) == 1.0
-    assert epsilon(tuned, 36_000, first_goal=20_000) == pytest.approx(0.525)
+    episodes = EpisodeRecorder(4)
+    for steps, wanted in ((0, 1.0), (4_000, 0.505), (8_000, 0.01), (9_000, 0.01)):
+        episodes.steps = steps
+        assert epsilon(paper, episodes) == pytest.approx(wanted)
+    episodes.steps = 200_000
+    episodes.append((9_000, 50, 0.0, 0, 0))
+    assert epsilon(tuned, episodes) == 1.0
+    episodes += [(184_000, 40, 1.0, 1, 1), (190_000, 40, 1.0, 1, 1)]
+    assert epsilon(tuned, episodes) == pytest.approx(0.525)
 
 
 def test_the_paper_setting_is_the_papers():

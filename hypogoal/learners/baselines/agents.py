@@ -3,7 +3,7 @@
 import contextlib
 import random
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from hypogoal.core.checkpoints import Checkpoints, State, restored, snapshot_of
+from hypogoal.core.checkpoints import Checkpoints, Resumable, State, restored, snapshot_of
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for, seed_for
@@ -22,6 +22,7 @@ from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import CELL, FEATURES, NETWORKS
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.learners.double_dqn import linear_epsilon
+from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE
 
 LOG_INTERVAL = 5_000  # environment steps
@@ -64,10 +65,7 @@ class ExploringDQN(DQN):
 
 
 class Watch(BaseCallback):
-    """Logs every ``LOG_INTERVAL`` steps, stops at NaN, and notes when the first goal was seen.
-
-    Before each rollout the state of all is offered as a checkpoint.
-    """
+    """Logs every ``LOG_INTERVAL`` steps, stops at NaN, and offers a checkpoint of all before each rollout."""
 
     def __init__(
         self,
@@ -78,12 +76,6 @@ class Watch(BaseCallback):
     ):
         super().__init__()
         self.env, self.checkpoints, self.log, self.progress = env, checkpoints, log, progress
-        self.first_goal: int | None = None
-
-    def see(self, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Look for the first goal among episodes, of which those that ended before did not succeed."""
-        if self.first_goal is None:
-            self.first_goal = next((step for step, *_, succeeded in rows if succeeded), None)
 
     def _on_rollout_start(self) -> None:
         self.checkpoints.offer(self.snapshot)
@@ -93,10 +85,9 @@ class Watch(BaseCallback):
         return {"agent": agent_snapshot(self.model, self.env), "log": self.log.snapshot()}
 
     def _on_step(self) -> bool:
-        episodes, count = self.env.episodes, self.env.num_envs
-        self.see(episodes[-count:])
+        episodes = self.env.episodes
         shown = {}
-        if episodes.steps // LOG_INTERVAL > (episodes.steps - count) // LOG_INTERVAL:
+        if episodes.steps // LOG_INTERVAL > (episodes.steps - self.env.num_envs) // LOG_INTERVAL:
             check_finite(self.model, episodes.steps)
             shown = {"success": episodes.recent()["success"] if episodes else 0.0}
             numbers = {name.removeprefix(UPDATED): value for name, value in _updated(self.model).items()}
@@ -196,17 +187,12 @@ def train(
     with own_randomness():
         agent = make_agent(env, chosen, seed, device)
         if isinstance(agent, ExploringDQN) and isinstance(chosen, DQNSettings):
-            agent.exploration_schedule = lambda _: epsilon(
-                chosen,
-                env.episodes.steps,
-                watch.first_goal,
-            )
+            agent.exploration_schedule = lambda _: epsilon(chosen, env.episodes)
             agent.exploration_rate = 1.0
         saved = checkpoints.load()
         log.restore(saved["log"] if saved else 0)
         if saved:
             restore_agent(agent, env, saved["agent"])
-            watch.see(env.episodes)
             progress.resume(min(env.episodes.steps, steps))
         agent.learn(
             steps - agent.num_timesteps,
@@ -225,11 +211,9 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> State:
     two rollouts is written down field by field; within a rollout (under a second) it cannot be interrupted.
     """
     snapshot = {
-        "parts": [snapshot_of(part) for part in _parts(agent)],
+        "parts": [snapshot_of(part) for part in _parts(agent, env)],
         "values": {name: getattr(agent, name) for name in CHANGING if hasattr(agent, name)},
         "updated": _updated(agent),
-        "env": env.snapshot(),
-        "generators": _generators(),
     }
     if isinstance(agent, ExploringDQN):
         buffer: Any = agent.replay_buffer
@@ -241,13 +225,11 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> State:
 
 def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, Any]) -> None:
     """Continue from an ``agent_snapshot`` of such an agent."""
-    for part, saved in zip(_parts(agent), snapshot["parts"], strict=True):
+    for part, saved in zip(_parts(agent, env), snapshot["parts"], strict=True):
         restored(part, saved)
     for name, value in snapshot["values"].items():
         setattr(agent, name, value)
     agent.logger.name_to_value.update(snapshot["updated"])
-    env.restore(snapshot["env"])
-    _set_generators(snapshot["generators"])
     if isinstance(agent, ExploringDQN):
         buffer: Any = agent.replay_buffer
         replay = snapshot["replay"]
@@ -256,9 +238,9 @@ def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, A
             getattr(buffer, name)[: len(values)] = values
 
 
-def _parts(agent: BaseAlgorithm) -> list[Any]:
-    """Networks, optimiser and generators of an agent."""
-    parts = [agent.policy, agent.policy.optimizer, agent.action_space.np_random]
+def _parts(agent: BaseAlgorithm, env: EngineEnv) -> list[Any]:
+    """Networks, optimiser and generators of an agent, and its environments."""
+    parts = [agent.policy, agent.policy.optimizer, agent.action_space.np_random, env, GlobalRandomness()]
     return [*parts, agent.explore_rng] if isinstance(agent, ExploringDQN) else parts
 
 
@@ -268,25 +250,26 @@ def _updated(agent: BaseAlgorithm) -> dict[str, float]:
     return {name: float(value) for name, value in logged.items() if name.startswith(UPDATED)}
 
 
-def _generators() -> dict[str, Any]:
-    """The states of the global generators that the library draws from."""
-    numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002
-    return {"torch": torch.get_rng_state(), "numpy": numpy_state}
+class GlobalRandomness(Resumable):
+    """The global generators that the library draws from."""
 
+    def snapshot(self) -> State:
+        return {"torch": torch.get_rng_state(), "numpy": np.random.get_state(legacy=False)}  # noqa: NPY002
 
-def _set_generators(states: Mapping[str, Any]) -> None:
-    torch.set_rng_state(states["torch"])
-    np.random.set_state(states["numpy"])  # noqa: NPY002
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        torch.set_rng_state(snapshot["torch"])
+        np.random.set_state(snapshot["numpy"])  # noqa: NPY002
 
 
 @contextlib.contextmanager
 def own_randomness() -> Iterator[None]:
     """Lend stable-baselines3 the global generators, which it seeds, and put them back afterwards."""
-    before, python = _generators(), random.getstate()
+    lent, python = GlobalRandomness(), random.getstate()
+    before = lent.snapshot()
     try:
         yield
     finally:
-        _set_generators(before)
+        lent.restore(before)
         random.setstate(python)
 
 
@@ -296,8 +279,9 @@ def weights(agent: BaseAlgorithm) -> dict[str, Tensor]:
     return {name: weight.detach() for name, weight in named if not name.startswith("q_net_target.")}
 
 
-def epsilon(chosen: DQNSettings, step: int, first_goal: int | None) -> float:
-    """Table 4: exploration at ``step``: from 1 to the final value, linearly, from the start or the first goal on."""
+def epsilon(chosen: DQNSettings, episodes: EpisodeRecorder) -> float:
+    """Table 4: exploration falls from 1 to the final value, linearly, from the start or the first goal on."""
+    step = episodes.steps
     if chosen.epsilon_from == "first-goal":
-        step -= step if first_goal is None else first_goal
+        step -= next((end for end, *_, succeeded in episodes if succeeded), step)
     return float(linear_epsilon(step, chosen.epsilon_steps, chosen.epsilon_final))
