@@ -165,7 +165,8 @@ def _join(pieces: Sequence[Ids], bound: int) -> tuple[Ids, Ids]:
         pairs = ids.astype(np.int64) * bound + piece
         ids, distinct = _rank(pairs, len(tuples) * bound)
         before, last = np.divmod(distinct, bound)
-        tuples = np.column_stack([tuples[before], last.astype(np.int32)])
+        joined = last.astype(np.int32)
+        tuples = np.column_stack([tuples[before], joined])
     return ids, tuples
 
 
@@ -210,7 +211,8 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
             rows = level.lines[images]
             ids = level.rows[rows]
             ranks, occurring = _rank(ids, len(level.parts))
-            share = np.bincount(ranks.ravel()) / ids.size
+            counts = np.bincount(ranks.ravel())
+            share = counts / ids.size
             of_group = torch.from_numpy(share.astype(np.float32))
             shares[number].append((of_group[None], ids.size))
             below = _positions(level.parts[occurring], used)
@@ -297,7 +299,8 @@ def _batch_norm(
         return torch.addcmul(layer.bias - layer.running_mean * scale, rows, scale)
     sizes = [share.shape[1] for share, _ in shares]
     normed = []
-    for number, group in enumerate(rows.split(sizes)):
+    groups = rows.split(sizes)
+    for number, group in enumerate(groups):
         share, places = shares[number]
         mean = share @ group
         centred = group - mean

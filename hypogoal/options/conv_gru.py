@@ -206,7 +206,8 @@ class PaperLearner(Learner):
             images, places = self._seen(self.windows[rows])
             lengths = torch.from_numpy(self.lengths[rows])
             values = network(network.see(images), places, lengths)
-            chosen[rows] = values.argmax(1).cpu().numpy()
+            preferred = values.argmax(1)
+            chosen[rows] = preferred.cpu().numpy()
         return chosen
 
     def _seen(self, windows: Ints) -> tuple[Tensor, Tensor]:
@@ -254,13 +255,15 @@ class PaperLearner(Learner):
         lengths = torch.from_numpy(length)
         later_lengths = torch.from_numpy(np.minimum(length + 1, most))
         both = np.stack([now, following])
-        images, (before, after) = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
+        images, places = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
+        before, after = places
         online, target = member.online.train(), member.target
         features = online.see(images)
         values = online(features, before, lengths)
         with torch.no_grad():
             next_online = online(features, after, later_lengths)
-            next_target = target(target.see(images), after, later_lengths)
+            target_features = target.see(images)
+            next_target = target(target_features, after, later_lengths)
 
         next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]
