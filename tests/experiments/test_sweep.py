@@ -123,7 +123,7 @@ def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: p
     """As where an emulator ends with a segmentation fault: said in a line, and the same bytes."""
     monkeypatch.setenv("HYPOGOAL_CHECKPOINT_SECONDS", "0")
     toy, out = tmp_path / "toy.toml", tmp_path / "out"
-    toy.write_text((whole / "toy.toml").read_text().replace("steps=20", "steps=300"))
+    toy.write_text((whole / "toy.toml").read_text().replace("steps=20", "steps=80"))
     cells, _ = plan(str(toy), out, seeds="0")
     chain = cells[:2]
     said: list[str] = []
@@ -141,7 +141,7 @@ def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: p
     assert said[-2:] == ["ensemble/seed-0 ...; 0 to come", "ensemble/seed-0 done"]
     assert any(re.match(r"ensemble/seed-0 crashed \(signal (6|11)\): it goes on", line) for line in said)
     unbroken = tmp_path / "unbroken"
-    run("train-ensemble", out / "data.h5", "--out", unbroken, "-q", *SMALL.replace("20", "300").split(), "--seed", "0")
+    run("train-ensemble", out / "data.h5", "--out", unbroken, "-q", *SMALL.replace("20", "80").split(), "--seed", "0")
     name = "right-room.safetensors"
     assert (out / "ensemble/seed-0" / name).read_bytes() == (unbroken / name).read_bytes()
 

@@ -67,6 +67,6 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
         chooser = EvenChooser(rng_for(0, "choice"), 2)
     elif chooser_name != "random":
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
-        meta = MetaConfig(head=head, decisions=16, meta_batch=8)
+        meta = MetaConfig(head=head, decisions=8, meta_batch=4)
         chooser = MetaPolicy(engine, 2, meta, 2, device)
     return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, engine), config, gamma=0.9)

@@ -6,13 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_line import refuses
 from corridor import LongCorridor
 from toy_data import untrained
 
+import hypogoal
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Domain
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
@@ -134,13 +137,31 @@ def test_options_on_a_ladder(tmp_path: Path) -> None:
     assert all(reached)
 
 
-@pytest.mark.atari
 def test_a_baseline_begins_where_it_is_told(tmp_path: Path) -> None:
-    """Spec E7, I4: in a new game, in room 1 from step 0 on; an unknown start leaves nothing behind."""
-    few = {"agent": "ppo", "setting": "paper", "steps": 200, "start": "game", "max_episode_steps": 50, "quiet": True}
-    train_baseline("montezuma", tmp_path / "ppo", **few)
-    layout = json.loads((tmp_path / "ppo" / "layout.json").read_text())
-    assert layout["start"] == "game"
+    """Spec E7, I4: an unknown start leaves nothing behind."""
+    few = {"agent": "ppo", "steps": 128, "max_episode_steps": 20, "quiet": True}
+    train_baseline(DOMAIN.name, tmp_path / "ppo", start="left", **few)
+    assert json.loads((tmp_path / "ppo" / "layout.json").read_text())["start"] == "left"
     with pytest.raises(UserError, match="unknown start: nowhere"):
-        train_baseline("montezuma", tmp_path / "none", **(few | {"start": "nowhere"}))
+        train_baseline(DOMAIN.name, tmp_path / "none", start="nowhere", **few)
     assert not (tmp_path / "none").exists()
+
+
+def test_options_go_on_elsewhere(tmp_path: Path) -> None:
+    """Options learned from one start go on from another; what is loaded plays as they do."""
+    ensemble, near, far = (tmp_path / name for name in ("ensemble", "near", "far"))
+    untrained(ensemble, DOMAIN, network="mlp")
+    few = {"termination": "learned", "steps": 100}
+    train(ensemble, near, start="middle", **few)
+    # So long a warm-up that nothing is learned: the options as they are.
+    few |= {"start": "left", "warm_up": 10**6, "options": near}
+    train(ensemble, far, **few)
+    weights, later = (load_tensors(folder / "options.safetensors") for folder in (near, far))
+    assert all(torch.equal(value, later[name]) for name, value in weights.items() if name.startswith("online."))
+    assert (later["option_steps"] > weights["option_steps"]).all()
+    assert open_artefact(far).config["start"] == "left"
+    picture = LongCorridor(1).images(np.zeros(1, np.int64))[0]
+    assert 0 <= hypogoal.load_options(far).policies(1)(picture) < LongCorridor.n_actions
+    another = untrained(tmp_path / "another", DOMAIN, network="mlp", seed=1)
+    with pytest.raises(UserError, match="trained with another ensemble"):
+        train(another, tmp_path / "other", **few)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from breaking import Breaking, Broken
+from corridor import Corridor
 from gymnasium import spaces
-from own_domain import TallCorridor
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints
@@ -31,6 +31,12 @@ from hypogoal.stages.train_baseline import train_baseline
 EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 2_000, ("ppo", "tuned"): 3_000, ("dqn", "tuned"): 3_000}
 
 
+class Low(Corridor):
+    """In pictures that three convolutions take."""
+
+    observation_shape = (32, 64, 3)
+
+
 def learn(env, chosen, steps, folder, kept=None):
     """A trained agent."""
     log, progress = MetricsLog(folder / "metrics.jsonl"), Progress("", steps, quiet=True)
@@ -41,10 +47,10 @@ def learn(env, chosen, steps, folder, kept=None):
 def test_solves_an_easy_task(agent, setting, tmp_path):
     """Spec E7: every baseline, in either setting, learns a corridor that random play rarely finishes in time."""
     chosen = HYPERPARAMETERS[agent, setting]
-    env = EngineEnv(TallCorridor(chosen.environments, max_steps=4))
+    env = EngineEnv(Low(chosen.environments, max_steps=4))
     trained = learn(env, chosen, EASY_STEPS[agent, setting], tmp_path)
     assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.5
-    trial = EngineEnv(TallCorridor(1))
+    trial = EngineEnv(Low(1))
     observation: Any = trial.reset()
     while not trial.episodes:
         observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
@@ -53,7 +59,7 @@ def test_solves_an_easy_task(agent, setting, tmp_path):
 
 def test_a_time_limit_is_not_a_terminal_state():
     """Spec E7, D2: a cut episode is told to the agent as truncated, with the state it was cut in; the goal is not."""
-    corridor = TallCorridor(2, max_steps=3)
+    corridor = Low(2, max_steps=3)
     env = EngineEnv(corridor)
     env.reset()
     for _ in range(2):
@@ -141,7 +147,7 @@ def test_global_randomness_is_given_back(tmp_path):
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    learn(EngineEnv(TallCorridor(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
+    learn(EngineEnv(Low(4)), HYPERPARAMETERS["ppo", "paper"], 100, tmp_path)
     assert torch.rand(1) == expected
 
 
