@@ -95,7 +95,7 @@ def decisions(options: list[int], offered: list[list[int]], count: int) -> Choic
 def test_choices_by_hand() -> None:
     """Two sub-goals of two members: 60 decisions for the first, 45 of them for the better; one choice is none."""
     quality = np.array([0.9, 0.1, 0.5, 0.6])
-    judged = judge(decisions([0] * 45 + [1] * 15 + [2] * 9, [[0, 1, 2]] * 60 + [[2, 0]] * 9, 4), quality, 2)
+    judged = judge(decisions([0] * 45 + [1] * 15 + [2] * 30, [[0, 1, 2]] * 60 + [[2, 0]] * 30, 4), quality, 2)
     assert judged["preference"][:2].tolist() == [1.5, 0.5]
     assert np.isnan(judged["preference"][2:]).all()
     assert judged["within_rho"] == pytest.approx(1.0)

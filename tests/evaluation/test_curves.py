@@ -66,7 +66,8 @@ def test_what_does_not_succeed_is_no_success():
     """Spec F5: whatever its reward, and whether it terminated; a hundred without success solve nothing."""
     terminated, succeeded = np.array([1, 1, 1, 1, 0], dtype=bool), np.array([0, 0, 1, 0, 0], dtype=bool)
     run = Episodes(np.arange(1, 6), np.full(5, 10), np.array([0.0, 0, 1, -1, 1]), terminated, succeeded)
-    assert run_numbers(run, None)["success"] == 0.2
+    numbers = run_numbers(run, None)
+    assert (numbers["success"], numbers["ended"], numbers["cut"]) == (0.2, 0.6, 0.2)
     none = np.zeros(100, dtype=bool)
     hundred = Episodes(np.arange(1, 101), np.full(100, 10), np.zeros(100), ~none, none)
     assert math.isnan(run_numbers(hundred, None)["steps_to_95"])

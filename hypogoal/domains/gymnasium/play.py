@@ -136,7 +136,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
         observations, labels, origins = zip(*met, strict=True)
         named = dict(zip(ORIGINS, np.transpose(origins), strict=True))
         states = States(
-            np.array(observations, reader.dtype),
+            np.array([*observations], reader.dtype),  # a tuple would be one mixed observation
             np.array(labels),
             named,
         )
