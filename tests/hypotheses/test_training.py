@@ -163,7 +163,7 @@ def test_a_look_leaves_no_trace(schedule: str) -> None:
         (0.0, "none", True, False),
         (0.5, "dbat", False, False),
         (0.5, "none", False, True),
-        (0.0, "dbat", False, True),
+        (0.5, "dbat", False, True),
     ],
 )
 def test_batchnorm_sees_unlabelled_states_whatever_the_diversity(
