@@ -125,8 +125,13 @@ def write(folder: Path, results: Results, every: list[Context]) -> None:
 
 def summary(results: Results, every: list[Context]) -> Group:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
-    open_ones = [context for context in every if not context["folded"]]
-    tables = [page.terminal(context["title"], page.words_of(context).shown) for context in open_ones]
+    tables = []
+    for context in every:
+        if context["folded"]:
+            continue
+        shown = page.words_of(context).shown
+        if not shown.empty:  # such as the layouts of a run without agents
+            tables.append(page.terminal(context["title"], shown))
     lines = Table.grid()
     lines.width = page.WIDTH
     if results.facts["missing"]:
