@@ -13,7 +13,7 @@ from PIL import Image
 from torch import nn
 
 from hypogoal.data import Collected, States, write_dataset
-from hypogoal.evaluation.attributing import look, pick_for_gallery, pick_to_explain
+from hypogoal.evaluation.attributing import look, outcomes, pick_for_gallery, pick_to_explain
 from hypogoal.evaluation.house import joined
 from hypogoal.evaluation.judging import Judged, Judgement, Work
 from hypogoal.evaluation.pictures import attribution_image, coloured, encoded, last_frame, overlay
@@ -33,6 +33,13 @@ def test_states_on_which_members_disagree_or_err_come_first():
     assert {500, 501} == set(pick[0][:2].tolist()) and len(set(pick[0].tolist())) == 12
     assert np.bincount(rooms[pick[0]], minlength=4).min() >= 2
     assert labels[pick[0]].sum() == 6, "labels take turns"
+
+
+def test_outcomes_by_hand() -> None:
+    """Spec F7: the filters of the gallery, of three members."""
+    labels = np.array([True, True, True, False])
+    predictions = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0], [1, 1, 0]], dtype=np.bool_)
+    assert outcomes(predictions, labels).tolist() == ["all right", "disagree", "all wrong", "disagree"]
 
 
 def test_what_is_drawn_of_a_state():
