@@ -109,6 +109,9 @@ def test_what_nobody_knows_is_left_out() -> None:
     assert math.isnan(judged["pair"])
     assert math.isnan(judged["score"])
     assert math.isnan(judged["within_rho"])
+    chosen_too = decisions([0] * 40 + [1] * 10, [[0, 1, 2]] * 50, 3)
+    judged = judge(chosen_too, np.array([0.9, math.nan, 0.1]), 3)
+    assert judged["score"] == pytest.approx(1), "of the forty decisions for a member that is known"
 
 
 @pytest.mark.parametrize("hundredths", range(0, 81, 4))
