@@ -107,11 +107,12 @@ class MontezumaEngine(TurnEngine):
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
         rows = snapshot["stacks"].tolist()
         stacks = [itemgetter(*numbers)(frames) for numbers in rows]
+        kept = stacks[: -self.count]
+        playing = stacks[-self.count :]
         starts = range(len(self.starts))
         latest = range(self.oldest, self.n_states)
-        self._seen = dict(zip([*starts, *latest], stacks, strict=False))
+        self._seen = dict(zip([*starts, *latest], kept, strict=True))
         states = snapshot["states"]
-        playing = stacks[-self.count :]
         for emulator, saved, seen in zip(self._emulators, states, playing, strict=True):
             state = ALEState(saved.tobytes())
             start = game.Snapshot(state, seen)
