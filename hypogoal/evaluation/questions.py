@@ -65,10 +65,10 @@ def answers(results: Results) -> list[Context]:
 
 def context_of(question: ModuleType, results: Results) -> Context | None:
     """What a question's template is given; None where the run has nothing of it."""
-    answer_to = question.context(results)
-    if not answer_to:
+    parts = question.context(results)
+    if not parts:
         return None
-    compared = answer_to.get("compared", pd.DataFrame())
+    compared = parts.get("compared", pd.DataFrame())
     return {
         "name": name_of(question),
         "title": question.TITLE,
@@ -77,7 +77,7 @@ def context_of(question: ModuleType, results: Results) -> Context | None:
         "table": pd.DataFrame(),
         "pairs": compared if compared.empty else house.pairs(compared),
         "figures": [],
-        **answer_to,
+        **parts,
     }
 
 
