@@ -84,5 +84,7 @@ def _output_of(words: tuple[object, ...]) -> Path | None:
 
 
 def _names_beside(out: Path | None) -> list[Path]:
-    """Everything in the folder that an output is in, drafts too."""
-    return [] if out is None else sorted(out.parent.rglob("*"))
+    """Everything in the folder that an output is in, drafts too, but for what Python keeps of modules."""
+    if out is None:
+        return []
+    return sorted(path for path in out.parent.rglob("*") if "__pycache__" not in path.parts)

@@ -68,8 +68,9 @@ def test_an_option_is_a_setting(tmp_path: Path) -> None:
         ("frobnicate", "See 'hypogoal --help'"),
     ],
 )
-def test_unknown_words_lead_on(command: str, words: str) -> None:
+def test_unknown_words_lead_on(command: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line, code 2: where to read on."""
+    monkeypatch.chdir(tmp_path)
     refuses(words, *command.split())
 
 
