@@ -16,6 +16,7 @@ from hypogoal.core.errors import NumericalError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.learners import episodes
 from hypogoal.meta import training
+from hypogoal.options import recording
 from hypogoal.options.loop import OptionLoop
 
 STEPS, BREAKS = 210, (23, 51)  # environment steps, and the steps of the loop after which it breaks
@@ -34,6 +35,7 @@ def run(case: str, folder: Path, checkpoints: Checkpoints, until: float = 0.0, s
 def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G1: networks, optimisers, replays, choices, episodes, verdicts, generators, log, after two breaks."""
     monkeypatch.setattr(training, "LOG_INTERVAL", 50)
+    monkeypatch.setattr(recording, "WINDOW", 40)  # which begins at another step than the run
     (tmp_path / "unbroken").mkdir()
     (tmp_path / "broken").mkdir()
     unbroken = run(case, tmp_path / "unbroken", Checkpoints(None))

@@ -51,6 +51,13 @@ def test_a_timeout_ends_the_option_but_is_no_terminal_state() -> None:
     assert not outcome.terminated[0] and not outcome.truncated[0]
 
 
+def test_a_task_that_ends_when_time_is_up_was_not_timed_out() -> None:
+    """Spec D1: option left-end pushed right reaches the end of the task at its third step, which is its last."""
+    (last,) = played(script(Corridor(1), 1, option_timeout=3), 3).learner.seen[2:]
+    assert last.terminated.tolist() == last.ended.tolist() == [True]
+    assert last.timed_out.tolist() == last.reached.tolist() == [False]
+
+
 def test_a_cut_episode_is_truncated_not_terminated() -> None:
     """Spec D2: the cap is no terminal state."""
     loop = played(script(Corridor(1, max_steps=1), 0), 1)
