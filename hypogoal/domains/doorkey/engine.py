@@ -197,18 +197,19 @@ class DoorKeyEngine(Engine):
         return following
 
     def _changed(self, site: int, action: int) -> int:
-        """The configuration after ``pickup``, ``drop`` or ``toggle``, possibly unchanged."""
+        """The configuration after an action that ``MAY_CHANGE`` it: it picks up a key, drops one or toggles the door."""
         configuration, pose = divmod(site, POSES)
-        front = AHEAD.item(pose)
-        code = self._bare_codes[configuration, front]
         seed, door, *keys = self._configurations[configuration]
-        held = sum(place >= HELD for place in keys)
+        last = max(keys)
+        if action == DROP and last < HELD:  # most drops of a random policy
+            return configuration
+        front = AHEAD.item(pose)
         has_red_key = keys[-1] >= HELD
-        if action == PICKUP and front in keys:
-            keys[keys.index(front)] = HELD + held
-        elif action == DROP and held and code == EMPTY:
-            keys[keys.index(max(keys))] = front
-        elif action == TOGGLE and code >= DOOR:
+        if action == PICKUP:
+            keys[keys.index(front)] = max(HELD, last + 1)
+        elif action == DROP:
+            keys[keys.index(last)] = front
+        elif action == TOGGLE:
             if door == OPEN:
                 door = CLOSED
             elif door == CLOSED or has_red_key:  # once unlocked it never locks again
@@ -383,11 +384,12 @@ class DoorKeyEngine(Engine):
         cell, direction = divmod(pose, 4)
         codes = self._codes[new]
         codes[:] = self._bare_codes[configuration]
-        codes[cell] = AGENT_ON.item(codes.item(cell)) + direction
+        under = codes.item(cell)
+        codes[cell] = AGENT_ON.item(under) + direction
         self._site[new] = site
         self._ahead[new] = configuration * CELLS + AHEAD.item(pose)
-        seed, _, blue, green, _ = self._configurations[configuration]
-        at_goal = cell == layout_of(seed).goal
+        _, _, blue, green, _ = self._configurations[configuration]
+        at_goal = under == GOAL
         self._on_goal[new] = at_goal
         is_wrong = self.harsh and max(blue, green) >= HELD
         self._final[new] = at_goal or is_wrong
