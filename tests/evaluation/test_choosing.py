@@ -3,14 +3,16 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from planted import harsh, planted
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.evaluation.choosing import judge, qualities
+from hypogoal.evaluation.choosing import judge, qualities, with_choosers
 from hypogoal.evaluation.frozen import Choices, play
+from hypogoal.evaluation.names import UNIFORM
 from hypogoal.evaluation.selection import numbers_of_choices
 from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.meta.ppo import MetaPolicy
@@ -182,3 +184,11 @@ def test_counts_by_hand():
     np.testing.assert_allclose(found["preference"], [10 / 30, 50 / 20, np.nan, 1])
     np.testing.assert_allclose(found["chosen"], [10, 50, 0, 10])
     np.testing.assert_allclose(found["duration"], [5, 2, np.nan, 2])
+
+
+def test_uniform_random_choice_stands_beside_the_agent_whose_options_it_has() -> None:
+    """A method has two choosers: its own and the uniform one."""
+    runs = pd.DataFrame({"artefact": ["a", "a", "b"], "method": ["D-BAT", UNIFORM, "one classifier"]})
+    told = with_choosers(runs)
+    assert told["method"].tolist() == ["D-BAT", "D-BAT", "one classifier"]
+    assert told["chooser"].tolist() == ["the agent's", UNIFORM, "the agent's"]

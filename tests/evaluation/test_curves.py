@@ -100,3 +100,5 @@ def test_a_figure_of_lengths_that_are_all_alike_says_nothing() -> None:
     drawn = figures(question, results_of(*rows, more, final, random, **agents))
     assert [each.name for each in drawn] == ["figure6", "figure6-length"]
     assert drawn[0].about["dotted"] == "random_success"
+    scored = row("reward", 7, step=300, **place)
+    assert figures(question, results_of(*rows, scored, final, random, **agents))[0].about["dotted"] == ""

@@ -51,6 +51,8 @@ def test_an_agent_of_one_of_several_ensembles_has_its_name() -> None:
     alike = [configs[0] | {"steps": 1}, configs[0] | {"steps": 2}]
     assert names_apart(["option agent"] * 2, alike) == ["option agent, steps=1", "option agent, steps=2"]
     assert names_apart(["random choice"] * 2, configs)[0] == "random choice, D-BAT, 3 members"
+    both = [configs[0] | {"a": 1}, configs[1] | {"a": 2}]
+    assert names_apart(["option agent"] * 2, both) == ["D-BAT, 3 members, a=1", "one classifier, a=2"]
 
 
 def test_settings_of_the_domain_split_and_n_does_not() -> None:

@@ -11,12 +11,14 @@ import pytest
 from corridor import Corridor
 from option_loops import loop_of
 
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, Layouts
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.frozen import play
-from hypogoal.evaluation.zero_shot import alone, shortest_ways
+from hypogoal.evaluation.names import UNIFORM
+from hypogoal.evaluation.zero_shot import alone, played, shortest_ways
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds
 from hypogoal.meta.setup import Setup, make_engine
 from hypogoal.options.loop import OptionLoop
@@ -119,6 +121,17 @@ def test_a_wrong_member_is_told_from_an_option_that_gets_nowhere() -> None:
     found = [alone(loop, option, option, ways[:, option]) for option in (2, 3, 4)]
     assert [told["success"].mean() for told in found] == [1, 0, 0]
     assert [told["false_positives"].mean() for told in found] == [0, 1, 0]
+
+
+def test_an_agent_and_random_choice_among_its_options_are_played(tiny_run: Path) -> None:
+    """Beside each option alone, whatever its kind; an artefact of options has no choice of its own to play."""
+    every: dict[str, list[Any]] = {}
+    for kind in ("meta", "options"):
+        of_kind = played(open_artefact(tiny_run / kind), (100, 101))
+        every[kind] = [fields for fields, _ in of_kind]
+    alone_in_turn = every["options"]
+    assert [fields["member"] for fields in alone_in_turn] == [0, 1, 0, 1]
+    assert every["meta"] == [{}, {"method": UNIFORM}, *alone_in_turn]
 
 
 def test_the_setting_says_how_many_or_which() -> None:
