@@ -197,7 +197,7 @@ class DoorKeyEngine(Engine):
         return following
 
     def _changed(self, site: int, action: int) -> int:
-        """The configuration after an action that ``MAY_CHANGE`` it: it picks up a key, drops one or toggles the door."""
+        """The configuration after an action that ``MAY_CHANGE`` it: a key picked up or dropped, the door toggled."""
         configuration, pose = divmod(site, POSES)
         seed, door, *keys = self._configurations[configuration]
         last = max(keys)
