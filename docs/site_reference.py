@@ -17,7 +17,7 @@ PYTHON: dict[str, tuple[str | tuple[str, str], ...]] = {
         "hypogoal.stages.evaluate.evaluate",
         "hypogoal.stages.report.report",
         "hypogoal.api.compare",
-        ("hypogoal.made.Made", "metrics, show"),
+        ("hypogoal.look.Made", "metrics, show"),
     ),
     "Loading and playing": (
         "hypogoal.api.load_ensemble",
@@ -100,7 +100,7 @@ def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
     from hypogoal.core.config import TABLES, described
     from hypogoal.domains.base import BUILT_IN, layers_of
-    from hypogoal.experiments.named import config_class_of
+    from hypogoal.experiments.experiment import config_class_of
 
     lines = [
         "# Settings",

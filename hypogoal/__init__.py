@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hypogoal.api import compare, load_ensemble, load_options
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium.domain import GymnasiumDomain
-    from hypogoal.made import Made
+    from hypogoal.look import Made
     from hypogoal.options.env import OptionEnv
     from hypogoal.options.reward import SubgoalReward
     from hypogoal.stages.collect import collect
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _HOMES = {  # where each name is imported from on first use
     "GymnasiumDomain": "domains.gymnasium.domain",
-    "Made": "made",
+    "Made": "look",
     "OptionEnv": "options.env",
     "SubgoalReward": "options.reward",
     "UserError": "core.errors",

@@ -11,7 +11,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.processes import own_settings
 from hypogoal.core.tensors import load_tensors
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
-from hypogoal.made import Made
+from hypogoal.look import Made
 from hypogoal.options.env import Options
 from hypogoal.options.learner import make_policies
 from hypogoal.options.reward import ensemble_at
@@ -19,13 +19,11 @@ from hypogoal.options.termination import saved_terminations
 from hypogoal.stages import Place
 
 
-@own_settings()
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
     """Compare each evaluated run with the first. The result shows which wins, by how much, on what."""
     from hypogoal.tools.compare import compare as compared
 
-    compared([*map(Path, runs)], Path(out), force=force)
-    return Made(out)
+    return compared(runs, out, force=force)
 
 
 @own_settings()

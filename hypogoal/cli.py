@@ -25,9 +25,10 @@ from typer.core import TyperGroup
 from hypogoal import stages
 from hypogoal.core import own_code, processes
 from hypogoal.core.errors import UserError, printable
-from hypogoal.core.terminal import say
+from hypogoal.core.progress import say
+from hypogoal.stages import LOOK, OWN
 
-MAKE, LOOK, OWN = "Make", "Look", "Own data and code"  # groups of commands
+MAKE = "Make"  # a group of commands
 EXPERIMENTS = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
     "module:function."
@@ -271,7 +272,7 @@ def config(
     """List every setting of a stage: default, unit, meaning, source."""
     from hypogoal.core import config as settings
     from hypogoal.domains import base as domains
-    from hypogoal.experiments.named import config_class_of
+    from hypogoal.experiments.experiment import config_class_of
 
     rows = settings.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
     echo(rows, as_json, [settings.as_toml(stage, rows)] if toml else _setting_lines(rows))
@@ -293,96 +294,8 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
             yield from wrapped.wrap(f"{row['meaning']}{allowed}{source}")
 
 
-@command(LOOK, "compare runs/mine runs/other --out runs/both")
-def compare(
-    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Evaluated; each is compared with the first.")],
-    out: stages.Out,
-    force: stages.Force = False,
-) -> None:
-    """Put evaluated runs side by side: what differs, who wins."""
-    from hypogoal import look
-    from hypogoal.tools.compare import compare as compared
-
-    page = compared(runs, out, force=force)
-    say(*look.outcome(look.describe(out)), page)
-
-
-LABEL = "Episodes: a column, last:N frames, FILE.csv, module:function; data file: FILE.csv."
-
-
-def _label(text: str) -> tuple[str, str]:
-    """``NAME=RULE`` as a pair."""
-    name, _, rule = text.partition("=")
-    if not (name and rule):
-        raise UserError("--label needs NAME=RULE", text, "For example --label won=next.success.")
-    return name, rule
-
-
-@command(OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
-def import_(
-    source: Annotated[Path, Argument(help="Arrays, pictures, or episodes (Minari, LeRobot, robomimic, films).")],
-    out: stages.Out,
-    sub_goal: Annotated[
-        list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
-    ] = None,
-    label: Annotated[list[Any] | None, Option(parser=_label, metavar="NAME=RULE", help=LABEL)] = None,
-    key: Annotated[list[str] | None, Option(help="Episodes: which observation to take; repeatable.")] = None,
-    every: Annotated[int, Option(min=1, help="Episodes: take every N-th frame.")] = 1,
-    heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
-    resize: Annotated[int, Option(min=0, help="Most pixels on the longer side of pictures; 0: as many as given.")] = 0,
-    group: Annotated[str, Option(help="Arrays: which one says what states belong together; held out whole.")] = "",
-    stack: Annotated[bool, Option("--stack", metavar="", help="Axes of frames and colours become channels.")] = False,
-    domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
-    seed: stages.Seed = 0,
-    force: stages.Force = False,
-    quiet: stages.Quiet = False,
-) -> None:
-    """Make a data file of your arrays, pictures or recorded episodes."""
-    from hypogoal import look
-    from hypogoal.importing.data_file import import_data
-
-    remarks = import_data(
-        source,
-        out,
-        sub_goals=tuple(sub_goal or ()),
-        rules=dict(label or ()),
-        share=heldout,
-        group=group,
-        domain=domain,
-        seed=seed,
-        force=force,
-        keys=tuple(key or ()),
-        every=every,
-        resize=resize,
-        stack=stack,
-    )
-    say(*(f"hypogoal: {line}" for line in remarks), err=True)
-    if not quiet:
-        details = look.describe(out)
-        say(f"states: {details['observations']}", *look.outcome(details))
-        run_folder = out.parent if out.name == "data.h5" else Path("runs", out.stem)
-        say(f"next: {own_code.command('train-ensemble', out, '--out', run_folder / 'ensemble')}")
-    say(out)
-
-
-@command(OWN, "export runs/mine/ensemble --out mine")
-def export(
-    source: Annotated[Path, Argument(help="The folder of a meta or an ensemble artefact.")],
-    out: stages.Out,
-    episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
-    seed: stages.Seed = 0,
-    force: stages.Force = False,
-    quiet: stages.Quiet = False,
-) -> None:
-    """Write an agent's episodes or an ensemble for other software.
-
-    Episodes as a Minari dataset, which 'import' reads. Ensembles as a folder
-    that torch and safetensors load without hypogoal.
-    """
-    from hypogoal.tools.export import export as written
-
-    written(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
-    say(out)
+for _stage, _help in stages.LISTED.items():  # their commands come from them
+    app.command(_stage, help=_help, rich_help_panel=stages.TOOLS.get(_stage, MAKE))(lambda: None)
 
 
 @command(OWN, "check mine:DOMAIN")
@@ -434,9 +347,6 @@ def check(
         if not verdict.ok:
             raise typer.Exit(2)
 
-
-for _stage, _help in stages.LISTED.items():  # their commands come from them
-    app.command(_stage, help=_help, rich_help_panel=OWN if _stage == "audit" else MAKE)(lambda: None)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,7 +1,9 @@
-"""What is there, is it whole, is it up to date: for ``show``, ``verify`` and ``status`` (Spec A8, G2)."""
+"""What is there, is it whole, is it up to date: for ``show``, ``verify``, ``status`` and notebooks (Spec A8, G2)."""
 
 import shlex
 import textwrap
+from html import escape
+from os import PathLike
 from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
@@ -10,7 +12,7 @@ from hypogoal.cells import read_plan, status_lines
 from hypogoal.core.artefacts import LOG, MANIFEST, Artefact, Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_log, visible
-from hypogoal.core.terminal import drawn
+from hypogoal.core.progress import drawn, say
 from hypogoal.data import SPLITS, open_dataset
 from hypogoal.observations import type_text
 
@@ -207,3 +209,35 @@ def stale_lines(rows: list[Details]) -> list[str]:
     if rows:
         text.append(f"{count} of {len(rows)} stale: renew them in this order" if count else "everything is up to date")
     return text
+
+
+class Made:
+    """A data file, an artefact or a run at ``path``. It works wherever a path is expected, and shows what it holds."""
+
+    def __init__(self, path: str | PathLike[str]):
+        self.path = Path(path)
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    @property
+    def metrics(self) -> Any:
+        """Its numbers: counts of states or a training's last log entry, a dict; of an evaluation the DataFrame."""
+        table = self.path / "numbers.csv"
+        if table.is_file():
+            from hypogoal.evaluation.house import read_numbers
+
+            return read_numbers(table)
+        return dict(describe(self.path).get("numbers", {}))
+
+    def __repr__(self) -> str:
+        details = describe(self.path)
+        return "\n".join([lines(details)[0], *outcome(details)])
+
+    def _repr_html_(self) -> str:
+        return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'
+
+    def show(self) -> None:
+        """Print what ``hypogoal show`` prints: result, configuration, inputs."""
+        for line in [*repr(self).splitlines(), *lines(describe(self.path))[1:]]:
+            say(line)

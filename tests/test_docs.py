@@ -59,7 +59,7 @@ def test_the_reference_is_that_of_the_code(site: Path) -> None:
     """Every command and every setting of every stage is in the reference, and every page is there."""
     from hypogoal.cli import commands as made_commands
     from hypogoal.core.config import STAGES, described
-    from hypogoal.experiments.named import config_class_of
+    from hypogoal.experiments.experiment import config_class_of
 
     assert len(list(site.rglob("*.html"))) >= 15
     pages = {name: (site / f"reference/{name}.html").read_text(encoding="utf-8") for name in ("cli", "settings")}

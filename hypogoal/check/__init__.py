@@ -4,8 +4,7 @@
 """
 
 from hypogoal.check.domains import check_domain
-from hypogoal.check.members import check_teacher, check_view
-from hypogoal.check.networks import check_network
+from hypogoal.check.members import check_network, check_teacher, check_view
 from hypogoal.check.objectives import check_objective
 from hypogoal.check.parts import check_part
 from hypogoal.check.verdict import Verdict, require

@@ -1,4 +1,4 @@
-"""The contracts of views and teachers: what members see, and what they are told of unlabelled states."""
+"""The contracts of member networks, views (what members see) and teachers (what they are told) (Spec C5)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,18 +7,25 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hypogoal.check.domains import SEEDED, collected
 from hypogoal.check.verdict import Verdict, promise, verdicts
+from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.networks import inputs_of
 from hypogoal.hypotheses.training import train
-from hypogoal.hypotheses.views import StateOrigins, changed_by, view_of
+from hypogoal.hypotheses.views import FullView, StateOrigins, changed_by, view_of
+from hypogoal.observations import PICTURE, Observations
 
 FEW = 8  # states
 SMALL: dict[str, Any] = {"members": 2, "steps": 2, "batch_size": 16, "network": "mlp"}
+CLOSE = 1e-4  # between probabilities that are the same up to rounding
+ANEW = "Make new layers at every call, with weights from PyTorch's generator."
 
 
 def check_view(name: str, domain: Domain | None = None, config: Any = None, seed: int = 0) -> Iterator[Verdict]:
@@ -96,3 +103,63 @@ class _Trained:
             self.seed,
             origins=StateOrigins(labelled.origins, unlabelled.origins),
         )
+
+
+def check_network(
+    name: str, observation_shape: tuple[int, ...] = (64, 64, 3), observation_dtype: np.dtype[Any] = PICTURE
+) -> Iterator[Verdict]:
+    """Whether a member network, by its ``--set network`` name, can be trained, stored, used and explained."""
+    values = rng_for(0, "check").integers(256, size=(FEW, *observation_shape))
+    laws = [_Network.logits, _Network.members, _Network.gradients, _Network.answers]
+    return verdicts(laws, _Network(name, values.astype(observation_dtype)))
+
+
+@dataclass
+class _Network:
+    name: str
+    states: Observations
+
+    def ensemble(self) -> Ensemble:
+        view = FullView(self.states.shape[1:], self.states.dtype)
+        view.fit(self.states, self.states, StateOrigins(), 0)
+        return Ensemble(self.name, view.shape, 2, torch_generator(0, "check"), view)
+
+    def inputs(self, ensemble: Ensemble) -> Tensor:
+        return inputs_of(ensemble.see(self.states))
+
+    def logits(self) -> str:
+        """Rows in are rows out, of two logits."""
+        ensemble = self.ensemble()
+        member, _ = ensemble.members
+        shape = tuple(member(self.inputs(ensemble)).shape)
+        promise(
+            shape == (FEW, 2),
+            f"logits are {shape}",
+            "Leave the last layer to hypogoal.",
+        )
+        return f"{shape}, explained by {method_of(member)}"
+
+    def members(self) -> None:
+        """Their weights come from the seed."""
+        for weights, others in zip(self.ensemble().parameters(), self.ensemble().parameters(), strict=True):
+            promise(torch.equal(weights, others), "two ensembles of one seed differ", ANEW)
+
+    def gradients(self) -> None:
+        """Every weight that is not frozen learns."""
+        ensemble = self.ensemble()
+        member, _ = ensemble.members
+        member(self.inputs(ensemble)).square().sum().backward()
+        for name, weight in member.named_parameters():
+            learns = weight.grad is not None and weight.grad.any()
+            fault = f"weight {name} gets no gradient"
+            promise(learns or not weight.requires_grad, fault, "Is it used, not detached?")
+
+    def answers(self) -> None:
+        """The same for a state alone and among others, which is different code."""
+        ensemble = self.ensemble()
+        many = ensemble.predict(np.concatenate([self.states] * 40))
+        alone = ensemble.predict(self.states[:1])
+        worst = np.abs(many[:1] - alone).max()
+        promise(np.isfinite(worst), "probabilities are not finite", "Look for NaN or Inf among its features.")
+        fault = f"probabilities alone and among others differ by {worst:.2g}"
+        promise(worst < CLOSE, fault, "Use layers that act on each state alone, and neither count nor draw.")

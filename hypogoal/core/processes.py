@@ -18,6 +18,8 @@ from hypogoal.core.errors import UserError
 T = TypeVar("T")
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use
 DEVICES = ("auto", "cpu", "cuda")
+# Libraries use one thread per process, unless the user sets these.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
 
 _turn = threading.RLock()  # a stage may call another one
@@ -103,6 +105,19 @@ def _run(task: Callable[[], T]) -> T:
         if user_error is None:
             raise
         raise user_error from error
+
+
+@contextmanager
+def surroundings() -> Iterator[None]:
+    """Within it this process has the environment of those that it starts."""
+    before = dict(os.environ)
+    # A process that starts others imports no random.py from the current folder.
+    os.environ.update({**dict.fromkeys(THREADS, "1"), **before, **own_code.environment(), "PYTHONSAFEPATH": "1"})
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def prepare(device: str = "auto") -> str:

@@ -1,5 +1,6 @@
-"""Progress on stderr, a line that changes; and the log of a training."""
+"""What is printed: lines, tables, progress on stderr (a line that changes); and the log of a training."""
 
+import io
 import json
 import math
 import os
@@ -100,3 +101,27 @@ class MetricsLog:
     def restore(self, snapshot: int) -> None:
         """Truncate the file to the length of a ``snapshot``."""
         os.truncate(self._path, snapshot)
+
+
+def say(*lines: object, err: bool = False) -> None:
+    """Print lines on standard output or error."""
+    stream = sys.stderr if err else sys.stdout
+    for line in lines:
+        print(line, file=stream, flush=True)
+
+
+def drawn(table: Any, width: int) -> str:
+    """A table as plain text, the same on every machine; brackets are no mark-up."""
+    from rich.console import Console
+
+    console = Console(
+        width=width,
+        record=True,
+        file=io.StringIO(),
+        markup=False,
+        emoji=False,
+        highlight=False,
+        force_jupyter=False,
+    )
+    console.print(table)
+    return console.export_text().rstrip("\n")

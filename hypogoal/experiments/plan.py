@@ -13,8 +13,7 @@ from hypogoal.core.config import preset as read_preset
 from hypogoal.core.errors import UserError, reason
 from hypogoal.core.own_code import allow
 from hypogoal.domains.base import settings_of
-from hypogoal.experiments.experiment import STAGE, Command
-from hypogoal.experiments.named import find_experiment
+from hypogoal.experiments.experiment import STAGE, Command, find_experiment
 from hypogoal.stages import load_stage
 
 OUTPUT = re.compile("(|.*=)@(.+)")  # in a word an output: @data, --data=@data

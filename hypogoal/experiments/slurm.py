@@ -16,7 +16,7 @@ from pathlib import Path
 from hypogoal.cells import Cell
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
-from hypogoal.experiments.local import surroundings
+from hypogoal.core.processes import surroundings
 from hypogoal.stages import LISTED
 
 JOBS = "slurm/jobs"  # the numbers of the jobs last submitted, the last of them first: scancel $(cat ...)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
-from hypogoal.importing.episodes import HELDOUT, LABELLED, UNLABELLED, Array, Episode
+from hypogoal.importing.states import HELDOUT, LABELLED, UNLABELLED, Array, Episode
 
 # Of each set of states: what the names of its observations begin with, and those of its other arrays.
 SETS = {

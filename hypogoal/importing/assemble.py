@@ -10,8 +10,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, Labels, States, doubts_of, require_classes
-from hypogoal.importing.episodes import HELDOUT, LABELLED, ROLES, UNLABELLED
-from hypogoal.importing.states import Frames, together
+from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNLABELLED, Frames, together
 from hypogoal.observations import digest, packed
 
 ROW = "row"  # the origin of each state: its place in its set

@@ -12,8 +12,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.own_code import load
 from hypogoal.data import Collected, Labels, joined, open_dataset, write_dataset
-from hypogoal.importing.episodes import UNLABELLED, Array
-from hypogoal.importing.states import Frames
+from hypogoal.importing.states import UNLABELLED, Array, Frames
 from hypogoal.observations import NUMBERS, digest
 
 LAST, TABLE = "last:", ".csv"  # how rules begin and end that are no columns

@@ -1,12 +1,14 @@
-"""From episodes to their frames, whatever they were read from: chosen, and taken for pictures or numbers, key by key.
+"""Episodes, whatever they were read from, and their frames: chosen, and taken for pictures or numbers, key by key.
 
 What is taken for what: the table in docs/own-domain.md.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from glob import iglob
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -15,14 +17,55 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import AGAIN, reading
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
-from hypogoal.importing.episodes import Array, Episode
 from hypogoal.observations import NUMBERS, PICTURE, spread_rows
 
+Array: TypeAlias = NDArray[Any]
+ROLES = LABELLED, UNLABELLED, HELDOUT = "labelled", "unlabelled", "heldout"
 STACKED = "Give pictures as uint8 (H, W, C); 'import --stack' puts stacked frames among the channels."
 MOST_COMPARED = 2_000  # rows of numbers that are compared before and after the cast to float32, spread evenly
 LEFT = 0.9  # the share of a column's distinct values that float32 must keep
 NAMED = 4  # columns that a message names
 IN_FLOAT32 = "have values that float32 makes infinite, 0 or equal, or that are not finite"
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Frames in order: a recorded episode, one picture, or a set of arrays.
+
+    Attributes:
+        name: what messages and tables of labels call it.
+        length: T, how many frames it has.
+        observations: by key, an array (T, ...), or a function from rising numbers of frames to what is seen in these,
+            one after another. The key is "" if there are none.
+        columns: (T,) by name, which may label frames.
+        role: one of ``ROLES``; empty if it may become any, as a whole.
+        group: with which others frames are held out, if at all: one name, or (T,) names; empty if they stand alone.
+    """
+
+    name: str
+    length: int
+    observations: Mapping[str, Any]
+    columns: Mapping[str, Array]
+    role: str = ""
+    group: str | Array = ""
+
+
+def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> list[Path]:
+    """The visible files with these suffixes in a folder and those below it, sorted, links followed.
+
+    ``left`` counts the others by suffix.
+    """
+    taken = []
+    for name in iglob("**/*", root_dir=folder, recursive=True):
+        file = folder / name
+        suffix = file.suffix.lower()
+        if file.is_dir():
+            continue
+        if suffix in suffixes:
+            taken.append(file)
+        else:
+            left[suffix or file.name] += 1
+    return sorted(taken)
 
 
 class Frames(NamedTuple):

@@ -21,12 +21,11 @@ from typer import Option
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import Complete, UserError
-from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.core.terminal import say
+from hypogoal.core.progress import MetricsLog, Progress, say
 
 if TYPE_CHECKING:
     from hypogoal.core.artefacts import Draft
-    from hypogoal.made import Made
+    from hypogoal.look import Made
 
 Place = str | os.PathLike[str]
 DOMAINS = "doorkey, montezuma, rooms, or module:object."
@@ -34,7 +33,7 @@ WIDTH = 100  # of tables
 # Options that stages leave out which do not train, or have no settings.
 NO_TRAINING = ("device", "tensorboard")
 NO_SETTINGS = ("preset", "seed", *NO_TRAINING)
-LISTED = {  # every stage in its order, in a line; it is loaded when it is called
+LISTED = {  # every stage in its order, then tools, in a line; it is loaded when it is called
     "collect": "Collect labelled, unlabelled and held-out states.",
     "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
     "train-options": "Learn an option (a policy) for every member.",
@@ -42,8 +41,13 @@ LISTED = {  # every stage in its order, in a line; it is loaded when it is calle
     "train-baseline": "Train PPO or DQN on primitive actions, to compare.",
     "evaluate": "Compute every number of a run: accuracy, curves, choices.",
     "report": "Draw the report of an evaluated run: one HTML file.",
+    "compare": "Put evaluated runs side by side: what differs, who wins.",
+    "import": "Make a data file of your arrays, pictures or recorded episodes.",
+    "export": "Write an agent's episodes or an ensemble for other software.",
     "audit": "How often, and where, do policies fool a success classifier?",
 }
+LOOK, OWN = "Look", "Own data and code"  # groups of commands
+TOOLS = {"compare": LOOK, "import": OWN, "export": OWN, "audit": OWN}
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
 Preset = Annotated[str | None, Option("--preset", help="demo, paper, or your .toml file.")]
@@ -142,8 +146,8 @@ def load_stage(name: str) -> "Stage":
     """The stage of a command; an unknown one is a ``UserError``."""
     if name not in LISTED:
         raise UserError("this is no stage", name, f"Choose one of {', '.join(LISTED)}.")
-    folder = "tools" if name == "audit" else "stages"
-    word = name.replace("-", "_")
+    folder = "tools" if name in TOOLS else "stages"
+    word = "import_data" if name == "import" else name.replace("-", "_")
     function: Any = getattr(import_module(f"hypogoal.{folder}.{word}"), word)
     loaded: Stage = function.stage
     return loaded
@@ -175,7 +179,7 @@ class Stage:
     into: str = ""
 
     def __post_init__(self) -> None:
-        self.name = self.function.__name__.replace("_", "-")
+        self.name, *_ = self.example.split()
         _, self.source, *self.inputs = inspect.signature(self.function).parameters.values()
         _, self.out, _, *shared = inspect.signature(Call).parameters.values()
         options = [option for option in shared if option.name not in self.leaves_out]
@@ -190,7 +194,7 @@ class Stage:
         @functools.wraps(self.function)
         def called(source: Any, out: Place | None = None, **arguments: Any) -> "Made":
             from hypogoal.core.processes import own_settings
-            from hypogoal.made import Made
+            from hypogoal.look import Made
 
             own_code.allow([source, *arguments.values()])
             values = {}

@@ -6,8 +6,7 @@ from typer import Argument
 
 from hypogoal.core.artefacts import DATA
 from hypogoal.core.errors import UserError
-from hypogoal.core.progress import Progress
-from hypogoal.core.terminal import say
+from hypogoal.core.progress import Progress, say
 from hypogoal.stages import DOMAINS, NO_TRAINING, Call, Done, stage
 
 

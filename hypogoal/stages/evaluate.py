@@ -7,8 +7,7 @@ from typer import Argument, Option
 
 from hypogoal import cells
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.progress import Progress
-from hypogoal.core.terminal import drawn
+from hypogoal.core.progress import Progress, drawn
 from hypogoal.stages import NO_SETTINGS, WIDTH, Call, Done, stage
 
 PLAYED = "Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."

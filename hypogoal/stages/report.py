@@ -6,7 +6,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.terminal import say
+from hypogoal.core.progress import say
 from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 MOST_BYTES = 2_000_000  # of a film on the page

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hypogoal.core.errors import Complete, UserError
-from hypogoal.core.terminal import say
+from hypogoal.core.progress import say
 from hypogoal.stages import Call, Done, stage
 
 REPORT = "audit.json"

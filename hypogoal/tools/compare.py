@@ -1,33 +1,36 @@
 """Spec F5, F7: several evaluated runs side by side, as one page and its numbers."""
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from hypogoal.core.artefacts import create
+from typer import Argument
+
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation import compare as beside
-from hypogoal.evaluation.plots import slug
-from hypogoal.evaluation.run import evaluation_of, read_evaluation
+from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 
-def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
-    """Compare evaluated runs, the others with the first; returns the page of an artefact with ``*.csv`` beside it.
+@stage(
+    "compare runs/mine runs/other --out runs/both",
+    leaves_out=(*NO_SETTINGS, "resume", "quiet"),
+)
+def compare(
+    call: Call,
+    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Evaluated; each is compared with the first.")],
+) -> Done:
+    """Put evaluated runs side by side: what differs, who wins.
 
     Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
+    from hypogoal.evaluation import compare as beside
+    from hypogoal.evaluation.plots import slug
+    from hypogoal.evaluation.run import evaluation_of, read_evaluation
+
     where = " ".join(map(str, runs))
     places = {run.resolve() for run in runs}
     if len(places) < max(2, len(runs)):
         raise UserError("a comparison takes two or more different runs", where, "Name each run once.")
     inputs = [evaluation_of(run).path for run in runs]
-    with create(
-        out,
-        kind="comparison",
-        config={},
-        seed=0,
-        inputs=inputs,
-        force=force,
-    ) as draft:
+    with call.draft("comparison", {}, inputs) as draft:
         labels = beside.labels_of([run.resolve().as_posix() for run in runs])
         results = dict(zip(labels, map(read_evaluation, runs), strict=True))
         questions = beside.shared(results)
@@ -45,4 +48,4 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
         for drawn in figures:
             path = folder / f"{slug(drawn.name)}.svg"
             path.write_bytes(drawn.svg)
-    return out / "index.html"
+    return Done(beside.winners(beside.read_pairs(call.out)))

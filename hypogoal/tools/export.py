@@ -6,16 +6,22 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from typer import Argument, Option
 
-from hypogoal.core.artefacts import Artefact, create, open_artefact
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.observations import PICTURE, fields_of
+from hypogoal.stages import NO_TRAINING, Call, Done, stage
 
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # of a Minari dataset
+SOURCE = (
+    "An agent (meta): its episodes become a Minari dataset, which 'import' reads. Or an ensemble: a folder that torch "
+    "and safetensors load without hypogoal."
+)
 CARD = """---
 library_name: hypogoal
 ---
@@ -37,29 +43,34 @@ Positive above the `thresholds` in the file of weights.
 """
 
 
-def export(source: Path, out: Path, *, episodes: int, seed: int, force: bool, quiet: bool) -> None:
-    """Write an artefact for other software.
+@stage(
+    "export runs/mine/ensemble --out mine",
+    leaves_out=(*NO_TRAINING, "preset", "resume"),
+)
+def export(
+    call: Call,
+    source: Annotated[Path, Argument(help=SOURCE)],
+    *,
+    episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
+) -> Done:
+    """Write an agent's episodes or an ensemble for other software.
 
     An ensemble becomes a folder that torch and safetensors load without hypogoal, a meta artefact a Minari dataset of
     so many ``episodes``. ``seed`` is of its agent's choices.
     """
     artefact = open_artefact(source, "meta", "ensemble")
-    is_ensemble = artefact.kind == "ensemble"
-    if not (is_ensemble or NAME.fullmatch(out.name)):
-        raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
-    with create(
-        out,
-        kind="hub" if is_ensemble else "episodes",
-        config={} if is_ensemble else {"episodes": episodes},
-        seed=seed,
-        inputs=[source],
-        force=force,
-    ) as draft:
-        if is_ensemble:
+    if artefact.kind == "ensemble":
+        with call.draft("hub", {}, [source]) as draft:
             write_hub(artefact, draft.files)
-            return
-        with Progress("export", total=episodes, quiet=quiet) as progress:
-            write_episodes(artefact, draft.files / "data", out, seed, progress)
+        return Done()
+    if not NAME.fullmatch(call.out.name):
+        raise UserError("a Minari dataset needs a version in its name", call.out.name, "Give --out DIR/NAME-v0.")
+    with (
+        call.draft("episodes", {"episodes": episodes}, [source]) as draft,
+        Progress("export", total=episodes, quiet=call.quiet) as progress,
+    ):
+        write_episodes(artefact, draft.files / "data", call.out.name, call.seed, progress)
+    return Done()
 
 
 def write_hub(artefact: Artefact, folder: Path) -> None:
@@ -125,8 +136,8 @@ def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
     return rows
 
 
-def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress: Progress) -> None:
-    """Let the agent of a meta artefact play as a Minari dataset of the name ``out``.
+def write_episodes(meta: Artefact, folder: Path, name: str, seed: int, progress: Progress) -> None:
+    """Let the agent of a meta artefact play as a Minari dataset of this name.
 
     ``infos/option`` is the option that led to each state, -1 at the start.
     """
@@ -151,7 +162,7 @@ def write_episodes(meta: Artefact, folder: Path, out: Path, seed: int, progress:
     place = meta.config["layouts"] or meta.config["layout_seed"]
     origin = f"{meta.config['domain']}, layout seed {place}, seed {seed}"
     description = {
-        "dataset_id": out.name,
+        "dataset_id": name,
         "minari_version": __version__,
         "algorithm_name": "hypogoal",
         "description": f"Episodes of an agent that chooses among options ({origin}).",

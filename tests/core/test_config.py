@@ -25,7 +25,7 @@ from hypogoal.core.config import (
 )
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import settings_of
-from hypogoal.experiments.named import config_class_of
+from hypogoal.experiments.experiment import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 

@@ -18,9 +18,8 @@ from toy import SMALL, write_toy
 
 from hypogoal.cells import Cell, read_plan, status_lines
 from hypogoal.core.artefacts import Draft
-from hypogoal.experiments.local import PRELOADED, run_local
 from hypogoal.experiments.plan import plan
-from hypogoal.experiments.run import begin
+from hypogoal.experiments.run import PRELOADED, begin, run_local
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0

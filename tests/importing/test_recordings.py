@@ -14,9 +14,9 @@ import pytest
 from command_line import refuses, run
 
 from hypogoal.data import Dataset, open_dataset
-from hypogoal.importing import films
+from hypogoal.importing import pictures
 from hypogoal.importing.assemble import with_roles
-from hypogoal.importing.episodes import ROLES
+from hypogoal.importing.states import ROLES
 from hypogoal.observations import digest
 from tests.importing import robot_data
 from tests.importing.robot_data import LENGTHS, STATE, TOP, WRIST
@@ -201,8 +201,8 @@ def write_turned(path: Path, orientation: int) -> None:
 @pytest.mark.parametrize("orientation", [2, 3, 6, 7])
 def test_a_film_is_turned_as_players_turn_it(tmp_path: Path, orientation: int) -> None:
     write_turned(tmp_path / "x.mp4", orientation)
-    assert films.count_frames(tmp_path / "x.mp4") == 2
-    [seen] = films.frames_in(tmp_path / "x.mp4", np.array([1]))
+    assert pictures.count_frames(tmp_path / "x.mp4") == 2
+    [seen] = pictures.frames_in(tmp_path / "x.mp4", np.array([1]))
     assert seen.shape == UPRIGHT.shape
     assert np.abs(seen[4::16, 4::16].mean(-1) - UPRIGHT[4::16, 4::16].mean(-1)).max() < 40  # colours are compressed
 
