@@ -6,10 +6,10 @@ its last attempt did (``logs/NAME.code``). Nothing else is recorded: a run may b
 
 from pathlib import Path
 
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter
 
 from hypogoal.core.artefacts import Draft
-from hypogoal.core.errors import UserError, reason
+from hypogoal.core.files import reading
 
 PLAN = "sweep.json"
 NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's folder
@@ -107,11 +107,8 @@ def read_plan(run: Path) -> list[Cell]:
     path = run / PLAN
     if not path.exists():
         return []
-    try:
+    with reading(path, "Remove it: what is complete is kept.", "the plan"):
         cells = CELLS.validate_json(path.read_bytes())
-    except ValidationError as error:
-        problem = f"the plan is damaged, or of another version ({reason(error)})"
-        raise UserError(problem, path, "Remove it: what is complete is kept.") from None
     return [cell.model_copy(update={"run": run}) for cell in cells]
 
 

@@ -24,7 +24,7 @@ from typer.core import TyperGroup
 
 from hypogoal import stages
 from hypogoal.core import own_code, processes
-from hypogoal.core.errors import UserError, printable
+from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
 from hypogoal.stages import LOOK, OWN
 
@@ -137,8 +137,10 @@ def _called(words: list[str]) -> int:
 
 def _advice(error: Any) -> str:
     """What to do about words that a command does not take; settings are often mistaken for options."""
+    from hypogoal.core.config import STAGES
+
     stage = error.ctx.info_name
-    if hasattr(error, "possibilities") and stage in stages.LISTED:
+    if hasattr(error, "possibilities") and stage in STAGES:
         return f"Settings are given as --set KEY=VALUE; 'hypogoal config {stage}' lists them."
     words = "hypogoal" if stage == "hypogoal" else f"hypogoal {stage}"
     return f"See '{words} --help'."
@@ -149,7 +151,7 @@ def _fail(message: str, code: int, error: BaseException | None = None) -> int:
     notes = getattr(error, "__notes__", [])
     if notes:
         message = "; ".join([message.rstrip("."), *notes])
-    say(f"hypogoal: {printable(message)}", err=True)
+    say(f"hypogoal: {message}", err=True)
     return code
 
 

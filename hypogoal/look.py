@@ -149,21 +149,17 @@ def faults(path: Path) -> list[str]:
     lines = []
     for part in parts_of(path):
         try:
-            if part.is_file():
-                _read_all(part)
-            else:
+            if part.is_dir():
                 lines += [f"{part}: {fault}" for fault in Artefact(part).faults(within=path.resolve())]
+                continue
+            dataset = open_dataset(part)
+            dataset.unlabelled()
+            for goal in dataset.sub_goals:
+                dataset.labelled(goal)
+                dataset.heldout(goal)
         except UserError as error:
             lines.append(str(error))
     return lines
-
-
-def _read_all(data: Path) -> None:
-    dataset = open_dataset(data)
-    dataset.unlabelled()
-    for goal in dataset.sub_goals:
-        dataset.labelled(goal)
-        dataset.heldout(goal)
 
 
 def stale(run: Path) -> list[Details]:
@@ -239,5 +235,4 @@ class Made:
 
     def show(self) -> None:
         """Print what ``hypogoal show`` prints: result, configuration, inputs."""
-        for line in [*repr(self).splitlines(), *lines(describe(self.path))[1:]]:
-            say(line)
+        say(repr(self), *lines(describe(self.path))[1:])

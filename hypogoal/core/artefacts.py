@@ -31,7 +31,6 @@ DATA = "data"  # the kind of outputs that are HDF5 files
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers",)  # settings that change no result
 AGAIN = "Make the artefact again."
-AWAY = "Move it away, or choose another --out."
 PACKAGES = (
     "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
     "safetensors", "stable-baselines3",

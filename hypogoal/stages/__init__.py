@@ -280,6 +280,10 @@ class Stage:
         if typed and "preset" in self.leaves_out:
             raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
         inputs = {each.name: values.pop(each.name) for each in self.inputs}
+        if "device" in values:
+            from hypogoal.core.processes import prepare
+
+            values["device"] = prepare(values["device"])
         place = Path(out) if out else Path(source, self.into)
         call = Call(stage=self.name, out=place, typed=typed, **values)
         try:

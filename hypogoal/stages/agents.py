@@ -8,7 +8,6 @@ import numpy as np
 
 from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.core.processes import prepare
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.nearness import Near, nearness
@@ -26,11 +25,13 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
     Of options of an artefact, trained further, the ``fixed`` settings hold. Where other ones are typed, or these
     options are of another ensemble, it is a ``UserError``.
     """
-    device = prepare(call.device)
     source = open_artefact(ensemble, "ensemble")
     held: dict[str, Any] = {}
     if practice:
-        _require_same(practice, source)
+        made_from = [entry.sha256 for entry in practice.manifest.inputs if entry.kind == "ensemble"]
+        if sha256_of(source.path) not in made_from:
+            do = f"Train them from {source.path}."
+            raise UserError("these options were trained with another ensemble", practice.path, do)
         held = {name: practice.config[name] for name in fixed if name in practice.config}
         if practice.config["layouts"]:  # options of many layouts may be played in any
             held.pop("layout_seed", None)
@@ -46,16 +47,8 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
         source.path,
         config,
         call.seed,
-        device,
+        call.device,
     )
-
-
-def _require_same(practice: Artefact, source: Artefact) -> None:
-    """Refuse (``UserError``) options of another ensemble."""
-    made_from = [entry.sha256 for entry in practice.manifest.inputs if entry.kind == "ensemble"]
-    if sha256_of(source.path) not in made_from:
-        fault = "these options were trained with another ensemble"
-        raise UserError(fault, practice.path, f"Train them from {source.path}.")
 
 
 def description(setup: Setup, **more: Any) -> dict[str, Any]:

@@ -25,7 +25,6 @@ def train_baseline(
 
     Without ``data`` it plays in the world of the domain's defaults.
     """
-    from hypogoal.core.processes import prepare
     from hypogoal.core.tensors import save_tensors
     from hypogoal.domains.base import load_domain
     from hypogoal.learners import world
@@ -35,7 +34,6 @@ def train_baseline(
     from hypogoal.observations import PICTURE, standard_of
     from hypogoal.options.tables import Episodes
 
-    device = prepare(call.device)
     config = call.settings(domain)
     played = load_domain(domain)
     dataset = _states_of(domain, data) if data else None
@@ -58,7 +56,7 @@ def train_baseline(
         env = EngineEnv(engine)
         files = work.draft.files
         kept = work.draft.checkpoints()
-        agent = agents.train(env, chosen, config.steps, call.seed, work.log, work.progress, kept, device)
+        agent = agents.train(env, chosen, config.steps, call.seed, work.log, work.progress, kept, call.device)
         work.progress.update(config.steps)
         Episodes.of_rows(env.episodes).write(files)
         save_tensors(files / "policy.safetensors", agents.weights(agent))

@@ -5,7 +5,7 @@ from functools import partial
 from math import isnan
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Argument, Option
 
@@ -36,17 +36,23 @@ def train_ensemble(
     Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
     of those of ``data``. Each sub-goal has a progress line and a folder of TensorBoard's of its own.
     """
-    from hypogoal.core.processes import allowed, in_processes, prepare
+    from hypogoal.core.processes import allowed, in_processes
     from hypogoal.data import open_dataset
     from hypogoal.domains.base import installed_domain
     from hypogoal.hypotheses.sub_goals import checked, log_of, train_sub_goal
+    from hypogoal.observations import type_text
     from hypogoal.options.visited import unlabelled_file
 
-    device = prepare(call.device)
     dataset = open_dataset(data)
     config, sub_goals = checked(call.settings(dataset.domain), dataset)
     others = [unlabelled_file(path, dataset) for path in unlabelled or ()]
-    settings = _described(config, sub_goals, dataset)
+    settings = config.model_dump(mode="json") | {
+        "sub_goals": list(sub_goals),
+        "observation_shape": list(dataset.observation_shape),
+        "observation_dtype": type_text(dataset.observation_dtype),
+        "domain": dataset.domain,
+        "domain_config": dataset.config,
+    }
     with call.draft("ensemble", settings, [data, *others]) as draft:
         jobs = []
         for sub_goal in sub_goals:
@@ -59,7 +65,7 @@ def train_ensemble(
                 sub_goal,
                 config,
                 call.seed,
-                device,
+                call.device,
                 board,
                 quiet=call.quiet,
             )
@@ -71,19 +77,6 @@ def train_ensemble(
         (draft.files / LOG).write_text("".join(texts), encoding="utf-8")
     then = "" if installed_domain(dataset.domain) else "evaluate {run}"  # recorded states have no world to practise in
     return Done(_outcome(accuracies), then=then)
-
-
-def _described(config: Any, sub_goals: Sequence[str], dataset: Any) -> dict[str, Any]:
-    """The artefact's configuration."""
-    from hypogoal.observations import type_text
-
-    return config.model_dump(mode="json") | {
-        "sub_goals": list(sub_goals),
-        "observation_shape": list(dataset.observation_shape),
-        "observation_dtype": type_text(dataset.observation_dtype),
-        "domain": dataset.domain,
-        "domain_config": dataset.config,
-    }
 
 
 def _outcome(accuracies: Sequence[dict[str, float]]) -> list[str]:

@@ -5,11 +5,11 @@ count in every curve.
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Argument, Option
 
-from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.stages import Call, Done, outcome_of, stage
 
 FIXED = (  # as of the options trained before
@@ -41,13 +41,18 @@ def train_meta(
     practice = open_artefact(options, "options") if options else None
     setup = agents.setup_of(call, ensemble, practice, FIXED)
     steps = setup.config.steps
-    settings = agents.description(setup, **_steps_spent(practice))
+    spent = {"options_steps": 0}
+    if practice:
+        spent = {"options_steps": practice.config["steps"]}
+        if "ended_at" in practice.config:
+            spent["options_ended_at"] = practice.config["ended_at"]
+    settings = agents.description(setup, **spent)
     inputs = [ensemble, options] if options else [ensemble]
     with call.training("meta", settings, inputs, steps) as work:
         loop = training.assemble(setup)
         if practice:
             training.continue_with(loop, practice)
-            begun_at = practice.config.get("ended_at", practice.config["steps"])
+            begun_at = spent.get("options_ended_at", spent["options_steps"])
             loop.recorder.start_at(begun_at)
             if all(practice.config[key] == settings[key] for key in WORLD):
                 practised = Episodes.read(practice.path / Episodes.FILE)
@@ -56,13 +61,3 @@ def train_meta(
     episodes = loop.recorder.episodes
     numbers = episodes.counts() | episodes.recent()
     return Done(outcome_of(numbers))
-
-
-def _steps_spent(practice: Artefact | None) -> dict[str, Any]:
-    """Steps of ``train-options``, for the manifest: as many as were asked for, and where it ended before."""
-    if practice is None:
-        return {"options_steps": 0}
-    spent = {"options_steps": practice.config["steps"]}
-    if "ended_at" in practice.config:
-        spent["options_ended_at"] = practice.config["ended_at"]
-    return spent

@@ -64,7 +64,6 @@ def _in_play(
     member: int,
 ) -> tuple[list[str], dict[str, float | None]]:
     """Train and play the policies: the findings in lines, and the shares of false positives."""
-    from hypogoal.core.processes import prepare
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation import audit as played
@@ -76,11 +75,10 @@ def _in_play(
     from hypogoal.meta.training import assemble
     from hypogoal.stages import agents
 
-    device = prepare(call.device)
     config = call.settings(domain)
     world = load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
-    audited, source = classifier_of(classifier, sub_goal, device)
+    audited, source = classifier_of(classifier, sub_goal, call.device)
     thresholds = audited.thresholds.tolist()
     if member >= len(thresholds):
         raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(thresholds) - 1}.")
@@ -93,7 +91,7 @@ def _in_play(
     }
     if source and source.config["domain"] == domain:
         ensemble_config["domain_config"] = source.config["domain_config"]
-    setup = Setup(world, ensemble_config, Path(), config, call.seed, device)
+    setup = Setup(world, ensemble_config, Path(), config, call.seed, call.device)
     settings = agents.description(setup, classifier=classifier, member=member)
     inputs = [source.path] if source else []
     try:

@@ -18,7 +18,6 @@ def audited(
 
     ``out`` gets ``audit.json``, the page ``index.html`` and, for each sub-goal (or the named one), ``next/SUB_GOAL/``.
     """
-    from hypogoal.core.processes import prepare
     from hypogoal.core.progress import Progress
     from hypogoal.data import open_dataset
     from hypogoal.evaluation import page, recorded
@@ -31,7 +30,6 @@ def audited(
     if member is not None or call.typed or call.preset or call.resume or not (data or is_ensemble):
         do = "Give --domain and --sub-goal; or, without settings, an ensemble's folder or --data FILE."
         raise UserError("an audit plays in a domain, or looks at recorded data", source, do)
-    device = prepare(call.device)
     inputs = []
     if is_ensemble:
         artefact = open_artefact(Path(source), "ensemble")
@@ -49,7 +47,7 @@ def audited(
         Progress("audit", len(goals), quiet=call.quiet) as progress,
     ):
         for goal in goals:
-            classifier, _ = classifier_of(source, goal, device)
+            classifier, _ = classifier_of(source, goal, call.device)
             findings = recorded.findings_of(classifier, dataset, goal)
             recorded.write_next(draft.files / "next" / goal, COLUMNS, findings)
             parts.append(findings["numbers"])
