@@ -12,7 +12,7 @@ from hypogoal.cells import read_plan, status_lines
 from hypogoal.core.artefacts import LOG, MANIFEST, Artefact, Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_log, visible
-from hypogoal.core.progress import drawn, say
+from hypogoal.core.progress import say
 from hypogoal.data import SPLITS, open_dataset
 from hypogoal.observations import type_text
 
@@ -97,8 +97,7 @@ def outcome(details: Details) -> list[str]:
 
         path = Path(details["path"])
         results = read_results(Artefact(path))
-        table = drawn(summary(results, answers(results)), WIDTH)
-        return [line.rstrip() for line in table.splitlines()]
+        return summary(results, answers(results))
     if kind == "comparison":
         from hypogoal.evaluation.compare import read_pairs, winners
 

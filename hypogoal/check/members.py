@@ -14,13 +14,13 @@ from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
-from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.config import FULL, EnsembleConfig
 from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import inputs_of
 from hypogoal.hypotheses.training import train
-from hypogoal.hypotheses.views import FullView, StateOrigins, changed_by, view_of
-from hypogoal.observations import PICTURE, Observations
+from hypogoal.hypotheses.views import StateOrigins, changed_by, view_of
+from hypogoal.observations import PICTURE
 
 FEW = 8  # states
 SMALL: dict[str, Any] = {"members": 2, "steps": 2, "batch_size": 16, "network": "mlp"}
@@ -117,10 +117,10 @@ def check_network(
 @dataclass
 class _Network:
     name: str
-    states: Observations
+    states: Any  # observations (N, *obs)
 
     def ensemble(self) -> Ensemble:
-        view = FullView(self.states.shape[1:], self.states.dtype)
+        view = view_of(FULL, (), self.states.shape[1:], self.states.dtype)
         view.fit(self.states, self.states, StateOrigins(), 0)
         return Ensemble(self.name, view.shape, 2, torch_generator(0, "check"), view)
 

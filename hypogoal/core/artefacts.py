@@ -316,7 +316,7 @@ def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> 
             open_artefact(out)  # refuses changed files
         complete = _manifest_of(out).model_copy(update={"versions": {}})  # nothing is continued with others
         _refuse_other(complete, wanted, "the complete output was made")
-        raise Complete(out)
+        raise Complete(f"{out} is complete already")
     if kind and not force:
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
     return False

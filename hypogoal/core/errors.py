@@ -23,14 +23,7 @@ class UserError(Exception):
 
 
 class Complete(UserError):
-    """The output to resume is complete and as requested: the command line says so and exits with code 0.
-
-    ``path`` is the output.
-    """
-
-    def __init__(self, path: object):
-        super().__init__(f"{path} is complete already")
-        self.path = path
+    """The output to resume is complete and as requested: the command line says so and exits with code 0."""
 
 
 class NumericalError(Exception):

@@ -1,6 +1,5 @@
-"""What is printed: lines, tables, progress on stderr (a line that changes); and the log of a training."""
+"""What is printed: lines, and progress on stderr, a line that changes; and the log of a training."""
 
-import io
 import json
 import math
 import os
@@ -108,20 +107,3 @@ def say(*lines: object, err: bool = False) -> None:
     stream = sys.stderr if err else sys.stdout
     for line in lines:
         print(line, file=stream, flush=True)
-
-
-def drawn(table: Any, width: int) -> str:
-    """A table as plain text, the same on every machine; brackets are no mark-up."""
-    from rich.console import Console
-
-    console = Console(
-        width=width,
-        record=True,
-        file=io.StringIO(),
-        markup=False,
-        emoji=False,
-        highlight=False,
-        force_jupyter=False,
-    )
-    console.print(table)
-    return console.export_text().rstrip("\n")

@@ -3,6 +3,7 @@
 Every sentence is in ``templates/``; a question gives its template what it computed.
 """
 
+import io
 import re
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping
@@ -16,12 +17,13 @@ import jinja2
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from rich.console import Console
 from rich.table import Table
 
 from hypogoal.core.artefacts import versions
 from hypogoal.evaluation import pictures
 from hypogoal.evaluation.house import BOOTSTRAP_FROM
-from hypogoal.evaluation.plots import styled, to_file
+from hypogoal.evaluation.plots import slug, styled, to_file
 
 WIDTH = 80  # of tables in a terminal
 DASH = "–"
@@ -179,6 +181,21 @@ def terminal(title: str, frame: pd.DataFrame) -> Table:
     return printed
 
 
+def plain(tables: Any) -> list[str]:
+    """Tables for a terminal as lines of plain text, the same on every machine; brackets are no mark-up."""
+    console = Console(
+        width=WIDTH,
+        record=True,
+        file=io.StringIO(),
+        markup=False,
+        emoji=False,
+        highlight=False,
+        force_jupyter=False,
+    )
+    console.print(tables)
+    return [line.rstrip() for line in console.export_text().splitlines()]
+
+
 def listed(items: Iterable[Any]) -> str:
     """1, 2 and 3."""
     texts = [str(item) for item in items]
@@ -250,3 +267,12 @@ def render(template: str, /, **context: Any) -> str:
 def lines_of(template: str, /, **context: Any) -> list[str]:
     """What a template of lines says."""
     return [line for line in render(template, **context).splitlines() if line]
+
+
+def write(folder: Path, text: str, figures: Iterable[Drawn]) -> None:
+    """Write a page, ``index.html``, and its figures as files beside it."""
+    (folder / "index.html").write_text(text, encoding="utf-8")
+    (folder / "figures").mkdir()
+    for drawn in figures:
+        path = folder / "figures" / f"{slug(drawn.name)}.svg"
+        path.write_bytes(drawn.svg)

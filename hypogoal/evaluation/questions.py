@@ -123,7 +123,7 @@ def write(folder: Path, results: Results, every: list[Context]) -> None:
             table.to_csv(folder / "tables" / f"{name}.csv", index=False)
 
 
-def summary(results: Results, every: list[Context]) -> Group:
+def summary(results: Results, every: list[Context]) -> list[str]:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
     tables = []
     for context in every:
@@ -138,7 +138,7 @@ def summary(results: Results, every: list[Context]) -> Group:
         lines.add_row(f"In this run: {'; '.join(results.facts['missing'])}.")
     for sentence in sentences(results):
         lines.add_row(sentence)
-    return Group(*tables, lines)
+    return page.plain(Group(*tables, lines))
 
 
 def sentences(results: Results) -> list[str]:

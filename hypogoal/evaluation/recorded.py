@@ -3,7 +3,7 @@
 Where members disagree, which failures they take for a success, and which states to label next.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,9 @@ NEIGHBOURS = 10  # whose distance says how dense states are
 SAMPLE = 500  # states whose usual distance is taken
 COMPARED = 4_000  # unlabelled states, spread over the file
 NEXT = 100  # states to label next in the table
+# Of the table: the picture's file, the label (1, 0 or nothing yet), the row among the unlabelled states and its
+# :func:`hypogoal.observations.digest`, how much members disagree.
+COLUMNS = ["name", "label", "row", "digest", "disagreement"]
 CARDS, FAILURES = 20, 4  # on the page: of these, and of each member's failures
 
 
@@ -93,11 +96,7 @@ def findings_of(
     }
 
 
-def write_next(
-    folder: Path,
-    columns: Sequence[str],
-    findings: Mapping[str, Any],
-) -> None:
+def write_next(folder: Path, findings: Mapping[str, Any]) -> None:
     """Write the states to label next: a table to fill in, and pictures ``001.png``, ... in its order, if they are."""
     folder.mkdir(parents=True)
     lines = []
@@ -109,7 +108,7 @@ def write_next(
             name = f"{number:03d}.png"
             Image.fromarray(picture).save(folder / name)
         lines.append([name, "", row, digest(state).hex(), disputed])
-    table = pd.DataFrame(lines, columns=[*columns])
+    table = pd.DataFrame(lines, columns=COLUMNS)
     table.round(4).to_csv(folder / TO_FILL_IN, index=False)
 
 

@@ -18,9 +18,6 @@ from hypogoal.observations import NUMBERS, digest
 LAST, TABLE = "last:", ".csv"  # how rules begin and end that are no columns
 SPANS = {"episode": str, "from": int, "to": int}  # columns of a table of positive frames; ``to`` is the first behind
 SUCCESS = ("next.success", "success", "next.reward", "reward", "rewards")  # columns that say so, the first there is
-# Columns of a table of states to label: the picture's file, the label (1, 0 or nothing yet), the row among the
-# unlabelled states and its :func:`hypogoal.observations.digest`, how much members disagree.
-COLUMNS = ("name", "label", "row", "digest", "disagreement")
 TRUTHS = {"0": False, "1": True}
 
 

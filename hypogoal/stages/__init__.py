@@ -219,8 +219,7 @@ class Stage:
             source = values.pop(self.source.name)
             call, done = self.run(source, values.pop("out"), values, typed)
             if not (call.quiet or done.told):
-                for line in done.lines:
-                    say(line)
+                say(*done.lines)
                 if then := done.then or self.then:
                     places = {"source": source, "out": call.out, "run": call.out.parent}
                     words = [word.format(**places) for word in then.split()]

@@ -10,7 +10,7 @@ from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.nearness import Near, nearness
+from hypogoal.evaluation.nearness import nearness
 from hypogoal.learners.world import write_layout
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import train
@@ -70,11 +70,7 @@ def learn(work: Training, setup: Setup, loop: OptionLoop, steps: int, until: flo
         near(np.repeat(loop.engine.ids[:1], setup.options), np.arange(setup.options))
     kept = work.draft.checkpoints()
     solved = train(loop, steps, work.log, work.progress, kept, until)
-    _write(work.draft.files, setup, loop, near)
-    return solved
-
-
-def _write(folder: Path, setup: Setup, loop: OptionLoop, near: Near | None) -> None:
+    folder = work.draft.files
     loop.recorder.write(folder)
     if near:
         loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
@@ -90,3 +86,4 @@ def _write(folder: Path, setup: Setup, loop: OptionLoop, near: Near | None) -> N
         last = config.layout_seed + int(layouts) - 1
         layouts = f"{config.layout_seed}-{last}"
     write_layout(folder, loop.engine, config, setup.seed, layouts)
+    return solved

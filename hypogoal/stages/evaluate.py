@@ -1,14 +1,14 @@
 """Spec A5, F: every number of the report, from whatever artefacts a run has; what is missing is named."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Argument, Option
 
 from hypogoal import cells
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.progress import Progress, drawn
-from hypogoal.stages import NO_SETTINGS, WIDTH, Call, Done, stage
+from hypogoal.core.progress import Progress
+from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 PLAYED = "Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."
 
@@ -39,11 +39,8 @@ def evaluate(
     from hypogoal.meta.config import layout_seeds
 
     prepare()
-    settings: dict[str, Any] = {}
-    played: tuple[int, ...] = ()
-    if layouts:
-        settings["layouts"] = layouts
-        played = tuple(layout_seeds(layouts))
+    settings = {"layouts": layouts} if layouts else {}
+    played = tuple(layout_seeds(layouts)) if layouts else ()
     contents = find(run)
     trained = [artefact.path for artefact in contents.everything()]
     with call.draft("evaluation", settings, [*contents.data(), *trained]) as draft:
@@ -65,5 +62,4 @@ def evaluate(
         every = questions.answers(results)
         questions.write(draft.files, results, every)
         cells.write_results(run, draft.files)
-    table = drawn(questions.summary(results, every), WIDTH).splitlines()
-    return Done(table)
+    return Done(questions.summary(results, every))

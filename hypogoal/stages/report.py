@@ -1,5 +1,6 @@
 """Spec A5, F7: draw an evaluated run as one self-contained HTML page, and its figures as files."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +39,7 @@ def report(
         raise UserError("--format is for --figures", format, "Give --figures DIR too, or leave it out.")
 
     from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
-    from hypogoal.evaluation.page import source
+    from hypogoal.evaluation.page import source, write
     from hypogoal.evaluation.questions import answers, render
     from hypogoal.evaluation.run import evaluation_of, read_evaluation
 
@@ -60,14 +61,8 @@ def report(
         small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
         shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
         page = render(results, every, shown)
-        index = draft.files / "index.html"
-        index.write_text(page, encoding="utf-8")
-        pictures = draft.files / "figures"
-        pictures.mkdir()
-        for each in every:
-            for drawn in each["figures"]:
-                path = pictures / f"{drawn.name}.svg"
-                path.write_bytes(drawn.svg)
+        drawn = chain.from_iterable(each["figures"] for each in every)
+        write(draft.files, page, drawn)
         moving = draft.files / "videos"
         for film in films:
             moving.mkdir(exist_ok=True)

@@ -26,6 +26,7 @@ def train_baseline(
     Without ``data`` it plays in the world of the domain's defaults.
     """
     from hypogoal.core.tensors import save_tensors
+    from hypogoal.data import open_dataset
     from hypogoal.domains.base import load_domain
     from hypogoal.learners import world
     from hypogoal.learners.baselines import agents
@@ -36,8 +37,14 @@ def train_baseline(
 
     config = call.settings(domain)
     played = load_domain(domain)
-    dataset = _states_of(domain, data) if data else None
-    collected = played.world(dataset.config) if dataset else {}
+    dataset = None
+    collected: dict[str, Any] = {}
+    if data:
+        dataset = open_dataset(data)
+        if dataset.domain != domain:
+            fault = f"these are states of {dataset.domain!r}, not of {domain!r}"
+            raise UserError(fault, data, "Name their domain.")
+        collected = played.world(dataset.config)
     played_world = world.played_world(played, collected, config)
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
@@ -63,14 +70,3 @@ def train_baseline(
         world.write_layout(files, engine, config, call.seed)
     numbers = env.episodes.counts() | env.episodes.recent()
     return Done(outcome_of(numbers))
-
-
-def _states_of(domain: str, data: Path) -> Any:
-    """A data file of states of the domain; of another one they are refused."""
-    from hypogoal.data import open_dataset
-
-    dataset = open_dataset(data)
-    if dataset.domain != domain:
-        fault = f"these are states of {dataset.domain!r}, not of {domain!r}"
-        raise UserError(fault, data, "Name their domain.")
-    return dataset

@@ -24,7 +24,6 @@ def audited(
     from hypogoal.evaluation.classifiers import classifier_of
     from hypogoal.evaluation.house import as_json
     from hypogoal.evaluation.plots import slug
-    from hypogoal.importing.labels import COLUMNS
 
     is_ensemble = Path(source).is_dir()
     if member is not None or call.typed or call.preset or call.resume or not (data or is_ensemble):
@@ -49,7 +48,7 @@ def audited(
         for goal in goals:
             classifier, _ = classifier_of(source, goal, call.device)
             findings = recorded.findings_of(classifier, dataset, goal)
-            recorded.write_next(draft.files / "next" / goal, COLUMNS, findings)
+            recorded.write_next(draft.files / "next" / goal, findings)
             parts.append(findings["numbers"])
             heading = {"name": slug(goal), "title": goal, "template": "audited", "folded": False}
             sections.append(heading | findings)

@@ -22,7 +22,7 @@ def compare(
     Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
     from hypogoal.evaluation import compare as beside
-    from hypogoal.evaluation.plots import slug
+    from hypogoal.evaluation.page import write
     from hypogoal.evaluation.run import evaluation_of, read_evaluation
 
     where = " ".join(map(str, runs))
@@ -39,13 +39,7 @@ def compare(
             do = "Choose runs of one experiment, evaluated alike."
             raise UserError("these runs cannot be compared", reason, do)
         page, figures, tables = beside.page_of(results, questions, [str(run) for run in runs])
-        index = draft.files / "index.html"
-        index.write_text(page, encoding="utf-8")
+        write(draft.files, page, figures)
         for name, table in tables.items():
             table.to_csv(draft.files / f"{name}.csv", index=False)
-        folder = draft.files / "figures"
-        folder.mkdir()
-        for drawn in figures:
-            path = folder / f"{slug(drawn.name)}.svg"
-            path.write_bytes(drawn.svg)
     return Done(beside.winners(beside.read_pairs(call.out)))
