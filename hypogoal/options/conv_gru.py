@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.utils.rnn import pack_padded_sequence
+from torch.nn.functional import linear
 
 from hypogoal.core.arrays import Bools, Columns, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
@@ -35,7 +35,7 @@ class PaperQNetwork(nn.Module):
     """Two of (convolution, BatchNorm, ReLU, pooling), a GRU, two dense layers.
 
     The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
-    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``).
+    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands behind pooling: the same function, cheaper.
     """
 
     HIDDEN = 512
@@ -46,12 +46,12 @@ class PaperQNetwork(nn.Module):
         self.features = nn.Sequential(
             nn.Conv2d(depth, 16, 3),
             nn.BatchNorm2d(16),
-            nn.ReLU(),
             nn.MaxPool2d(2),
+            nn.ReLU(),
             nn.Conv2d(16, 32, 3),
             nn.BatchNorm2d(32),
-            nn.ReLU(),
             nn.MaxPool2d(2),
+            nn.ReLU(),
             nn.Flatten(),
         )
         sides = [((side - 2) // 2 - 2) // 2 for side in (height, width)]
@@ -64,30 +64,40 @@ class PaperQNetwork(nn.Module):
         )
 
     def see(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> features float32 (N, F)."""
+        """uint8 (N, H, W, C) -> what the GRU's three gates take from each, float32 (N, 3 * ``HIDDEN``).
+
+        Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
+        """
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return self.features(pixels)
+        return linear(self.features(pixels), self.gru.weight_ih_l0, self.gru.bias_ih_l0)
 
     def forward(
         self,
-        features: Tensor,
+        seen: Tensor,
         windows: Tensor,
         lengths: Tensor,
     ) -> Tensor:
         """Values float32 (n, A) of the last states of windows.
 
-        ``windows`` int64 (n, T) say which of the features, float32 (N, F), each window has; of its T places the first
+        ``windows`` int64 (n, T) say which of the images :meth:`see` saw each window has; of its T places the first
         ``lengths`` (n,) are real.
         """
-        frames = features.index_select(0, windows.flatten()).view(*windows.shape, -1)
-        packed = pack_padded_sequence(
-            frames,
-            lengths.cpu(),
-            batch_first=True,
-            enforce_sorted=False,
-        )
-        _, last = self.gru(packed)
-        return self.values(last[0])
+        state = seen.new_zeros(len(windows), self.HIDDEN)
+        for place, images in enumerate(windows.unbind(1)):
+            following = self._next(seen.index_select(0, images), state)
+            is_real = (lengths > place)[:, None]
+            state = torch.where(is_real, following, state)
+        return self.values(state)
+
+    def _next(self, seen: Tensor, state: Tensor) -> Tensor:
+        """The GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
+        remembered = linear(state, self.gru.weight_hh_l0, self.gru.bias_hh_l0)
+        reset_of_image, update_of_image, new_of_image = seen.chunk(3, dim=1)
+        reset_of_state, update_of_state, new_of_state = remembered.chunk(3, dim=1)
+        reset = (reset_of_image + reset_of_state).sigmoid()
+        update = (update_of_image + update_of_state).sigmoid()
+        new = (new_of_image + reset * new_of_state).tanh()
+        return torch.lerp(new, state, update)
 
 
 @dataclass(frozen=True)
@@ -141,9 +151,9 @@ class PaperPolicies:
 def _act(network: PaperQNetwork, window: deque[Observations], observation: Observations) -> int:
     """The action in the last state of an execution, of which ``window`` has those before."""
     window.append(observation)
-    features = network.see(torch.from_numpy(np.stack(window)))
+    seen = network.see(torch.from_numpy(np.stack(window)))
     count = len(window)
-    values = network(features, torch.arange(count)[None], torch.tensor([count]))
+    values = network(seen, torch.arange(count)[None], torch.tensor([count]))
     return int(values.argmax())
 
 
@@ -204,7 +214,7 @@ class PaperLearner(Learner):
             rows = options == option
             network = self.members[option].online.eval()
             images, places = self._seen(self.windows[rows])
-            lengths = torch.from_numpy(self.lengths[rows])
+            lengths = tensor(self.lengths[rows], self.device)
             values = network(network.see(images), places, lengths)
             preferred = values.argmax(1)
             chosen[rows] = preferred.cpu().numpy()
@@ -252,18 +262,17 @@ class PaperLearner(Learner):
         most = self.config.recurrence
         now, shifted = path[:, :-1], path[:, 1:]
         following = np.where(length[:, None] < most, now, shifted)
-        lengths = torch.from_numpy(length)
-        later_lengths = torch.from_numpy(np.minimum(length + 1, most))
+        lengths = tensor(length, self.device)
+        later_lengths = tensor(np.minimum(length + 1, most), self.device)
         both = np.stack([now, following])
         images, places = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
         before, after = places
         online, target = member.online.train(), member.target
-        features = online.see(images)
-        values = online(features, before, lengths)
+        seen = online.see(images)
+        values = online(seen, before, lengths)
         with torch.no_grad():
-            next_online = online(features, after, later_lengths)
-            target_features = target.see(images)
-            next_target = target(target_features, after, later_lengths)
+            next_online = online(seen, after, later_lengths)
+            next_target = target(target.see(images), after, later_lengths)
 
         next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]

@@ -42,8 +42,9 @@ def test_windows_of_other_lengths_change_nothing() -> None:
     network = PaperQNetwork((64, 64, 3), 7).eval()
     windows, lengths = torch.tensor([[0, 1, 2, 3], [4, 2, 2, 2], [1, 1, 0, 0]]), torch.tensor([4, 2, 3])
     with torch.no_grad():
-        features = network.see(images)
-        together = network(features, windows, lengths)
+        features = network.features(images.permute(0, 3, 1, 2) / 255.0)
+        seen = network.see(images)
+        together = network(seen, windows, lengths)
         cell = torch.nn.GRUCell(features.shape[1], network.HIDDEN)
         cell.load_state_dict({name.removesuffix("_l0"): value for name, value in network.gru.state_dict().items()})
         for row, length, values in zip(windows, lengths, together, strict=True):
@@ -54,7 +55,7 @@ def test_windows_of_other_lengths_change_nothing() -> None:
             for feature in features[real]:
                 state = cell(feature[None], state)
             torch.testing.assert_close(network.values(state)[0], values, atol=1e-5, rtol=0)
-        shorter = network(features, windows[:1, 1:], torch.tensor([3]))
+        shorter = network(seen, windows[:1, 1:], torch.tensor([3]))
     assert not torch.allclose(shorter[0], together[0], atol=1e-4), "what came before is of no account"
 
 
