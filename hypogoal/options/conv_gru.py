@@ -68,8 +68,9 @@ class PaperQNetwork(nn.Module):
 
         Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
         """
+        weight, _, bias, _ = self.gru.all_weights[0]
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return linear(self.features(pixels), self.gru.weight_ih_l0, self.gru.bias_ih_l0)
+        return linear(self.features(pixels), weight, bias)
 
     def forward(
         self,
@@ -91,7 +92,8 @@ class PaperQNetwork(nn.Module):
 
     def _next(self, seen: Tensor, state: Tensor) -> Tensor:
         """The GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
-        remembered = linear(state, self.gru.weight_hh_l0, self.gru.bias_hh_l0)
+        _, weight, _, bias = self.gru.all_weights[0]
+        remembered = linear(state, weight, bias)
         reset_of_image, update_of_image, new_of_image = seen.chunk(3, dim=1)
         reset_of_state, update_of_state, new_of_state = remembered.chunk(3, dim=1)
         reset = (reset_of_image + reset_of_state).sigmoid()
