@@ -1,12 +1,15 @@
 """SMDP returns and the meta-policy's loss (Spec E1-E3)."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from corridor import Corridor
+from numpy.typing import NDArray
 
+from hypogoal.meta import smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, among
 from hypogoal.meta.ppo import Draws, MetaPolicy, clipped_surrogate
@@ -110,23 +113,49 @@ def test_the_papers_network_has_the_size_that_its_deviation_gives() -> None:
     assert 400_000 < size < 450_000
 
 
+def draws_in(states: NDArray[np.int64]) -> Draws:
+    """The first and the second of two options in turn, each with probability one half."""
+    count = len(states)
+    return Draws(
+        states,
+        offered=np.ones((count, 2), dtype=np.bool_),
+        drawn=(states[:, None] % 2).astype(np.float32),
+        log_prob=np.full(count, np.log(0.5), dtype=np.float32),
+    )
+
+
 def test_the_value_that_is_learned_is_what_decisions_return() -> None:
     """Spec E1, E2: where each decision returns .5 and ends its episode, every state is worth .5."""
     policy = MetaPolicy(Corridor(4), 2, MetaConfig(decisions=32, meta_batch=16), 0)
-    states, over = np.arange(32) % 5, np.ones(32, dtype=np.bool_)
-    draws = Draws(
-        states,
-        offered=np.ones((32, 2), dtype=np.bool_),
-        drawn=(states[:, None] % 2).astype(np.float32),
-        log_prob=np.full(32, np.log(0.5), dtype=np.float32),
-    )
+    states = np.arange(32) % 5
     outcomes = replace(
         Outcome.zeros(32),
         environments=np.repeat(np.arange(4), 8),
         returns=np.full(32, 0.5),
         discounts=np.full(32, 0.9),
         next_ids=states,
-        terminated=over,
+        terminated=np.ones(32, dtype=np.bool_),
     )
-    values = [policy.update(draws, outcomes)["value"] for _ in range(20)]
+    values = [policy.update(draws_in(states), outcomes)["value"] for _ in range(20)]
     assert abs(values[0]) < 0.1 and values[-1] == pytest.approx(0.5, abs=0.1)
+
+
+def test_credit_ends_with_an_episode_and_with_an_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec E1: of decisions side by side none is credited with what another environment's, or episode's, returned."""
+    asked: list[tuple[NDArray[np.bool_], ...]] = []
+
+    def noted(*given: Any) -> Any:
+        asked.append(given)
+        return smdp_advantages(*given)
+
+    monkeypatch.setattr(smdp, "smdp_advantages", noted)
+    outcomes = replace(
+        Outcome.zeros(6),
+        environments=np.repeat([0, 1], 3),
+        terminated=np.array([True, False, False, False, False, False]),
+        truncated=np.array([False, False, False, False, True, False]),
+    )
+    MetaPolicy(Corridor(2), 2, MetaConfig(decisions=6, meta_batch=6), 0).update(draws_in(np.arange(6) % 5), outcomes)
+    *_, terminated, ended, _ = asked[0]
+    assert terminated.tolist() == outcomes.terminated.tolist()
+    assert ended.tolist() == [True, False, True, False, True, True]
