@@ -1,19 +1,25 @@
 """Observations that are no pictures, in domains made from Gymnasium environments (Spec B6)."""
 
+from pathlib import Path
 from typing import Any
 
 import corridor_env
 import gymnasium
 import numpy as np
 import pytest
+from command_line import run, settings, trusting
 from corridor_env import SENSED
 from gymnasium import spaces
 
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import open_dataset, write_dataset
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig
 from hypogoal.domains.gymnasium.reader import reader_of
+from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.setup import Setup, make_engine, of_ensemble
 from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised
 
 NAMES = (*(f"layout[{number}]" for number in range(8)), "noise", "place[0]", "place[1]")
@@ -108,3 +114,18 @@ def test_numbers_are_standardised_and_cut() -> None:
     assert seen.dtype == NUMBERS and seen[1].tolist() == [DEVIATIONS, 0.0]
     np.testing.assert_allclose(seen[0], [(5 - mean[0]) / deviation[0], 0.5], rtol=1e-5)
     assert [part.tolist() for part in standard_of((2,))] == [[0, 0], [1, 1]]
+
+
+def test_agents_see_numbers_by_the_standard_that_members_have(tmp_path: Path) -> None:
+    """Spec C2, D1: that of the training data, which an engine does not know by itself."""
+    data, made = tmp_path / "data.h5", tmp_path / "ensemble"
+    run("collect", "corridor_env:SENSED", "--out", data, "-q", *settings("steps=80", "heldout_seeds=4"))
+    with trusting():
+        run("train-ensemble", data, "--out", made, "-q", *settings("steps=2", "members=1", "workers=1"))
+    config = open_artefact(made).config
+    setup = Setup(SENSED, config, made, TrainMetaConfig.of(), 0)
+    engine = make_engine(setup)
+    of_ensemble(setup, engine)
+    mean, deviation = read_ensemble(made, config, "left-end").view.standard or (0, 1)
+    assert np.any(mean != 0) and engine.standard is not None
+    np.testing.assert_array_equal(engine.standard, [mean, deviation])
