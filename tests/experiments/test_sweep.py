@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from command_line import fails, refuses, run
-from toy import SMALL, write_toy
+from toy import DATA, PLAY, SMALL, write_toy
 
 from hypogoal.cells import Cell, read_plan, status_lines
 from hypogoal.core.artefacts import Draft
@@ -148,66 +148,71 @@ def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: p
 FAILS = f"""
 [[cells]]
 name = "worse"
-axes = ["seed"]
-command = "train-ensemble {{data}} --seed {{seed}} {SMALL} --set sub_goals=nowhere"
+command = "train-ensemble {{data}} {SMALL} --set sub_goals=nowhere"
 
 [[cells]]
 name = "lost"
-axes = ["seed"]
-command = "train-meta {{worse}} --seed {{seed}}"
+command = "train-meta {{worse}} {PLAY}"
 """
 
 
 def test_a_cell_that_fails_holds_only_those_that_need_it(whole: Path, out: Path, tmp_path: Path) -> None:
-    """Spec G4: told in one line with its log, at the end; the status says what waits; mended, only that is run."""
+    """Spec G4: told in one line with its log, at the end; the status says what waits; mended, only that is run.
+
+    What was evaluated of fewer cells is evaluated again.
+    """
     toy = write_toy(tmp_path / "toy.toml", "0-1", FAILS, evaluate=True)
     err = fails("run", toy, "--out", out, "--resume", "-q").err
-    assert err.count("\n") == 1 and "5 of 11 cells done, 2 failed, 4 waiting: failed worse/seed-0: " in err
-    assert str(out / "logs/worse/seed-0.log") in err and "nowhere" in err
+    assert err.count("\n") == 1 and "5 of 9 cells done, 1 failed, 3 waiting: failed worse: " in err
+    assert str(out / "logs/worse.log") in err and "nowhere" in err
     found = states(out)
-    assert [name for name, state in found.items() if state == "failed"] == ["worse/seed-0", "worse/seed-1"]
-    waiting = ["lost/seed-0", "lost/seed-1", "evaluation", "report"]
+    assert [name for name, state in found.items() if state == "failed"] == ["worse"]
+    waiting = ["lost", "evaluation", "report"]
     assert [name for name, state in found.items() if state == "waiting"] == waiting
     head, *lines = run("status", out).out.splitlines()[:3]
-    assert head == f"{out}: 5 of 11 cells done, 2 failed, 4 waiting"
-    assert lines[0].startswith("  failed worse/seed-0: ") and "nowhere" in lines[0]
+    assert head == f"{out}: 5 of 9 cells done, 1 failed, 3 waiting"
+    assert lines[0].startswith("  failed worse: ") and "nowhere" in lines[0]
     before = made(out)
     toy.write_text(toy.read_text().replace(" --set sub_goals=nowhere", ""))
     run("run", toy, "--out", out, "--resume", "-q")
     assert {*states(out).values()} == {"done"}
-    assert renewed(before, out) == ["worse/seed-0", "worse/seed-1", *waiting]
+    assert renewed(before, out) == ["worse", *waiting]
+    assert "\nlost,train-meta,lost," in (out / "evaluation" / "results.csv").read_text()
 
 
 def test_a_stage_made_again(whole: Path, out: Path) -> None:
-    """Spec I7: ``--from`` a stage all that needs it, ``--only`` that stage; --force all. The same bytes each time."""
-    words, closing = ["run", whole / "toy.toml", "--out", out, "-q"], ["evaluation", "report"]
-    agents, expected = ["agent/seed-0", "agent/seed-1"], bytes_of(out)
-    for given, again, waiting in (
-        (["--only", "train-meta"], agents, closing),
-        (["--resume"], closing, []),
-        (["--from", "evaluate"], closing, []),
-        (["--force"], [cell.name for cell in read_plan(out)], []),
+    """Spec I7: ``--only`` a stage, also with other settings; ``--from`` it all that needs it, the same bytes as before.
+
+    A setting of what is kept is refused.
+    """
+    agents, closing, expected = ["agent/seed-0", "agent/seed-1"], ["evaluation", "report"], bytes_of(out)
+    other = out.parent / "toy.toml"
+    other.write_text((whole / "toy.toml").read_text().replace("steps=200", "steps=208"))
+    before = made(out)
+    refuses("began agent/seed-0 otherwise: train-meta ", "run", other, "--out", out, "--resume", "-q")
+    refuses("otherwise", "run", other, "--out", out, "--from", "evaluate", "-q")
+    assert renewed(before, out) == []
+    for toy, given, again, waiting in (
+        (other, ["--only", "train-meta"], agents, closing),
+        (other, ["--resume"], closing, []),
+        (whole / "toy.toml", ["--from", "train-meta"], [*agents, *closing], []),
     ):
         before = made(out)
-        run(*words, *given)
+        run("run", toy, "--out", out, "-q", *given)
         assert renewed(before, out) == again
         assert [name for name, state in states(out).items() if state != "done"] == waiting
     same = [name for name in expected if name.endswith((".csv", ".safetensors"))]
     assert [name for name in same if bytes_of(out)[name] != expected[name]] == []
 
 
-def test_a_stage_made_again_may_have_other_settings(whole: Path, out: Path) -> None:
-    """A setting of what is kept is refused; what was evaluated of less is evaluated again."""
-    toy = out.parent / "toy.toml"
-    toy.write_text((whole / "toy.toml").read_text().replace("steps=200", "steps=208"))
+def test_force_makes_all_again(tmp_path: Path) -> None:
+    """Of a run of one cell."""
+    toy, out = tmp_path / "toy.toml", tmp_path / "out"
+    toy.write_text(f'format = 1\nevaluate = false\n[[cells]]\nname = "data"\ncommand = "{DATA}"\n')
+    run("run", toy, "--out", out, "-q")
     before = made(out)
-    refuses("began agent/seed-0 otherwise: train-meta ", "run", toy, "--out", out, "--resume", "-q")
-    refuses("otherwise", "run", toy, "--out", out, "--from", "evaluate", "-q")
-    assert renewed(before, out) == []
-    run("run", toy, "--out", out, "--from", "train-meta", "-q")
-    assert renewed(before, out) == ["agent/seed-0", "agent/seed-1", "evaluation", "report"]
-    run("run", toy, "--out", out, "--resume", "--seed", "0-2", "-q")
-    assert "agent/seed-2,train-meta,agent,2," in (out / "evaluation" / "results.csv").read_text()
+    run("run", toy, "--out", out, "-q", "--force")
+    assert renewed(before, out) == ["data"]
 
 
 def test_what_a_run_refuses(whole: Path, out: Path, tmp_path: Path) -> None:
