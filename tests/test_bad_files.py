@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -40,6 +41,8 @@ DAMAGES: dict[str, Damage] = {
     "of another kind": lambda path: path.write_bytes(PICTURE if path.suffix != ".png" else b"step\n1\n"),
     "no UTF-8": lambda path: path.write_bytes(b"\xff" + path.read_bytes()),
 }
+# Of a file that a manifest lists every change is found in the same way, by its hash.
+OF_LISTED = ("missing", "cut off")
 # What a cut text may still be, and what is not looked for by its name.
 HARMLESS = {("own/preset.toml", "empty"), ("own/pictures/positive/0.png", "missing"), ("own/preset.toml", "cut off")}
 
@@ -69,13 +72,24 @@ def words_for(name: str, there: Path) -> list[str]:
     return [*READERS[name].format(run=there, out=out).split(), "-q"]
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("name", READERS)
+def cases() -> list[tuple[str, str]]:
+    """Each file with each damage that is one of its own."""
+    found = []
+    for name, damage in product(READERS, DAMAGES):
+        is_listed = not name.startswith("own/") and not name.endswith((MANIFEST, "data.h5"))
+        if is_listed and damage not in OF_LISTED:
+            continue
+        if damage == "no UTF-8" and not name.endswith(TEXTS):
+            continue
+        if (name, damage) not in HARMLESS:
+            found.append((name, damage))
+    return found
+
+
+@pytest.mark.parametrize(("name", "damage"), cases())
 def test_a_bad_file_is_one_line(there: Path, name: str, damage: str) -> None:
     """Spec A8, G2: which file it is, for the stage that reads it, and for ``verify`` if a manifest knows it."""
     path = there / name
-    if (name, damage) in HARMLESS or (damage == "no UTF-8" and path.suffix not in TEXTS):
-        pytest.skip("no such case")
     DAMAGES[damage](path)
     refuses(path.name if damage != "missing" else "", *words_for(name, there))
     known = damage != "missing" or path.name not in (MANIFEST, "data.h5")  # of a copy's input the original is there
