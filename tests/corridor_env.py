@@ -115,13 +115,6 @@ class Restless(CorridorEnv):
         return super().step(int(self.rng.integers(2)))
 
 
-class Lying(CorridorEnv):
-    """What it shows is not what its space says."""
-
-    def image(self) -> np.ndarray:
-        return super().image().astype(np.int32)
-
-
 class Grey(CorridorEnv):
     """Its images have no colours, and no axis for them."""
 
@@ -138,28 +131,10 @@ class Flipped(CorridorEnv):
         return super().image()[..., ::-1]
 
 
-class Stacked(CorridorEnv):
-    """Four frames, one behind the other, first."""
-
-    observation_space = spaces.Box(0, 255, (4, *SHAPE[:2]), np.uint8)
-
-
-class Turned(CorridorEnv):
-    """As many bytes as its space says, in another order."""
-
-    observation_space = spaces.Box(0, 255, (SHAPE[0] // 2, SHAPE[1] * 2, 3), np.uint8)
-
-
-def carries(env: gymnasium.Env) -> bool:
-    return env.unwrapped.carrying is not None  # type: ignore[attr-defined]
-
-
-GREY, STACKED, TURNED = (GymnasiumDomain(env, SUB_GOALS) for env in (Grey, Stacked, Turned))
-FRAMES = GymnasiumDomain(lambda: gymnasium.wrappers.FrameStackObservation(CorridorEnv(), 4), SUB_GOALS)
-RAISING = GymnasiumDomain(CorridorEnv, {"key": carries})
+GREY = GymnasiumDomain(Grey, SUB_GOALS)
 NAMELESS = GymnasiumDomain(CorridorEnv, {"rooms/low": at_left})
 TWICE = GymnasiumDomain(CorridorEnv, {"End": at_left, "end": at_right})
-WORDY, STEERED, RESTLESS, LYING = (GymnasiumDomain(env, SUB_GOALS) for env in (Wordy, Steered, Restless, Lying))
+WORDY, STEERED, RESTLESS = (GymnasiumDomain(env, SUB_GOALS) for env in (Wordy, Steered, Restless))
 SENSED, FRAMED, MIXED = (GymnasiumDomain(env, SUB_GOALS) for env in (Sensed, Framed, Mixed))
 NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: False})
 ALWAYS = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "somewhere": lambda env: True})

@@ -126,13 +126,6 @@ class Unsaved(Straight):
         return {"table": self.table.clone()}
 
 
-class Values(Straight):
-    """It gives the actions' values."""
-
-    def greedy(self, ids: Any, options: Any, age: Any) -> Any:
-        return np.zeros((len(ids), self.engine.n_actions))
-
-
 class Negative(Straight):
     def greedy(self, ids: Any, options: Any, age: Any) -> Any:
         return np.full(len(ids), -1)

@@ -81,7 +81,6 @@ def places(tiny_run: Path, tmp_path: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("train-ensemble {none}.h5 --out {out}", "no such file"),
         ("train-ensemble {ensemble} --out {out}", "is a directory"),
         ("train-meta {data} --out {out}", "no artefact here"),
         ("train-meta {made}/options --out {out}", "'options' artefact, but ensemble is needed"),
@@ -91,7 +90,6 @@ def places(tiny_run: Path, tmp_path: Path) -> dict[str, Path]:
         ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
         ("collect doorkey --out {out} --seed -1", "greater than or equal to 0"),
         ("collect chess --out {out}", "unknown domain: chess"),
-        ("collect nosuchmodule:DOMAIN --out {out}", "cannot be loaded"),
         ("train-ensemble {data} --out {out} --diversity magic", "magic"),
         ("train-meta {ensemble} --out {out} --device tpu", "unknown device"),
         ("evaluate {none}", "no such run: "),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import fails, refuses, settings
-from corridor_env import SUB_GOALS, CorridorEnv
+from corridor_env import SHAPE, SUB_GOALS, CorridorEnv
 from own_domain import CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -47,8 +47,8 @@ def labelling(value: Any) -> GymnasiumDomain:
 
 FITS_NOT = "an observation that does not fit its space"
 MALFORMED: list[tuple[Any, str]] = [
-    (giving(lambda image: image[:-1]), FITS_NOT),
-    (with_methods(reset=lambda self, **_: (1, {})), FITS_NOT),
+    (giving(lambda image: image.reshape(SHAPE[0] // 2, SHAPE[1] * 2, 3)), FITS_NOT),  # as many bytes
+    (with_methods(reset=lambda self, **_: (np.zeros(SHAPE, np.int32), {})), FITS_NOT),
     *((labelling(value), "the label of odd is no truth value") for value in ("no", NAN)),
 ]
 

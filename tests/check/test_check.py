@@ -284,8 +284,6 @@ def test_the_command_prints_a_line_for_each_law(monkeypatch: pytest.MonkeyPatch)
     assert told[-1].startswith("FAIL two engines") and "np_random" in told[-1]
     told = run("check", "corridor_env:SENSED", *small, "--network", "mlp").out.splitlines()
     assert len(told) == 9 and not any(line.startswith("FAIL") for line in told)
-    told = fails("check", "corridor_env:SENSED", *small, "--network", "doorkey").out.splitlines()
-    assert told[-1].startswith("FAIL logits: the network 'doorkey' does not take these observations")
     monkeypatch.chdir(TESTS.parent / "examples")
     run("check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide")
     refuses("nothing to check", "check")

@@ -63,7 +63,6 @@ def test_policies_share_the_steps() -> None:
         ("WORDY", "observations must be images, uint8 .* or numbers"),
         ("MIXED", "observations mix pictures with other values: 0. Give a Dict with each picture under a key"),
         ("STEERED", "actions must be Discrete"),
-        ("LYING", "an observation that does not fit its space"),
         ("NEVER", "on-the-moon has no positives"),
         ("ALWAYS", "somewhere has no negatives"),
     ],
