@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refuses, run, settings, trusting
+from command_line import run, settings, trusting
 from test_docs import DOCS, blocks
 
 from hypogoal.cli import main
@@ -92,13 +92,17 @@ def of_continuous_integration() -> list[str]:
 
 @pytest.mark.parametrize(("cell", "code"), [(1, 3), (0, 0)])
 def test_a_build_fails_by_the_module(cell: int, code: int, capsys: pytest.CaptureFixture[str]) -> None:
-    """Exit code 3 where the module says yes a cell too soon, else 0; one line of JSON."""
+    """Exit code 3 where the module says yes a cell too soon, else 0; one line of JSON; again where it is complete."""
     written(OF_MODULE, MODULE.format(column=CELL * cell))
+    words = of_continuous_integration()
     quick = settings("steps=900", "environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10", "mend=0")
-    assert main([*of_continuous_integration(), *quick, "-q"]) == code
-    told = json.loads(capsys.readouterr().out)
-    assert (told["failed"], told["fail_above"]) == (code == 3, 0.05)
-    assert all((share > 0.05) == (code == 3) for share in told["false_positives"].values())
+    for resumed in ([], ["--resume"]):
+        assert main([*words, *quick, "-q", *resumed]) == code
+        told = json.loads(capsys.readouterr().out)
+        assert (told["out"], told["failed"], told["fail_above"]) == (words[words.index("--out") + 1], code == 3, 0.05)
+        shares = told["false_positives"]
+        assert shares.keys() == {"policy", "play"}
+        assert all((share > 0.05) == (code == 3) for share in shares.values())
 
 
 @pytest.mark.parametrize(("block", "network"), [(OF_MODULE, MODULE.format(column=12)), (OF_LEROBOT, CLASSIFIER)])
@@ -115,11 +119,3 @@ def test_labels_by_hand_are_the_truth(block: str, network: str) -> None:
     run("import", "door.npz", "--out", "data/door.h5", "--sub-goal", "opened", "-q")
     told = run(*WORDS[1])
     assert "of 28 known failures" in told.out and Path("runs/audit/index.html").is_file()
-
-
-def test_policies_see_one_camera() -> None:
-    """The page's first command is refused in one line where observations are several by key."""
-    written(OF_LEROBOT, CLASSIFIER)
-    text = "from hypogoal import GymnasiumDomain\nfrom tests.mixed import DoorEnv\n"
-    Path("my_domain.py").write_text(text + 'DOMAIN = GymnasiumDomain(DoorEnv, {"opened": lambda env: env.open})\n')
-    refuses("agents see pictures or numbers, not both", *WORDS[0])

@@ -15,7 +15,6 @@ from own_domain import CorridorDomain, TallCorridor
 from PIL import Image
 from toy_data import files_of, reseal
 
-from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey.engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.audit import CELL, FILMS
@@ -143,20 +142,6 @@ def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> Non
     assert truth["mended"] is None
     assert (truth["random_play"]["accuracy"], truth["before"]["fires_far"]) == (1.0, 0.0)
     assert truth["before"]["there"] >= 50
-
-
-def test_an_audit_fails_a_build(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Exit code 3, at a complete output too, and one line of JSON; the truth passes."""
-    words = [*CORRIDOR, *settings("steps=900", "mend=0"), "--fail-above", "0.05", "--json", "-q"]
-    for classifier, code, resumed in (("too_soon", 3, []), ("too_soon", 3, ["--resume"]), ("left_end", 0, [])):
-        out = tmp_path / classifier
-        capsys.readouterr()
-        assert main(["audit", f"{__name__}:{classifier}", "--out", str(out), *words, *resumed]) == code
-        told = json.loads(capsys.readouterr().out)
-        assert (told["out"], told["failed"], told["fail_above"]) == (str(out), code == 3, 0.05)
-        shares = told["false_positives"]
-        assert shares.keys() == {"policy", "play"}
-        assert (shares["policy"] > 0.05) == (code == 3)
 
 
 def test_executions_that_begin_inside_are_said(tmp_path: Path) -> None:
