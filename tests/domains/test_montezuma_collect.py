@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, States
-from hypogoal.domains.base import Domain, load_domain, settings_of
+from hypogoal.domains.base import settings_of
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma import states as montezuma_states
 from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig
@@ -209,15 +209,8 @@ def test_picture_and_pixel(room: int) -> None:
         assert np.ptp(columns) < game.SPRITE_WIDTH and np.ptp(rows) < game.SPRITE_HEIGHT
 
 
-def test_the_domain_interface() -> None:
-    """Spec B6, D4: found by name, with starts, distances and defaults that the stages take."""
-    domain = load_domain("montezuma")
-    assert isinstance(domain, Domain)
-    assert domain is DOMAIN
-    assert DOMAIN.starts[:4] == ("1L", "1M", "1R", "0-4")
-    bases = np.array(BASES)
-    assert DOMAIN.distance_to("climb-down-ladder", bases[:1] + np.array([0, 5, 0])).tolist() == [5]
-    assert DOMAIN.pixel(bases).shape == (12, 2)
+def test_the_domains_defaults_are_those_of_its_stages() -> None:
+    """Spec B6, D4: each is another than without the domain."""
     for stage in ("train-ensemble", "train-options"):
         config, plain = settings_of(stage, "montezuma"), model_of(stage)()
         own = DOMAIN.defaults[stage]

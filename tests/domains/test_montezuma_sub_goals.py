@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hypogoal.core.progress import Progress
 from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig, rooms_of
-from hypogoal.domains.montezuma.emulator import DOWN, FACTS, LEFT, NOOP, SPRITE_TOP, UP, Emulator
+from hypogoal.domains.montezuma.emulator import DOWN, FACTS, LEFT, NOOP, ROOMS, SPRITE_TOP, UP, Emulator
 from hypogoal.domains.montezuma.env import BEGINNINGS, arrives, make_starts
 from hypogoal.domains.montezuma.ladders import BASES, LADDERS, TOPS, Ladder
+from hypogoal.domains.montezuma.states import gather
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ENEMIES, GATES, LASER_Y, SUB_GOALS, labels_of
 from hypogoal.evaluation.nearness import distances_of
 
@@ -21,7 +21,6 @@ LEFT_FIRE = 12
 ENEMY = [SimpleNamespace(**{"byte": "", **enemy}) for enemy in ENEMIES]
 MOVING = [enemy for enemy in ENEMY if enemy.byte]
 CLIMBED_UP = [ladder for ladder in LADDERS if ladder.steps_up]
-TINY = MontezumaConfig(states_per_room=40, unlabelled_per_room=8, heldout_per_room=6, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +130,15 @@ def test_lasers_kill_beside_the_places(emulator: Emulator, room: int) -> None:
 @pytest.mark.parametrize("name", ["climb-up-ladder", "pass-enemy-left", "pass-lasers"])
 def test_each_sub_goal_is_collected_alone(name: str) -> None:
     """A tenth of the labelled states or more are positive; unlabelled rooms have the sub-goal, or not."""
-    config = TINY.model_copy(update={"sub_goals": (name,)})
-    data = DOMAIN.collect(config, 3, Progress("collect", 1, quiet=True))
-    assert data.sub_goals == (name,)
-    assert 4 <= data.labelled.labels.sum() <= 30
-    rooms = set(data.heldout.origins["room"][data.heldout.labels[:, 0]].tolist())
     goal = SUB_GOALS[name]
+    labelled, unlabelled = rooms_of(MontezumaConfig(sub_goals=(name,)))
+    for room in labelled:
+        assert 4 <= gather("labelled", room, 40, 3, [goal]).labels.sum() <= 30
     clear = {place.room for index, place in enumerate(goal.places) if index not in goal.unclear}
-    assert rooms <= clear and len(rooms) >= len(clear) / 2
-    labelled, unlabelled = rooms_of(config)
+    others = {*range(ROOMS)} - clear
+    for rooms, positive in ((sorted(clear)[-3:], True), (sorted(others)[-2:], False)):
+        labels = [gather("heldout", room, 6, 3, [goal]).labels for room in rooms]
+        assert any(map(np.any, labels)) == positive
     assert not {*unlabelled} & {*labelled}
     assert [room in {place.room for place in goal.places} for room in unlabelled] == [True, False]
 

@@ -51,8 +51,7 @@ def forced_loop(failures: float, cap: int, environments: int) -> OptionLoop:
     return OptionLoop(engine, terminations, learner, chooser, Recorder(1, engine), config, GAMMA)
 
 
-@pytest.mark.parametrize("cap", [57, 500])
-@pytest.mark.parametrize("share", [0.9, 0.7, 0.3])
+@pytest.mark.parametrize(("share", "cap"), [(0.9, 57), (0.7, 500), (0.3, 57)])
 def test_forced_shares_of_failures_are_measured(share: float, cap: int) -> None:
     """Success, near and length lie within the binomial's interval of their true values (three in a million miss)."""
     loop = forced_loop(1 - share, cap, 64)

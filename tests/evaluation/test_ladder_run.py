@@ -122,13 +122,10 @@ def test_distances_are_those_of_the_tables(ladders, results):
     wanted = [1.5 * (10 * (validated[seed] + 1) + seed) for seed in (0, 1)]
     assert dbat["mean"]["validated"] == pytest.approx(np.mean(wanted))
     pairs = pd.read_csv(ladders / "evaluation/tables/distance-pairs.csv").set_index(["second", "quantity"])
-    best, mean = pairs.loc[ONE, "best"], pairs.loc[ONE, "mean"]
+    best = pairs.loc[ONE, "best"]
     assert best["ties"] == best["n"] == 4 and best["units"] == 2
-    assert mean["wins"] == mean["ties"] == 0  # its one member is D-BAT's nearer one
     assert {*pd.read_csv(ladders / "evaluation/tables/rooms-pairs.csv")["N"]} == {1, 2}
     assert results.facts["agents"] == {} and results.facts["missing"] == []
-    one = results.of(method=DBAT, member=1, seed=1, N=2, ladder="2-6", quantity="distance")["value"]
-    assert one.tolist() == [2 * (10 * 2 + 1)]
 
 
 def test_stops_are_kept_to_be_drawn(ladders, results):
