@@ -16,6 +16,7 @@ FEW = "--set members=2 --set workers=1 --set steps=20"
 GOALS = "--set sub_goals=collect-red-key,open-red-door"
 DOORKEY = "--set max_episode_steps=64 --set layout_seed=100"
 PLAY = f"--set steps=2048 {DOORKEY}"
+CONTROL = f"--set steps=1024 {DOORKEY}"
 SHORT = "--set environments=4 --set warm_up=50 --set steps=400 --set max_episode_steps=30"
 VISITED = "--set save_visited=5"
 
@@ -29,8 +30,8 @@ DOORKEY_RUN = {
     " --set threshold=unlabelled-split",
     "options": f"train-options {{run}}/ensemble --set steps=1024 {DOORKEY}",
     "meta": f"train-meta {{run}}/ensemble --options {{run}}/options {PLAY}",
-    "meta-random": f"train-meta {{run}}/ensemble {PLAY} --set chooser=random",
-    "meta-oracle": f"train-meta {{run}}/ensemble {PLAY} --set termination=oracle",
+    "meta-random": f"train-meta {{run}}/ensemble {CONTROL} --set chooser=random",
+    "meta-oracle": f"train-meta {{run}}/ensemble {CONTROL} --set termination=oracle",
     "ppo": f"train-baseline doorkey {PLAY}",
 }
 CORRIDOR_RUN = {

@@ -10,7 +10,7 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
-from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig
+from hypogoal.domains.rooms.domain import DOMAIN
 from studies import hypotheses, pages
 from studies.cells import collect_once, difference, interval, run_cells
 
@@ -137,10 +137,10 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 def test_a_study_keeps_its_data_and_refuses_others(tmp_path: Path) -> None:
     """Begun again, it goes on with the states it has; with other settings it says so."""
-    path, config = tmp_path / "data.h5", DoorKeyConfig(heldout_layouts=1)
+    path, config = tmp_path / "data.h5", DOMAIN.config_class(labelled=16, unlabelled=32)
     collect_once(DOMAIN, config, path)
     states = path.read_bytes()
     collect_once(DOMAIN, config, path)
     assert path.read_bytes() == states
-    with pytest.raises(UserError, match="heldout_layouts"):
-        collect_once(DOMAIN, config.model_copy(update={"heldout_layouts": 2}), path)
+    with pytest.raises(UserError, match="unlabelled"):
+        collect_once(DOMAIN, config.model_copy(update={"unlabelled": 48}), path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.domains.doorkey.engine import DROP, FORWARD, N_ACTIONS, PICKUP, START, TOGGLE, DoorKeyEngine
 from hypogoal.domains.doorkey.env import DOOR_LABELS, SUB_GOALS, DoorKeyEnv, GridLayout
 
-LAYOUTS = range(100, 140)
+LAYOUTS = range(100, 120)
 STEPS = 110
 MAX_STEPS = 50
 
@@ -105,15 +105,15 @@ def play_side_by_side(layout_seed: int, seen: Counter[str], wrong_key: str = "ha
 
 
 def test_engines_are_exact_to_minigrid() -> None:
-    """Spec B1, B2: pixels, rewards, ends and labels equal at every step of 40 layouts; all rules used."""
+    """Spec B1, B2: pixels, rewards, ends and labels equal at every step of 20 layouts; all rules used."""
     seen: Counter[str] = Counter()
     for layout_seed in LAYOUTS:
         play_side_by_side(layout_seed, seen)
     for event in ("pickup", "drop", "unlock", "close", "reopen", "in the doorway", "terminated", "truncated"):
-        assert seen[event] >= 20, (event, seen)
-    assert seen["hold 1"] >= 100
-    assert seen["hold 2"] >= 100
-    assert seen["hold 3"] >= 50
+        assert seen[event] >= 10, (event, seen)
+    assert seen["hold 1"] >= 50
+    assert seen["hold 2"] >= 50
+    assert seen["hold 3"] >= 25
 
 
 def test_wrong_keys_end_episodes() -> None:

@@ -113,7 +113,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path) -> None:
     """Spec B6: observations that are a dictionary of numbers; what is of pictures only is left out, or refused."""
     folder = tmp_path / "run"
     data, ensemble, options, meta = (folder / name for name in ("data.h5", "ensemble", "options", "meta"))
-    play = settings("steps=2500", "environments=4", "warm_up=200", "layout_seed=0")
+    play = settings("steps=800", "environments=4", "warm_up=200", "layout_seed=0")
     few = settings("unlabelled_seeds=1", "heldout_seeds=2")
     run("collect", "vector_goals:DOMAIN", "--out", data, "-q", *few)
     run("train-ensemble", data, "--out", ensemble, "-q", *settings("members=2", "workers=1"))

@@ -102,19 +102,6 @@ def test_members_start_the_same_whatever_the_ensemble() -> None:
     np.testing.assert_allclose(three.predict(observations)[:, :1], one.predict(observations), atol=1e-6)
 
 
-def test_tables_of_patches_do_not_change_what_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec C4: some steps through the plain network end where those through distinct patches end."""
-    observations, labels, unlabelled = toy()
-    config = TOY.model_copy(update={"steps": 4})
-    tabled = train(observations, labels, unlabelled, config, seed=0)
-    with monkeypatch.context() as patch:
-        patch.setattr(batches.patches, "make_tables", lambda *_: None)
-        plain = train(observations, labels, unlabelled, config, seed=0)
-    np.testing.assert_allclose(tabled.predict(unlabelled), plain.predict(unlabelled), atol=2e-3)
-    untrained = Ensemble("doorkey", (48, 48, 3), 2, torch_generator(0, "weights"))
-    assert abs(tabled.predict(unlabelled) - untrained.predict(unlabelled)).max() > 0.05
-
-
 @pytest.mark.parametrize("diversity", OBJECTIVES)
 def test_the_loss_is_that_of_equation_1(diversity: str) -> None:
     """Eq. (1): the sum of labelled losses + weight x sum over ordered pairs, at every step."""

@@ -23,7 +23,7 @@ from tests.importing.robot_data import LENGTHS, STATE, TOP, WRIST
 from tests.importing.states import SIDE, save_minari
 from tests.importing.test_odd import turned
 
-FORMATS = [("v2.1", "video"), ("v3.0", "video"), ("v2.1", "image"), ("v3.0", "image")]
+FORMATS = [("v2.1", "video"), ("v3.0", "video"), ("v3.0", "image")]
 LABEL = ["--label", "reached=next.success"]
 UPRIGHT = np.random.default_rng(0).integers(0, 255, (3, 5, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
 Change: TypeAlias = Callable[[Path], None]
@@ -87,7 +87,7 @@ def test_keys_are_chosen_and_one_picture_alone_is_a_picture(datasets: Path, tmp_
 
 def test_labels_of_last_frames_and_of_a_table(datasets: Path, tmp_path: Path) -> None:
     """Spec I6: the last n frames of successful episodes; a table's frames, where other episodes are unlabelled."""
-    source, out = datasets / "v2.1-image", tmp_path / "data.h5"
+    source, out = datasets / "v3.0-image", tmp_path / "data.h5"
     for state, label in frames_of(imported(source, out, "--key", STATE, "--label", "reached=last:3")):
         episode = next(e for e in range(6) if np.abs(robot_data.places(e) - state[0]).min() < 1e-6)
         assert label in (None, state[0] >= robot_data.places(episode)[-3] and episode != 2)
@@ -105,7 +105,7 @@ def test_labels_of_a_function(datasets: Path, tmp_path: Path, monkeypatch: pytes
     monkeypatch.syspath_prepend(str(tmp_path))
     far = f"def far(state): return state[0] > 0.5\ndef by_key(seen): return far(seen[{STATE!r}])\n"
     (tmp_path / "rules.py").write_text(far)
-    source, out = datasets / "v2.1-image", tmp_path / "data.h5"
+    source, out = datasets / "v3.0-image", tmp_path / "data.h5"
     for rule, keys, every in (("far", [STATE], "1"), ("by_key", [STATE, TOP], "2")):
         chosen = [word for key in keys for word in ("--key", key)]
         data = imported(source, out, *chosen, "--label", f"reached=rules:{rule}", "--every", every)

@@ -9,13 +9,13 @@ import gymnasium
 import numpy as np
 import pytest
 from command_line import run, settings, trusting
-from corridor_env import LENGTH, CorridorEnv, Flipped, Grey
+from corridor_env import CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -120,14 +120,6 @@ def test_agents_without_masks_play_masked_options(options: Options) -> None:
     met.clear()
     maskable.learn(64, callback=Met())
     assert met and not any(met)
-
-
-def test_what_a_session_shows_is_one_useful_line(options: Options) -> None:
-    """What there is to use is listed; ensembles and options say what they are."""
-    assert dir(hypogoal) == sorted(hypogoal.__all__)
-    assert repr(options) == "Options(4 of left-end, right-end: 2 members each, at most 10 steps)"
-    ensemble = options.ensembles[0]
-    assert repr(ensemble) == f"Ensemble(2 members, network 'doorkey', observations uint8 {ensemble.observation_shape})"
 
 
 class Falling(Terminations):
@@ -388,19 +380,3 @@ def test_maskable_ppo_learns_which_option_pays(options: Options) -> None:
     agent.learn(256)
     assert _first_choice(agent, env) >= MEMBERS
     assert env.step(_first_choice(agent, env))[2], "the task is over"
-
-
-def test_stable_baselines3_learns_a_classifiers_reward(made: Path) -> None:
-    """Spec D1: DQN, rewarded by the ensemble of the left end only, goes there; the environment pays at the right."""
-    env = hypogoal.SubgoalReward(made / "ensemble", "left-end").wrap(SameLayout(corridor()))
-    agent = DQN(
-        "MlpPolicy", env, learning_starts=100, buffer_size=2000, train_freq=2, target_update_interval=50, gamma=0.8,
-        learning_rate=1e-3, exploration_fraction=0.6, seed=0,
-    )  # fmt: skip
-    agent.learn(500)
-    observation, _ = env.reset()
-    rewards, terminated = [], False
-    while not terminated and len(rewards) < LENGTH:
-        observation, reward, terminated, _, _ = env.step(int(agent.predict(observation, deterministic=True)[0]))
-        rewards.append(reward)
-    assert rewards == [0.0, 1.0]

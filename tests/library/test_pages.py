@@ -17,14 +17,12 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``runs/demo/ensemble`` and ``runs/demo/meta``, as the demo leaves them, hardly trained."""
     folder = tmp_path_factory.mktemp("demo")
-    data, made = str(folder / "data.h5"), folder / "runs" / "demo"
-    layouts = settings("heldout_layouts=1", "unlabelled_seeds=1")
-    run("collect", "doorkey", "--out", data, "-q", *layouts)
+    made = folder / "runs" / "demo"
     few = settings("steps=2", "workers=1")
-    run("train-ensemble", data, "--out", made / "ensemble", "-q", *few)
+    run("train-ensemble", tiny_run / "data.h5", "--out", made / "ensemble", "-q", *few)
     play = settings("steps=320", "warm_up=100", "max_episode_steps=60")
     run("train-meta", made / "ensemble", "--out", made / "meta", "-q", *play)
     return folder

@@ -1,6 +1,5 @@
 """Spec A5, F, F7: a run of real, tiny artefacts is evaluated and drawn; what is missing is named."""
 
-import csv
 import json
 import re
 import shutil
@@ -65,7 +64,7 @@ def test_agents_are_grouped_and_counted_whole(tiny_run, results):
 
 def test_an_agent_without_a_whole_episode_is_said_to_be_one(corridor_run, tmp_path):
     """Spec F5: there is no success to speak of, neither 0 nor a dash."""
-    train_meta(corridor_run / "ensemble", tmp_path / "meta", steps=8, environments=4)
+    train_meta(corridor_run / "ensemble", tmp_path / "meta", steps=8, environments=4, max_episode_steps=30)
     numbers = evaluate(tmp_path).metrics
     assert "success" not in {*numbers[numbers["scope"] == ""]["quantity"]}
     page = page_of(tmp_path)
@@ -89,17 +88,13 @@ def test_members_are_judged_on_heldout_states(tiny_run, results):
     assert len(table[table["quantity"] == "best"]) == len(GOALS) + 1
 
 
-def test_thresholds_are_those_of_members(tiny_run):
+def test_thresholds_are_those_of_members(tiny_run, results):
     """Whatever rule set them."""
     source = open_artefact(tiny_run / "ensemble-none")
     wanted = read_ensemble(source.path, source.config, "open-red-door").thresholds.tolist()
     assert wanted[0] != 0.5
-    with (tiny_run / "evaluation" / "numbers.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["quantity"] == "threshold" and row["scope"] == "heldout"]
-    told = {
-        name: [float(row["value"]) for row in rows if row["artefact"] == name] for name in ("another", source.path.name)
-    }
-    assert told == {"another": [0.5] * 2, "ensemble-none": wanted}
+    for name, thresholds in (("another", [0.5] * 2), ("ensemble-none", wanted)):
+        assert results.of(artefact=name, quantity="threshold", scope="heldout")["value"].tolist() == thresholds
 
 
 def test_selection_counts_every_decision(tiny_run, results):
@@ -111,7 +106,7 @@ def test_selection_counts_every_decision(tiny_run, results):
     assert len(random) == 4
     assert random["chosen"].sum() == choices["chosen"].sum()
     assert random["expected"].sum() == pytest.approx(choices["chosen"].sum())
-    often = random["preference"][random["expected"] > 40]
+    often = random["preference"][random["expected"] > 20]
     assert len(often) and often.between(0.5, 1.7).all()
     overlaid = [name for name in results.arrays if name.startswith("terminations/meta/")]
     assert results.arrays[overlaid[0]].shape == (64, 64, 3)
@@ -205,10 +200,9 @@ def test_what_changed_since_is_said(tiny_copy):
     assert kept.name == "meta-episode-0.gif"
     assert not [line for line in read_evaluation(tiny_copy).facts["missing"] if "since" in line]
     reseal(shutil.copytree(tiny_copy / "ppo", tiny_copy / "later"), seed=1)
-    text = page_of(tiny_copy, videos=0, force=True)
-    assert "later: made since this evaluation" in text and "image/gif" not in text
     (tiny_copy / "meta" / "options.safetensors").unlink()
     text = page_of(tiny_copy, force=True)
+    assert "later: made since this evaluation" in text
     assert "no film of an episode: " in text and "image/gif" not in text
     with pytest.raises(UserError, match=r"options\.safetensors"):
         report(tiny_copy, videos=1, force=True)
