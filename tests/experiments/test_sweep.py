@@ -206,13 +206,15 @@ def test_a_stage_made_again(whole: Path, out: Path) -> None:
 
 
 def test_force_makes_all_again(tmp_path: Path) -> None:
-    """Of a run of one cell."""
-    toy, out = tmp_path / "toy.toml", tmp_path / "out"
-    toy.write_text(f'format = 1\nevaluate = false\n[[cells]]\nname = "data"\ncommand = "{DATA}"\n')
+    """And what was made by a cell that is none any more is gone."""
+    toy, out, head = tmp_path / "toy.toml", tmp_path / "out", "format = 1\nevaluate = false\n"
+    data, other = (f'[[cells]]\nname = "{name}"\ncommand = "{DATA}"\n' for name in ("data", "other"))
+    toy.write_text(head + data + other)
     run("run", toy, "--out", out, "-q")
     before = made(out)
+    toy.write_text(head + data)
     run("run", toy, "--out", out, "-q", "--force")
-    assert renewed(before, out) == ["data"]
+    assert renewed(before, out) == ["data"] and not (out / "other.h5").exists()
 
 
 def test_what_a_run_refuses(whole: Path, out: Path, tmp_path: Path) -> None:
