@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import product
 
 from hypogoal.core.config import setting
-from hypogoal.experiments.choosing import SOLVABLE
+from hypogoal.experiments.built_in import SOLVABLE
 from hypogoal.experiments.experiment import LAYOUTS, SEEDS, Command, Integers, Names, agents_of, experiment
 
 

@@ -141,14 +141,17 @@ class _Network:
 
     def members(self) -> None:
         """Their weights come from the seed."""
-        for weights, others in zip(self.ensemble().parameters(), self.ensemble().parameters(), strict=True):
-            promise(torch.equal(weights, others), "two ensembles of one seed differ", ANEW)
+        first, second = self.ensemble(), self.ensemble()
+        for weights, others in zip(first.parameters(), second.parameters(), strict=True):
+            is_same = torch.equal(weights, others)
+            promise(is_same, "two ensembles of one seed differ", ANEW)
 
     def gradients(self) -> None:
         """Every weight that is not frozen learns."""
         ensemble = self.ensemble()
         member, _ = ensemble.members
-        member(self.inputs(ensemble)).square().sum().backward()
+        logits = member(self.inputs(ensemble))
+        logits.square().sum().backward()
         for name, weight in member.named_parameters():
             learns = weight.grad is not None and weight.grad.any()
             fault = f"weight {name} gets no gradient"

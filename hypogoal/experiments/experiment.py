@@ -36,13 +36,13 @@ STAGE = "stage"  # an argument that is no setting: gives a stage's settings, as 
 LAYOUTS = "layouts, each with an agent of its own"
 SEEDS = "run seeds, each with ensembles of its own"
 EXPERIMENTS = {
-    "doorkey": "hypogoal.experiments.doorkey:doorkey",
-    "choosing": "hypogoal.experiments.choosing:choosing",
-    "montezuma-ladders": "hypogoal.experiments.ladders:montezuma_ladders",
-    "rooms": "hypogoal.experiments.rooms:rooms",
-    "figure3": "hypogoal.experiments.ladders:figure3",
-    "figure4": "hypogoal.experiments.ladders:figure4",
-    "figure6": "hypogoal.experiments.doorkey:figure6",
+    "doorkey": "hypogoal.experiments.built_in:doorkey",
+    "choosing": "hypogoal.experiments.built_in:choosing",
+    "montezuma-ladders": "hypogoal.experiments.built_in:montezuma_ladders",
+    "rooms": "hypogoal.experiments.built_in:rooms",
+    "figure3": "hypogoal.experiments.built_in:figure3",
+    "figure4": "hypogoal.experiments.built_in:figure4",
+    "figure6": "hypogoal.experiments.built_in:figure6",
 }
 Names: TypeAlias = tuple[str, ...]
 Integers: TypeAlias = tuple[int, ...]

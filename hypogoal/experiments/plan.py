@@ -119,7 +119,10 @@ def _with_shared(
     ``UserError``.
     """
     stage, *rest = words
-    values, typed = load_stage(stage).parsed([*rest, "--out", stage])
+    loaded = load_stage(stage)
+    if "resume" in loaded.leaves_out:
+        raise UserError("a cell must be able to go on after a break, which this command is not", stage, MEND)
+    values, typed = loaded.parsed([*rest, "--out", stage])
     domain = values.get("domain") or domain
     more: list[str] = []
     if stage in STAGES:

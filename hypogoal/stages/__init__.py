@@ -1,5 +1,7 @@
 """The stages, one file each. A stage is one function: from it come a command and a Python function of the same name.
 
+The tools (:mod:`hypogoal.tools`) are made the same way.
+
 ``@stage(...)`` makes of ``train_meta(call, ensemble, *, options=None)`` the command ``hypogoal train-meta ENSEMBLE
 --options PATH --out OUT`` and the function ``hypogoal.train_meta(ensemble, out, options=...)``, with the same
 arguments, settings and checks. What takes time to import is imported when it is called, so that ``--help`` is quick.
@@ -33,8 +35,9 @@ WIDTH = 100  # of tables
 # Options that stages leave out which do not train, or have no settings.
 NO_TRAINING = ("device", "tensorboard")
 NO_SETTINGS = ("preset", "seed", *NO_TRAINING)
-LISTED = {  # every stage in its order, then tools, in a line; it is loaded when it is called
+LISTED = {  # every stage and tool in a line, after those whose outputs it reads; it is loaded when it is called
     "collect": "Collect labelled, unlabelled and held-out states.",
+    "import": "Make a data file of your arrays, pictures or recorded episodes.",
     "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
     "train-options": "Learn an option (a policy) for every member.",
     "train-meta": "Learn from the reward which options to choose.",
@@ -42,7 +45,6 @@ LISTED = {  # every stage in its order, then tools, in a line; it is loaded when
     "evaluate": "Compute every number of a run: accuracy, curves, choices.",
     "report": "Draw the report of an evaluated run: one HTML file.",
     "compare": "Put evaluated runs side by side: what differs, who wins.",
-    "import": "Make a data file of your arrays, pictures or recorded episodes.",
     "export": "Write an agent's episodes or an ensemble for other software.",
     "audit": "How often, and where, do policies fool a success classifier?",
 }

@@ -32,14 +32,17 @@ def compare(
     inputs = [evaluation_of(run).path for run in runs]
     with call.draft("comparison", {}, inputs) as draft:
         labels = beside.labels_of([run.resolve().as_posix() for run in runs])
-        results = dict(zip(labels, map(read_evaluation, runs), strict=True))
+        evaluations = map(read_evaluation, runs)
+        results = dict(zip(labels, evaluations, strict=True))
         questions = beside.shared(results)
         reason = beside.why_not(results, questions)
         if reason is not None:
             do = "Choose runs of one experiment, evaluated alike."
             raise UserError("these runs cannot be compared", reason, do)
-        page, figures, tables = beside.page_of(results, questions, [str(run) for run in runs])
+        paths = [str(run) for run in runs]
+        page, figures, tables = beside.page_of(results, questions, paths)
         write(draft.files, page, figures)
         for name, table in tables.items():
             table.to_csv(draft.files / f"{name}.csv", index=False)
-    return Done(beside.winners(beside.read_pairs(call.out)))
+    pairs = beside.read_pairs(call.out)
+    return Done(beside.winners(pairs))

@@ -51,6 +51,7 @@ def import_data(
     LeRobotDataset, robomimic's HDF5, a folder of films, whose labels are rules of ``label``. Or it is a data file, and
     ``label`` names a table of its states, which move to the labelled ones.
     """
+    from hypogoal import look
     from hypogoal.data import write_dataset
     from hypogoal.domains.base import IMPORTED
     from hypogoal.importing.arrays import episodes_of, read_arrays
@@ -59,7 +60,6 @@ def import_data(
     from hypogoal.importing.pictures import POSITIVE, read_pictures
     from hypogoal.importing.recordings import reader_of
     from hypogoal.importing.states import frames_of
-    from hypogoal.look import describe, outcome
 
     if not source.exists():
         raise UserError("no such file or folder", source, "Give one that there is.")
@@ -115,9 +115,9 @@ def import_data(
                 remarks = [f"not read: {counts}", *remarks]
     for line in remarks:
         say(f"hypogoal: {line}", err=True)
-    details = describe(call.out)
+    details = look.describe(call.out)
     run = "{run}" if call.out.name == "data.h5" else "runs/{out.stem}"
     return Done(
-        [f"states: {details['observations']}", *outcome(details)],
+        [f"states: {details['observations']}", *look.outcome(details)],
         then=f"train-ensemble {{out}} --out {run}/ensemble",
     )

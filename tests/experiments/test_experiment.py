@@ -84,6 +84,7 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
 
 NO_FUNCTION = [
     ('"collect doorkey"', '"rm -rf x"', "this is no stage"),
+    ('"collect doorkey"', '"import x.npz"', "a cell must be able to go on after a break"),
     ('"collect doorkey"', '"collect \'doorkey"', "this is no command"),
     ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "reads what no cell before it makes"),
     ('"data", "collect doorkey"', "[3]", r"yields \(name, command\)"),
