@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hypogoal.core.artefacts import DATA, kind_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
 from hypogoal.stages import NO_TRAINING, Call, Done, stage
@@ -52,6 +51,7 @@ def import_data(
     ``label`` names a table of its states, which move to the labelled ones.
     """
     from hypogoal import look
+    from hypogoal.core.artefacts import DATA, kind_of
     from hypogoal.data import write_dataset
     from hypogoal.domains.base import IMPORTED
     from hypogoal.importing.arrays import episodes_of, read_arrays
