@@ -18,6 +18,7 @@ from hypogoal.data import open_dataset, write_dataset
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig
 from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, make_engine, of_ensemble
 from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised
@@ -129,3 +130,12 @@ def test_agents_see_numbers_by_the_standard_that_members_have(tmp_path: Path) ->
     mean, deviation = read_ensemble(made, config, "left-end").view.standard or (0, 1)
     assert np.any(mean != 0) and engine.standard is not None
     np.testing.assert_array_equal(engine.standard, [mean, deviation])
+
+
+def test_baselines_see_numbers_standardised_where_a_standard_is_known() -> None:
+    """Spec F1: as options do; else as they come."""
+    engine = SENSED.make_engine(0, 2, 30)
+    numbers = engine.images(engine.ids)
+    np.testing.assert_array_equal(EngineEnv(engine).reset(), numbers)
+    engine.standard = np.full(11, 2.0, NUMBERS), np.full(11, 4.0, NUMBERS)
+    np.testing.assert_allclose(EngineEnv(engine).reset(), (numbers - 2) / 4)
