@@ -232,11 +232,9 @@ class TurnEngine(Engine):
         return every.reshape(-1, self.width)[ids]
 
     def images(self, ids: Ints) -> Observations:
-        """See ``Engine``; ``ValueError`` if a state is unknown or forgotten."""
+        """See ``Engine``; ``KeyError`` if a state is unknown or forgotten."""
         images = np.empty((len(ids), *self.observation_shape), self.observation_dtype)
         for row, state in enumerate(ids.tolist()):
-            if state not in self._seen:
-                raise ValueError(f"state {state} is forgotten or unknown; the oldest kept is {self.oldest}")
             images[row] = self._image(self._seen[state])
         return images
 

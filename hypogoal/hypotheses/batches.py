@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from hypogoal.core.arrays import Bools, Ints
+from hypogoal.core.arrays import Bools, Ints, tensor
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import require_classes
@@ -62,7 +62,7 @@ class TrainingStates(Resumable):
         self.labels, self.n_unlabelled = labels, len(unlabelled)
         self.view, self.device = ensemble.view, ensemble.thresholds.device
         self._origins = origins
-        self._targets = torch.from_numpy(labels.astype(np.int64)).to(self.device)
+        self._targets = tensor(labels.astype(np.int64), self.device)
         kept = self.view.to_change(observations), self.view.to_change(unlabelled)
         self._tables: patches.Tables | None = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
@@ -77,7 +77,7 @@ class TrainingStates(Resumable):
 
     def targets(self, labelled: Numbers) -> Tensor:
         """Classes int64 (B,) of labelled states (B,)."""
-        return self._targets[torch.from_numpy(labelled).to(self.device)]
+        return self._targets[tensor(labelled, self.device)]
 
     def logits(
         self,
@@ -112,8 +112,9 @@ class TrainingStates(Resumable):
             network.eval()
         chunks = []
         with torch.no_grad():
-            for some in np.split(np.arange(self.n_unlabelled), range(self._at_once, self.n_unlabelled, self._at_once)):
-                chunks.append(self.logits(networks, unlabelled=some)[1])
+            for some in torch.arange(self.n_unlabelled).split(self._at_once):
+                _, logits = self.logits(networks, unlabelled=some.numpy())
+                chunks.append(logits)
         return torch.cat(chunks, dim=1)
 
     def batches(

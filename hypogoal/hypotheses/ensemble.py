@@ -88,7 +88,7 @@ class Ensemble(nn.Module):
         view: View | None = None,
     ):
         super().__init__()
-        self.observation_shape = tuple(int(size) for size in observation_shape)
+        self.observation_shape = tuple(observation_shape)
         self.view = view or FullView(self.observation_shape)
         self.network = networks.network_for(network, self.view.shape, self.view.dtype)
         built = []

@@ -37,6 +37,7 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from hypogoal.core.adam import Adam
+from hypogoal.core.arrays import tensor
 from hypogoal.diversity import Context, Objective, load_objective
 from hypogoal.hypotheses.batches import Numbers, TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -93,7 +94,7 @@ def fit(
             if config.unlabelled_bn and len(unlabelled):
                 with torch.no_grad():
                     states.logits(members, unlabelled=unlabelled)  # for BatchNorm's running statistics
-        numbers = torch.from_numpy(unlabelled).to(states.device)
+        numbers = tensor(unlabelled, states.device)
         context = Context(classes, on_labelled, on_unlabelled, frozen_logits[:, numbers], positives)
 
         labelled_losses = torch.stack([cross_entropy(logits, classes, class_weights) for logits in on_labelled])

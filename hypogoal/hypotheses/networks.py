@@ -159,10 +159,8 @@ def load_network(name: str) -> Callable[[Shape], Parts]:
     An unknown network, one that cannot be loaded, or code that the user did not allow (see
     :mod:`hypogoal.core.own_code`) is a ``UserError``.
     """
-    if name in NETWORKS:
-        return lambda shape: NETWORKS[name](shape[-1])
     built_in = dict.fromkeys(NETWORKS, __name__)
-    function = load(name, "network", ENTRY_POINTS, built_in)
+    function: Any = NETWORKS.get(name) or load(name, "network", ENTRY_POINTS, built_in)
     if not callable(function):
         raise UserError(
             "this is not a member network",

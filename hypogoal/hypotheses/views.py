@@ -55,7 +55,7 @@ class View(nn.Module):
     """
 
     Settings: ClassVar[type[Config]] = Config
-    changes: ClassVar[bool] = False
+    changes = False
     dtype: DType = PICTURE
     shape: Shape
 
@@ -154,11 +154,6 @@ def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype:
     kind: type[Any] = load_class(name, "view", View, {}, ENTRY_POINTS)
     chosen = resolve(kind.Settings, assigned(settings), stage=name)
     view: View = kind(observation_shape, chosen)
-    try:
-        _ = view.state_dict(), view.shape
-    except AttributeError:
-        do = "Call super().__init__() and set self.shape in its __init__."
-        raise UserError("the view is not ready", name, do) from None
     if view.dtype != dtype:
         raise UserError(f"the view is of {view.dtype}, these observations are {dtype}", name)
     return view

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 from torch.nn import Conv2d, Linear, ReLU
 
-from hypogoal.hypotheses.networks import AUTO
+from hypogoal.hypotheses.networks import AUTO, as_input
 from hypogoal.observations import Standard
 from hypogoal.options.networks import WIDTH, LightNetwork, embedding_for
 
@@ -50,8 +50,8 @@ class PaperMetaNetwork(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """uint8 (N, H, W, C) -> float32 (N, O + 1): a score per option, then the value."""
-        pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return self.outputs(self.dense(self.features(pixels)))
+        features = self.features(as_input(images))
+        return self.outputs(self.dense(features))
 
 
 def _outputs(width: int, options: int) -> Linear:

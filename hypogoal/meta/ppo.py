@@ -1,7 +1,7 @@
 """The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -67,11 +67,10 @@ class MetaPolicy(Chooser):
         self.generator = seeding.torch_generator(seed, "meta-draws")
         self.rng = seeding.rng_for(seed, "meta-batches")
         count = engine.count
-        self.running = Draws(  # the last one of every environment
-            state=np.zeros(count, np.int64),
+        self.running = replace(  # the last one of every environment
+            Draws.zeros(count),
             offered=np.zeros((count, options), np.bool_),
             drawn=np.zeros((count, self.head.remembered), np.float32),
-            log_prob=np.zeros(count, np.float32),
         )
         self.draws: list[Draws] = []  # decisions since the last update, as they ended,
         self.outcomes: list[Outcome] = []  # and what came of them

@@ -40,8 +40,7 @@ class Setup:
     @property
     def members(self) -> int:
         """Options of each sub-goal: one for each member, or for the truth."""
-        members: int = self.source["members"]
-        return 1 if self.config.termination == ends.ORACLE else members
+        return 1 if self.config.termination == ends.ORACLE else self.source["members"]
 
     @property
     def options(self) -> int:

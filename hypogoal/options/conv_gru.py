@@ -132,10 +132,6 @@ class PaperPolicies:
 
     def __init__(self, options: saved.SavedOptions):
         self.recurrence = options.config["recurrence"]
-        if not isinstance(self.recurrence, int):
-            fault = "these options remember their executions in another way than this version's"
-            place = f"recurrence={self.recurrence}"
-            raise UserError(fault, place, "Train them again with --set recurrence=N.")
         actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
         make = partial(PaperQNetwork, options.shape, actions)
         self.networks = []

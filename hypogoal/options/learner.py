@@ -55,7 +55,7 @@ class Learner(Part, ABC):
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    KEPT: ClassVar[tuple[str, ...]] = ("option_steps", "steps_since_positive")  # in artefacts, beside the weights
+    KEPT = ("option_steps", "steps_since_positive")  # in artefacts, beside the weights
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *KEPT)
 
     def __init__(
@@ -147,7 +147,7 @@ class Learner(Part, ABC):
         """
         self.load_weights(state)
         for name in self.KEPT:
-            setattr(self, name, saved_row(state, name, self.options, torch.int64))
+            setattr(self, name, saved_row(state, name, self.options))
 
 
 def load_learner(name: str) -> type[Learner]:

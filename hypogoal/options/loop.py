@@ -42,8 +42,17 @@ class OptionLoop(Resumable):
     """
 
     CHANGING = (
-        *("engine", "terminations", "learner", "chooser", "recorder", "visited"),
-        *("option", "began", "age", "inside", "returns"),
+        "engine",
+        "terminations",
+        "learner",
+        "chooser",
+        "recorder",
+        "visited",
+        "option",
+        "began",
+        "age",
+        "inside",
+        "returns",
     )
 
     engine: Engine

@@ -47,14 +47,14 @@ class CellEmbedding(nn.Module):
         """
         if tiles is not None:
             return self._looked_up(images, tiles)
-        pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
+        features = torch.relu(self.conv(as_input(images)))
+        return features.permute(0, 2, 3, 1).flatten(1)
 
     def _looked_up(self, codes: Tensor, tiles: Bytes) -> Tensor:
         if self._tiles is not tiles:
             self._tiles = tiles
             pixels = tensor(tiles.copy(), self.conv.weight.device)
-            self._pixels = pixels.permute(0, 3, 1, 2).flatten(1).float() / 255.0
+            self._pixels = as_input(pixels).flatten(1)
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
         # index_select, not embedding: the same, and its gradient takes a sixth of the time.
         return table.index_select(0, codes.flatten().long()).view(len(codes), -1)

@@ -49,10 +49,10 @@ def learned_by(part: Any) -> dict[str, float]:
     return numbers
 
 
-def saved_row(weights: Mapping[str, Tensor], name: str, options: int, dtype: Any) -> NDArray[Any]:
-    """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing or damaged."""
+def saved_row(weights: Mapping[str, Tensor], name: str, options: int) -> NDArray[Any]:
+    """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing."""
     row = weights.get(name)
-    if row is None or row.shape != (options,) or row.dtype != dtype:
+    if row is None or row.shape != (options,):
         fault = f"the weights do not fit the manifest (at {name})"
         raise UserError(fault, f"{options} options", AGAIN)
     return row.numpy().copy()

@@ -4,8 +4,6 @@ Where an engine knows what follows on each action, what an option does is a matt
 whose options are planned shows what its hypotheses are worth, whatever option learning makes of them.
 """
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +30,7 @@ class PlannedLearner(Learner):
         UserError: nobody knows what follows in this engine.
     """
 
-    CHANGING: ClassVar[tuple[str, ...]] = ("rng", "positives", *Learner.KEPT)  # it does not explore
+    CHANGING = ("rng", "positives", *Learner.KEPT)  # it does not explore
 
     def build(self, config: OptionConfig, seed: int) -> None:
         plan = plan_of(self.engine, self.terminations, config)

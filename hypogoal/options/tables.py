@@ -17,7 +17,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading, replacing
 from hypogoal.learners.episodes import LAST
 
-MAX_INTEGER = 2**53  # integers that a float holds exactly
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
 
 
@@ -66,9 +65,9 @@ class Episodes(Table):
     # Spec F5: as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
     succeeded: Bools
 
-    def last(self, count: int = LAST) -> Episodes:
-        """The last ``count`` episodes, or all where there are fewer."""
-        return self.at(slice(max(0, len(self.step) - count), None))
+    def last(self) -> Episodes:
+        """The last ``LAST`` episodes, or all where there are fewer."""
+        return self.at(slice(-LAST, None))
 
 
 @dataclass(frozen=True)
@@ -125,8 +124,8 @@ class Exploits(Table):
 def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, Doubles]:
     """Columns of a table of numbers, a CSV file with a header; float (n,) each.
 
-    ``columns`` are required, None for all that the file has. A file that is missing, too large, no table, or has other
-    cells than finite numbers of at most 2^53 (or, in a ``BLANK`` column, nothing) is a ``UserError``.
+    ``columns`` are required, None for all that the file has. A file that is missing, no table, or has other cells than
+    finite numbers (or, in a ``BLANK`` column, nothing) is a ``UserError``.
     """
     from pandas import read_csv
 
@@ -134,9 +133,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, Do
         frame = read_csv(path, dtype=str, encoding="utf-8-sig")
         frame = frame[[*(columns or frame)]].astype(np.float64)
     for name, values in frame.items():
-        exact = values.abs() < MAX_INTEGER  # no NaN, and an integer that has not lost digits
+        known = np.isfinite(values)
         if name in BLANK:
-            exact |= values.isna()
-        if not exact.all():
-            raise UserError("a number in the table is missing or too large", path, AGAIN)
+            known |= values.isna()
+        if not known.all():
+            raise UserError("a number in the table is missing", path, AGAIN)
     return {str(name): values.to_numpy() for name, values in frame.items()}

@@ -113,7 +113,7 @@ class Terminations(Part):
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
         """Go on with what an artefact kept."""
-        self.thresholds = saved_row(state, THRESHOLDS, self.options, torch.float32)
+        self.thresholds = saved_row(state, THRESHOLDS, self.options)
 
     def _all(self, ids: Ints) -> Floats:
         """Log-odds (n, O)."""

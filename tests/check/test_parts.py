@@ -37,7 +37,7 @@ BROKEN = [
     ("--learner", "Unsaved", "is kept: table is another one when loaded"),
     ("--termination", "Counts", "plays: reached gave int64 (4,)"),
     ("--termination", "Bare", "object has no attribute 'options': odd_parts.py, class Bare"),
-    ("--view", "Unready", "trains: the view is not ready"),
+    ("--view", "Unready", "object has no attribute 'shape': odd_parts.py, class Unready"),
     ("--view", "Few", "takes 2 positional arguments but 3 were given: Few.__init__"),
     ("--view", "OneRow", "trains: the view shows uint8 (1, 48, 48, 3) of 2 states"),
     ("--view", "Blackened", "trains: the view changes the observations"),

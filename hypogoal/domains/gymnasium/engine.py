@@ -57,7 +57,7 @@ class GymnasiumEngine(TurnEngine):
         count: int,
         *,
         max_steps: int,
-        memory: int = MEMORY,
+        memory: int,
         **arguments: Any,
     ):
         super().__init__()

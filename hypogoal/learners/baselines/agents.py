@@ -29,8 +29,14 @@ LOG_INTERVAL = 5_000  # environment steps
 UPDATED = "train/"  # before the names of the library's numbers of an update
 # What changes while an agent learns, where it has it: first counts, then what each environment showed last.
 CHANGING = (
-    *("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_n_calls", "exploration_rate"),
-    *("_last_obs", "_last_episode_starts"),
+    "num_timesteps",
+    "_n_updates",
+    "_episode_num",
+    "_current_progress_remaining",
+    "_n_calls",
+    "exploration_rate",
+    "_last_obs",
+    "_last_episode_starts",
 )
 REPLAY_COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -143,6 +149,8 @@ def make_agent(
             target_update_interval=chosen.target_interval * env.num_envs,  # it counts environment steps
         )
         agent.explore_rng = rng_for(seed, "explore")
+        agent.exploration_schedule = lambda _: epsilon(chosen, env.episodes)
+        agent.exploration_rate = 1.0
     elif env.num_envs > chosen.rollout:
         fault = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
         raise UserError(
@@ -186,9 +194,6 @@ def train(
     watch = Watch(env, checkpoints, log, progress)
     with own_randomness():
         agent = make_agent(env, chosen, seed, device)
-        if isinstance(agent, ExploringDQN) and isinstance(chosen, DQNSettings):
-            agent.exploration_schedule = lambda _: epsilon(chosen, env.episodes)
-            agent.exploration_rate = 1.0
         saved = checkpoints.load()
         log.restore(saved["log"] if saved else 0)
         if saved:

@@ -14,8 +14,6 @@ from hypogoal.domains.base import Engine
 from hypogoal.learners.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
 
-FIXED = "an engine's attributes are fixed, and it has no methods for single environments"
-
 
 class EngineEnv(VecEnv, Resumable):
     """All environments of an engine, with its primitive actions and images.
@@ -90,11 +88,11 @@ class EngineEnv(VecEnv, Resumable):
 
     def set_attr(self, *_: Any, **__: Any) -> None:
         """Not supported: an engine's attributes are fixed."""
-        raise NotImplementedError(FIXED)
+        raise NotImplementedError
 
     def env_method(self, *_: Any, **__: Any) -> list[Any]:
         """Not supported: an engine has no per-environment methods."""
-        raise NotImplementedError(FIXED)
+        raise NotImplementedError
 
     def env_is_wrapped(self, *_: Any, **__: Any) -> list[bool]:
         """An engine wears no Gymnasium wrappers."""
