@@ -19,16 +19,13 @@ import inspect
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-PairLoss: TypeAlias = Callable[["Tensor", "Tensor"], "Tensor"]
-EnsembleLoss: TypeAlias = Callable[["Context"], "Tensor"]
 
 ENTRY_POINTS = "hypogoal.diversity"
 OBJECTIVES: tuple[str, ...] = tuple(sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__)))
@@ -59,8 +56,8 @@ class Objective:
     """A diversity objective by name, of either kind: one of the two losses is given."""
 
     name: str
-    pair_loss: PairLoss | None = None
-    ensemble_loss: EnsembleLoss | None = None
+    pair_loss: Callable[[Tensor, Tensor], Tensor] | None = None
+    ensemble_loss: Callable[[Context], Tensor] | None = None
 
     def acts(self, members: int) -> bool:
         """Whether it has an effect on an ensemble with this number of members: pairs need two."""
@@ -81,8 +78,11 @@ def load_objective(name: str) -> Objective:
         if hasattr(loaded, kind):
             return Objective(name, **{kind: getattr(loaded, kind)})
     if not callable(loaded):
-        do = "Give a pair_loss(logits_a, logits_b) or an ensemble_loss(context)."
-        raise UserError("this is not a diversity objective", name, do)
+        raise UserError(
+            "this is not a diversity objective",
+            name,
+            "Give a pair_loss(logits_a, logits_b) or an ensemble_loss(context).",
+        )
     parameters = inspect.signature(loaded).parameters.values()
     required = [parameter for parameter in parameters if parameter.default is parameter.empty]
     if len(required) == 1:

@@ -12,12 +12,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from hypogoal.core import own_code
-from hypogoal.core.arrays import Bools, Bytes, Ints
+from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
-from hypogoal.observations import PICTURE, Observations, Standard
+from hypogoal.observations import PICTURE, DType, Observations, Shape, Standard
 
 if TYPE_CHECKING:
     import gymnasium
@@ -45,7 +45,7 @@ class Step(NamedTuple):
     """
 
     next_ids: Ints
-    rewards: NDArray[np.float32]
+    rewards: Floats
     terminated: Bools
     truncated: Bools
     succeeded: Bools | None = None
@@ -108,8 +108,8 @@ class Engine(Resumable, ABC):
 
     n_actions: int
     count: int
-    observation_shape: tuple[int, ...]
-    observation_dtype: np.dtype[Any] = PICTURE
+    observation_shape: Shape
+    observation_dtype: DType = PICTURE
     standard: Standard | None = None
     max_steps: int
     ids: Ints
@@ -310,11 +310,11 @@ class Domain(ABC):
 
     @property
     @abstractmethod
-    def observation_shape(self) -> tuple[int, ...]:
+    def observation_shape(self) -> Shape:
         """(H, W, C) for pictures, any shape for other observations."""
 
     @property
-    def observation_dtype(self) -> np.dtype[Any]:
+    def observation_dtype(self) -> DType:
         """uint8 for pictures, float32 for other observations."""
         return PICTURE
 
@@ -364,7 +364,7 @@ class Domain(ABC):
         """A picture of a room, uint8 (height, width, 3); needs ``pictures``."""
         raise NotImplementedError
 
-    def pixel(self, positions: Ints) -> NDArray[np.float64]:
+    def pixel(self, positions: Ints) -> Doubles:
         """The column and row of positions in that picture, (n, 2); needs ``pictures``."""
         raise NotImplementedError
 
@@ -378,8 +378,11 @@ def load_domain(name: str) -> Domain:
     name = "rooms" if name == "which-feature" else name  # so called in files of 0.23
     domain = REGISTERED.get(name)
     if domain is None and name == IMPORTED:
-        do = f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file."
-        raise UserError("the domain of these imported states is not known", name, do)
+        raise UserError(
+            "the domain of these imported states is not known",
+            name,
+            f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file.",
+        )
     domain = domain or own_code.load(name, "domain", ENTRY_POINTS, BUILT_IN)
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "Derive it from hypogoal.domains.base.Domain.")
@@ -397,7 +400,7 @@ def installed_domain(name: str) -> Domain | None:
         return None
 
 
-def layers_of(stage: str, domain: str, preset_name: str | None = None) -> list[tuple[Mapping[str, Any], str]]:
+def layers_of(stage: str, domain: str, preset_name: str | None) -> list[tuple[Mapping[str, Any], str]]:
     """What replaces the defaults of a stage's settings, and its source: the domain's own, then a preset's."""
     installed = installed_domain(domain)
     layers = []

@@ -26,6 +26,7 @@ from hypogoal.hypotheses.networks import at_once, inputs_of
 from hypogoal.observations import (
     NUMBERS,
     PICTURE,
+    DType,
     Observations,
     fields_of,
 )
@@ -72,7 +73,7 @@ def mean_state(observations: Observations) -> Observations:
     return mean.astype(observations.dtype)
 
 
-def by_key(values: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[Any]:
+def by_key(values: NDArray[np.floating], dtype: DType) -> NDArray[Any]:
     """Attributions (..., D) of mixed observations as float32 with a field for each key."""
     fields = fields_of((), dtype)
     states = values.shape[:-1]

@@ -98,8 +98,11 @@ class Ensemble(nn.Module):
         for member in built:
             weights += [*member.parameters(), *member.buffers()]
         if len({*weights}) < len(weights):
-            do = "Make new layers at every call, with weights from PyTorch's generator."
-            raise UserError("two members share weights", self.network, do)
+            raise UserError(
+                "two members share weights",
+                self.network,
+                "Make new layers at every call, with weights from PyTorch's generator.",
+            )
         self.members = nn.ModuleList(built)
         self.networks = tuple(map(networks.reordered, built))
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
@@ -133,8 +136,7 @@ class Ensemble(nn.Module):
         if dtype == NUMBERS and observations.dtype == np.float64:
             observations = observations.astype(NUMBERS)
         if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
-            kind = f"{observations.dtype} {observations.shape}"
-            raise UserError(NO_OBSERVATIONS, kind, f"Give {expected}.")
+            raise UserError(NO_OBSERVATIONS, f"{observations.dtype} {observations.shape}", f"Give {expected}.")
         return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
     def predictions(self, observations: Observations) -> Bools:

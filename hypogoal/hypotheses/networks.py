@@ -244,9 +244,11 @@ def _features(name: str, layers: Iterable[nn.Module], example: Tensor, shape: Sh
     except (RuntimeError, NotImplementedError, ValueError) as error:
         if place_of(error):
             raise
-        fault = f"the network {name!r} does not take these observations"
-        do = "Give another (mlp takes any), larger pictures, or your own, of float32 (N, C, H, W) or (N, *shape)."
-        raise UserError(fault, f"observation shape {tuple(shape)}: {error}", do) from None
+        raise UserError(
+            f"the network {name!r} does not take these observations",
+            f"observation shape {tuple(shape)}: {error}",
+            "Give another (mlp takes any), larger pictures, or your own, of float32 (N, C, H, W) or (N, *shape).",
+        ) from None
     if example._version > changes:
         raise UserError("the network changes its input, which all members see", name, "Have it change a copy.")
     kind = getattr(features, "dtype", type(features))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.arrays import Ints
+from hypogoal.core.arrays import Bytes, Ints
 from hypogoal.observations import spread_rows
 
 Ids = NDArray[np.int32]  # of patches, rows or colours
@@ -121,7 +121,7 @@ def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
 
 
 def _tables(
-    observations: NDArray[np.uint8],
+    observations: Bytes,
     windows: Sequence[tuple[int, int]],
 ) -> Tables:
     """The distinct patches of images, level by level: strips of distinct rows, bands of rows, then strips in bands."""
@@ -182,7 +182,7 @@ def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
     return ranks[values], np.flatnonzero(occurs)
 
 
-def _distinct_items(items: NDArray[np.uint8]) -> tuple[Ids, NDArray[np.uint8]]:
+def _distinct_items(items: Bytes) -> tuple[Ids, Bytes]:
     """Items (N, bytes) -> (indices of distinct items (N,), the distinct items in order of appearance)."""
     size = items.shape[1]
     together = np.ascontiguousarray(items).view(f"V{size}")

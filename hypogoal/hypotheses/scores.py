@@ -13,13 +13,11 @@ from hypogoal.core.arrays import (
     Ints,
 )
 
-Scores = dict[str, Doubles]
-
 
 def member_scores(
     predictions: Bools,
     labels: Bools,
-) -> Scores:
+) -> dict[str, Doubles]:
     """Spec F1: every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
 
     Undefined scores are NaN: recall without positives, balanced accuracy without positives or negatives, precision

@@ -21,7 +21,6 @@ ENTRY_POINTS = "hypogoal.thresholds"  # with which other packages add rules
 CERTAIN = 1e-12  # probabilities are clipped this far from 0 and 1
 BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
 Probabilities = Floats  # (states, K)
-Rule = Callable[[Probabilities, Bools, Probabilities], Any]
 
 
 def log_odds_of(probabilities: NDArray[Any]) -> Doubles:
@@ -51,7 +50,7 @@ def _cut(logits: Doubles) -> float:
     return float(1 / (1 + np.exp(-logits[cut : cut + 2].mean())))
 
 
-def threshold_rule(name: str) -> Rule:
+def threshold_rule(name: str) -> Callable[[Probabilities, Bools, Probabilities], Any]:
     """The rule of a setting; what is no number between 0 and 1, no rule and no function is a ``UserError``."""
     try:
         number = float(name)

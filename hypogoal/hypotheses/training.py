@@ -74,8 +74,11 @@ class EnsembleTraining(Resumable):
         saved: Mapping[str, Any] | None = None,
     ):
         if not len(unlabelled) and (objective_of(config) or config.teacher or config.threshold == SPLIT):
-            do = "Give some, or set diversity=none, threshold=0.5 and no teacher."
-            raise UserError("unlabelled states are needed to make members differ", None, do)
+            raise UserError(
+                "unlabelled states are needed to make members differ",
+                None,
+                "Give some, or set diversity=none, threshold=0.5 and no teacher.",
+            )
         origins = origins or views.StateOrigins()
         self.config, self.seed = config, seed
         self.observations, self.labels, self.unlabelled = observations, labels, unlabelled

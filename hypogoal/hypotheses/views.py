@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,7 +54,7 @@ class View(nn.Module):
         shape: of what members see of one.
     """
 
-    Settings: ClassVar[type[Config]] = Config
+    Settings: type[Config] = Config
     changes = False
     dtype: DType = PICTURE
     shape: Shape
@@ -167,8 +167,9 @@ def learn_from(view: View, labelled: Any, unlabelled: Any, origins: StateOrigins
     seen = np.asarray(view.see(two))
     wanted = (len(two), *view.shape)
     if seen.dtype != view.dtype or seen.shape != wanted:
-        fault = f"the view shows {seen.dtype} {seen.shape} of {len(two)} states"
-        raise UserError(fault, name, f"Show {view.dtype} {wanted}.")
+        raise UserError(
+            f"the view shows {seen.dtype} {seen.shape} of {len(two)} states", name, f"Show {view.dtype} {wanted}."
+        )
     if two.tobytes() != labelled[:2].tobytes():
         raise UserError("the view changes the observations", name, "Have it change a copy.")
 
@@ -180,8 +181,11 @@ def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
     most = np.inf if changed.dtype == view.dtype else 1
     if changed.shape != wanted or changed.dtype not in (view.dtype, NUMBERS) or changed.max() > most:
         shown = f"{changed.dtype} {changed.shape}, at most {changed.max()}"
-        do = f"Give {view.dtype} {wanted}, or float32 in 0..1."
-        raise UserError(f"the view changes a batch to {shown}", type(view).__name__, do)
+        raise UserError(
+            f"the view changes a batch to {shown}",
+            type(view).__name__,
+            f"Give {view.dtype} {wanted}, or float32 in 0..1.",
+        )
     return changed
 
 
@@ -193,6 +197,9 @@ def pools_of(view: View, labels: Bools, origins: Origins) -> tuple[list[Ints], f
         numbers = np.concatenate(pools)
     are_positives = np.isin(numbers, np.flatnonzero(labels)).all()
     if numbers.dtype.kind not in "iu" or not are_positives or not 0 < share < 1:
-        do = "Give lists of numbers of positives, none empty, and their share of a batch, between 0 and 1."
-        raise UserError(f"the view gave {len(pools)} pools and the share {share}", type(view).__name__, do)
+        raise UserError(
+            f"the view gave {len(pools)} pools and the share {share}",
+            type(view).__name__,
+            "Give lists of numbers of positives, none empty, and their share of a batch, between 0 and 1.",
+        )
     return pools, share

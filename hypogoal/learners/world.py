@@ -48,8 +48,11 @@ def make_engine(
         **arguments,
     )
     if keys := engine.observation_dtype.names:
-        do = "Reward another library's agent by the members: hypogoal.SubgoalReward (docs/library.md)."
-        raise UserError("agents see pictures or numbers, not both", ", ".join(keys), do)
+        raise UserError(
+            "agents see pictures or numbers, not both",
+            ", ".join(keys),
+            "Reward another library's agent by the members: hypogoal.SubgoalReward (docs/library.md).",
+        )
     if config.cap:
         shortest = engine.shortest_path()
         if shortest is None:

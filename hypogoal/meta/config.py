@@ -64,8 +64,9 @@ def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
         return list(dict.fromkeys(integers(text)))
     count = int(text or 1)
     if first is None or not 0 < count <= MOST:
-        do = f"Give 1 to {MOST}, or seeds as 2000-2099."
-        raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
+        raise UserError(
+            "which layouts, or how many?", f"layouts={layouts}", f"Give 1 to {MOST}, or seeds as 2000-2099."
+        )
     return list(range(first, first + count))
 
 

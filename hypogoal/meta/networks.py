@@ -6,7 +6,7 @@ from torch.distributions import Normal
 from torch.nn import Conv2d, Linear, ReLU
 
 from hypogoal.hypotheses.networks import AUTO, as_input
-from hypogoal.observations import Standard
+from hypogoal.observations import Shape, Standard
 from hypogoal.options.networks import WIDTH, LightNetwork, embedding_for
 
 
@@ -15,10 +15,10 @@ class LightMetaNetwork(LightNetwork):
 
     def __init__(
         self,
-        observation_shape: tuple[int, ...],
+        observation_shape: Shape,
         options: int,
-        standard: Standard | None = None,
-        name: str = "light",
+        standard: Standard | None,
+        name: str,
     ):
         embedding = AUTO if name == "light" else name
         super().__init__(embedding_for(observation_shape, standard, embedding))
@@ -35,7 +35,7 @@ class PaperMetaNetwork(nn.Module):
     The paper gives no sizes; 16, 32 and 32 channels with kernel 3 and stride 2, dense 256, are ours.
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], options: int):
+    def __init__(self, observation_shape: Shape, options: int):
         super().__init__()
         height, width, depth = observation_shape
         layers: list[nn.Module] = []

@@ -80,11 +80,10 @@ class MetaPolicy(Chooser):
     def refuse(cls, config: Any, engine: Engine) -> None:
         """The paper's network sees pictures only."""
         if config.meta_network == "paper" and engine.observation_dtype != PICTURE:
-            do = "Give --set meta_network=light."
             raise UserError(
                 "the paper's networks see pictures only",
                 "meta_network=paper",
-                do,
+                "Give --set meta_network=light.",
             )
 
     @classmethod

@@ -3,7 +3,7 @@
 import copy
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -46,9 +46,9 @@ class Options:
     policies: Policies
     ends: Terminations
     timeout: int
-    mask_reached: bool = True
-    domain: str = ""
-    domain_config: Mapping[str, Any] = field(default_factory=dict)
+    mask_reached: bool
+    domain: str
+    domain_config: Mapping[str, Any]
 
     def __repr__(self) -> str:
         goals = ", ".join(self.sub_goals)

@@ -85,9 +85,11 @@ class Learner(Part, ABC):
     @classmethod
     def policies(cls, options: SavedOptions) -> Policies:
         """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
-        fault = "these options need their domain's engine, which is not in the artefact"
-        do = "Load options of the light or the paper's network."
-        raise UserError(fault, f"network={options.config['network']}", do)
+        raise UserError(
+            "these options need their domain's engine, which is not in the artefact",
+            f"network={options.config['network']}",
+            "Load options of the light or the paper's network.",
+        )
 
     @abstractmethod
     def build(self, config: Any, seed: int) -> None:
@@ -160,7 +162,10 @@ def make_policies(
 ) -> Policies:
     """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration."""
     if config["termination"] == ORACLE:
-        fault = "these options end at the true sub-goals, which only the domain's engine can see"
-        raise UserError(fault, "termination=oracle", "Load options that were trained with learned members.")
+        raise UserError(
+            "these options end at the true sub-goals, which only the domain's engine can see",
+            "termination=oracle",
+            "Load options that were trained with learned members.",
+        )
     shape = tuple(ensemble_config["observation_shape"])
     return load_learner(config["network"]).policies(SavedOptions(config, weights, shape))

@@ -47,11 +47,9 @@ class LightLearner(Learner):
     def refuse(cls, config: LightConfig, engine: Engine) -> None:
         """Other members' sub-goals may lie between the first and the last of several steps."""
         if config.n_step > 1 and config.experience != "own":
-            fault = "several steps at once are for an option's own member: others' sub-goals may lie among them"
-            setting = f"n_step={config.n_step}, experience={config.experience}"
             raise UserError(
-                fault,
-                setting,
+                "several steps at once are for an option's own member: others' sub-goals may lie among them",
+                f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
 

@@ -122,7 +122,7 @@ class OptionLoop(Resumable):
         self._finish_options(step, moved, learning=learning)
         return moved
 
-    def _choose(self, learning: bool = True) -> None:
+    def _choose(self, learning: bool) -> None:
         free = np.flatnonzero(self.option == NONE)
         if not len(free):
             return
@@ -133,8 +133,11 @@ class OptionLoop(Resumable):
         chosen = self.chooser.choose(free, ids, offered.copy())
         chosen = answer_of(self.chooser, "choose", chosen, np.int64, len(free), self.terminations.options - 1)
         if learning and not offered[np.arange(len(free)), chosen].all():
-            fault = f"choose gave options {chosen}, of which not all are offered"
-            raise UserError(fault, type(self.chooser).__name__, "Choose where 'offered' is true.")
+            raise UserError(
+                f"choose gave options {chosen}, of which not all are offered",
+                type(self.chooser).__name__,
+                "Choose where 'offered' is true.",
+            )
         self.option[free], self.began[free] = chosen, ids
         self.inside[free] = self.terminations.of_running(ids, chosen)
         self.age[free] = 0

@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
-from hypogoal.observations import NUMBERS, PICTURE, Standard, standardised
+from hypogoal.observations import NUMBERS, PICTURE, Shape, Standard, standardised
 
 CELL = 8  # pixels
 WIDTH = 128  # of dense layers
@@ -27,7 +27,7 @@ class CellEmbedding(nn.Module):
 
     CHANNELS = 8
 
-    def __init__(self, observation_shape: tuple[int, ...]):
+    def __init__(self, observation_shape: Shape):
         super().__init__()
         height, width, depth = observation_shape
         self.conv = nn.Conv2d(
@@ -67,7 +67,7 @@ class PictureEmbedding(nn.Module):
     Where strides would not reach the last pixels, there is a margin of zeros, which costs less than to pad the pixels.
     """
 
-    def __init__(self, observation_shape: tuple[int, ...]):
+    def __init__(self, observation_shape: Shape):
         super().__init__()
         height, width, depth = observation_shape
         self.first = nn.Conv2d(
@@ -125,8 +125,8 @@ class OwnEmbedding(FullView):
     def __init__(
         self,
         name: str,
-        observation_shape: tuple[int, ...],
-        standard: Standard | None = None,
+        observation_shape: Shape,
+        standard: Standard | None,
     ):
         super().__init__(observation_shape, NUMBERS if standard else PICTURE, standard)
         network = build_network(name, observation_shape, None)
@@ -144,7 +144,7 @@ class OwnEmbedding(FullView):
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
 
 
-def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None, name: str = AUTO) -> Embedding:
+def embedding_for(observation_shape: Shape, standard: Standard | None, name: str) -> Embedding:
     """The embedding of this ``name``; a ``UserError`` where the observations do not suit it.
 
     ``auto`` is numbers where there is a ``standard``, else cells, or convolutions where whole cells do not fill the
@@ -157,8 +157,11 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:
-        do = f"Scale them up: {SMALLEST} x {SMALLEST} at least, or multiples of {CELL}; or bring an embedding."
-        raise UserError("images are too small for the light networks", f"{height} x {width}", do)
+        raise UserError(
+            "images are too small for the light networks",
+            f"{height} x {width}",
+            f"Scale them up: {SMALLEST} x {SMALLEST} at least, or multiples of {CELL}; or bring an embedding.",
+        )
     return CellEmbedding(observation_shape) if whole else PictureEmbedding(observation_shape)
 
 
@@ -189,11 +192,11 @@ class LightQNetwork(LightNetwork):
 
     def __init__(
         self,
-        observation_shape: tuple[int, ...],
+        observation_shape: Shape,
         members: int,
         actions: int,
-        standard: Standard | None = None,
-        embedding: str = AUTO,
+        standard: Standard | None,
+        embedding: str,
     ):
         super().__init__(embedding_for(observation_shape, standard, embedding))
         self.members, self.actions = members, actions

@@ -36,16 +36,20 @@ def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most
         shown = f"{given.min()} to {given.max()}"
     else:
         return given
-    do = f"Give {np.dtype(dtype)} ({count},), from 0 to {most}."
-    raise UserError(f"{method} gave {shown}", type(part).__name__, do)
+    raise UserError(
+        f"{method} gave {shown}", type(part).__name__, f"Give {np.dtype(dtype)} ({count},), from 0 to {most}."
+    )
 
 
 def learned_by(part: Any) -> dict[str, float]:
     """The numbers of the updates that were due; anything but a dictionary is a ``UserError``."""
     numbers = part.learn()
     if not isinstance(numbers, dict):
-        do = "Return a dict of numbers to log, empty where no update was due."
-        raise UserError(f"learn gave {numbers!r}", type(part).__name__, do)
+        raise UserError(
+            f"learn gave {numbers!r}",
+            type(part).__name__,
+            "Return a dict of numbers to log, empty where no update was due.",
+        )
     return numbers
 
 
@@ -53,6 +57,5 @@ def saved_row(weights: Mapping[str, Tensor], name: str, options: int) -> NDArray
     """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing."""
     row = weights.get(name)
     if row is None or row.shape != (options,):
-        fault = f"the weights do not fit the manifest (at {name})"
-        raise UserError(fault, f"{options} options", AGAIN)
+        raise UserError(f"the weights do not fit the manifest (at {name})", f"{options} options", AGAIN)
     return row.numpy().copy()

@@ -31,9 +31,11 @@ def require_observations(env: Env, ensemble: Ensemble) -> Reader:
     """A reader of an environment's observations; a ``UserError`` if the ensemble was trained on others."""
     reader, dtype, shape = reader_of(env.observation_space), ensemble.view.dtype, ensemble.observation_shape
     if (reader.shape, reader.dtype) != (shape, dtype):
-        mismatch = f"{reader.dtype} {reader.shape}, not {dtype} {shape}"
-        do = "Use the environment they were trained on, with its wrappers."
-        raise UserError("these members were trained on other observations", mismatch, do)
+        raise UserError(
+            "these members were trained on other observations",
+            f"{reader.dtype} {reader.shape}, not {dtype} {shape}",
+            "Use the environment they were trained on, with its wrappers.",
+        )
     return reader
 
 
@@ -77,8 +79,11 @@ class SubgoalReward:
         self.by = by
         self.least = {"any": 1, "vote": count // 2 + 1, "all": count}  # members that have to say so
         if by not in self.least and by not in range(count):
-            do = f"Choose one of {', '.join(self.least)}, or a member, 0 to {count - 1}."
-            raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
+            raise UserError(
+                "unknown rule for whether the sub-goal holds",
+                f"by={by!r}",
+                f"Choose one of {', '.join(self.least)}, or a member, 0 to {count - 1}.",
+            )
         thresholds = self.ensemble.thresholds_as_log_odds()
         self.ends = load_rule(termination)(
             None,

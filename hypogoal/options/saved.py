@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hypogoal.core.tensors import below, load_fitting
-from hypogoal.observations import Observations, standard_of
+from hypogoal.observations import Observations, Shape, standard_of
 from hypogoal.options.networks import LightQNetwork
 
 FILE = "options.safetensors"  # of an artefact
@@ -24,7 +24,7 @@ class SavedOptions:
 
     config: Mapping[str, Any]
     weights: Mapping[str, Tensor]
-    shape: tuple[int, ...]
+    shape: Shape
 
     @property
     def count(self) -> int:

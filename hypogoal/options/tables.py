@@ -35,8 +35,23 @@ class Table(Columns):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The table in a file; a ``UserError`` where it is missing or damaged, see :func:`read_table`."""
-        return cls.cast(*read_table(path, cls.names()).values())
+        """The table in a CSV file with a header.
+
+        A file that is missing, no table, or has other cells than finite numbers (or, in a ``BLANK`` column, nothing) is
+        a ``UserError``.
+        """
+        from pandas import read_csv
+
+        with reading(path, AGAIN, "the table"):
+            frame = read_csv(path, dtype=str, encoding="utf-8-sig")
+            frame = frame[[*cls.names()]].astype(np.float64)
+        for name, values in frame.items():
+            known = np.isfinite(values)
+            if name in BLANK:
+                known |= values.isna()
+            if not known.all():
+                raise UserError("a number in the table is missing", path, AGAIN)
+        return cls.cast(*frame.to_numpy().T)
 
     def write(self, folder: Path) -> None:
         """The file of this table into ``folder``; a NaN is an empty cell."""
@@ -119,23 +134,3 @@ class Exploits(Table):
     near: Bools  # that was near its true sub-goal
     best_near: Doubles  # highest log-odds near the true sub-goal; NaN where it did not come near
     best_far: Doubles  # highest log-odds far from it; NaN where it always was near
-
-
-def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, Doubles]:
-    """Columns of a table of numbers, a CSV file with a header; float (n,) each.
-
-    ``columns`` are required, None for all that the file has. A file that is missing, no table, or has other cells than
-    finite numbers (or, in a ``BLANK`` column, nothing) is a ``UserError``.
-    """
-    from pandas import read_csv
-
-    with reading(path, AGAIN, "the table"):
-        frame = read_csv(path, dtype=str, encoding="utf-8-sig")
-        frame = frame[[*(columns or frame)]].astype(np.float64)
-    for name, values in frame.items():
-        known = np.isfinite(values)
-        if name in BLANK:
-            known |= values.isna()
-        if not known.all():
-            raise UserError("a number in the table is missing", path, AGAIN)
-    return {str(name): values.to_numpy() for name, values in frame.items()}

@@ -173,9 +173,6 @@ def learned_terminations(
     stacked = StackedMembers(ensembles)
     members = len(ensembles[0])
 
-    def classify(ids: Ints) -> Floats:
-        return stacked.log_odds(engine.images(ids))
-
     def classify_one(ids: Ints, option: int) -> Floats:
         ensemble = ensembles[option // members]
         views = ensemble.see(engine.images(ids))
@@ -185,7 +182,7 @@ def learned_terminations(
 
     thresholds = [ensemble.thresholds_as_log_odds() for ensemble in ensembles]
     return load_rule(rule)(
-        classify,
+        lambda ids: stacked.log_odds(engine.images(ids)),
         len(stacked.networks),
         classify_one if running_only else None,
         np.concatenate(thresholds),

@@ -87,6 +87,9 @@ def unlabelled_file(path: Path, dataset: Dataset) -> Path:
     for name in ("domain", "observation_shape", "observation_dtype"):
         value, expected = getattr(source, name), getattr(dataset, name)
         if value != expected:
-            fault = f"the {name.replace('_', ' ')} is {value}, that of the data {expected}"
-            raise UserError(fault, file, "Give unlabelled states that fit the data.")
+            raise UserError(
+                f"the {name.replace('_', ' ')} is {value}, that of the data {expected}",
+                file,
+                "Give unlabelled states that fit the data.",
+            )
     return file

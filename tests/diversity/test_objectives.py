@@ -1,6 +1,7 @@
 """Diversity objectives against values worked by hand, and the laws each of them must keep (Spec C1, C2)."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
-from hypogoal.diversity import ENTRY_POINTS, OBJECTIVES, Context, Objective, PairLoss, load_objective
+from hypogoal.diversity import ENTRY_POINTS, OBJECTIVES, Context, Objective, load_objective
 from hypogoal.hypotheses.fit import disagreement_of
 from tests.logits import confident, context_of
 
@@ -20,7 +21,7 @@ ENSEMBLES = [name for name in OBJECTIVES if name not in PAIRED]
 EXTREME = (20.0, 100.0, 1e4)
 
 
-def pair_loss_of(name: str) -> PairLoss:
+def pair_loss_of(name: str) -> Callable[[Tensor, Tensor], Tensor]:
     """The pair loss of an objective that has one."""
     pair_loss = load_objective(name).pair_loss
     assert pair_loss is not None

@@ -119,7 +119,7 @@ def test_what_is_loaded_plays_the_same(recurrence: int) -> None:
     act = None
     for _ in range(40):
         if act is None:
-            loop._choose()
+            loop._choose(False)
             act = policies(int(loop.option[0]))
         wanted = act(engine.images(engine.ids)[0])
         moved = loop.advance(learning=False)

@@ -93,6 +93,6 @@ def test_numbers_and_member_networks_by_name(monkeypatch: pytest.MonkeyPatch) ->
     own = embedding_for((3,), (mean, deviation), f"{__name__}:dense")
     assert isinstance(own, OwnEmbedding) and own.features == 5
     torch.testing.assert_close(own(torch.tensor([[3.0, 4.0, 5.0]])), own.encoder(torch.ones(1, 3)))
-    network = LightQNetwork((24, 40, 3), 2, 7, embedding="tiles")
+    network = LightQNetwork((24, 40, 3), 2, 7, None, "tiles")
     assert network(torch.zeros(5, 24, 40, 3, dtype=torch.uint8)).shape == (5, 2, 7)
     assert network.cells.features == 64

@@ -123,7 +123,7 @@ def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest
     weights = loop.learner.state() | ends.state()
     named = config.model_dump() | {"sub_goals": ["a", "b"], "members": 2}
     policies = make_policies(named, weights, {"observation_shape": engine.observation_shape})
-    options = Options(("a", "b"), 2, ensembles, policies, saved_terminations(rule, weights, 4), timeout)
+    options = Options(("a", "b"), 2, ensembles, policies, saved_terminations(rule, weights, 4), timeout, True, "", {})
     played: list[int] = []
     env = OptionEnv(Watched(door_key(), played), options)
     env.reset(seed=0)

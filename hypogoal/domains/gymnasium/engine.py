@@ -155,9 +155,8 @@ class GymnasiumEngine(TurnEngine):
             self._earned[number] += float(reward)
         [kept] = self.images(self.ids[number : number + 1])
         if not np.array_equal(self.domain.reader.read(observation), kept):
-            fault = "the environment does not repeat itself for the same seed, so this cannot be resumed"
             raise UserError(
-                fault,
+                "the environment does not repeat itself for the same seed, so this cannot be resumed",
                 f"layout_seed={seed}",
                 ANEW,
             )

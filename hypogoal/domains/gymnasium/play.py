@@ -131,8 +131,11 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
             met += sampled(domain, env, layout_seed, config, seen, rng)
             progress.advance()
         if not met:
-            do = "Give other seeds, or more steps: states that look like training states do not count."
-            raise Unmet(f"there are no states for {name}", f"steps={config.steps}", do)
+            raise Unmet(
+                f"there are no states for {name}",
+                f"steps={config.steps}",
+                "Give other seeds, or more steps: states that look like training states do not count.",
+            )
         observations, labels, origins = zip(*met, strict=True)
         named = dict(zip(ORIGINS, np.transpose(origins), strict=True))
         states = States(

@@ -18,9 +18,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.observations import CLEARLY, reading_of
 from hypogoal.observations import NUMBERS, PICTURE, DType, Shape, mixed_type
 
-UNREADABLE = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
-MIXED = "observations mix pictures with other values"
-
 
 @dataclass(frozen=True)
 class Reader:
@@ -56,8 +53,11 @@ class Reader:
             values = values.astype(NUMBERS)
         shapes = (self.shape, self.space.shape)
         if values.dtype != self.dtype or values.shape not in shapes:
-            do = f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}."
-            raise UserError("the environment gave an observation that does not fit its space", received, do)
+            raise UserError(
+                "the environment gave an observation that does not fit its space",
+                received,
+                f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}.",
+            )
         return values.reshape(self.shape)
 
 
@@ -113,8 +113,11 @@ def _by_key(space: spaces.Dict) -> Reader:
     try:
         dtype = mixed_type(fields)
     except (ValueError, KeyError, TypeError):
-        do = "Give a Dict of pictures and numbers, with keys that can be file names."
-        raise UserError("the entries of the observations cannot be read by their keys", space, do) from None
+        raise UserError(
+            "the entries of the observations cannot be read by their keys",
+            space,
+            "Give a Dict of pictures and numbers, with keys that can be file names.",
+        ) from None
     return Reader(space, (), dtype, parts=parts)
 
 
@@ -123,8 +126,11 @@ def _numbers(space: spaces.Space[Any]) -> Reader:
     features: list[str] = []
     for name, part in _leaves(space):
         if _is_picture(part):
-            do = "Give a Dict with each picture under a key of its own, beside those of numbers."
-            raise UserError(MIXED, name, do)
+            raise UserError(
+                "observations mix pictures with other values",
+                name,
+                "Give a Dict with each picture under a key of its own, beside those of numbers.",
+            )
         features += _names(name, part)
     shape: Shape = (len(features),)
     if isinstance(space, spaces.Box) and space.shape:
@@ -148,8 +154,11 @@ def _names(name: str, space: spaces.Space[Any]) -> list[str]:
     try:
         size = spaces.flatdim(space)
     except (NotImplementedError, ValueError):
-        do = "Wrap it so that it gives those, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
-        raise UserError(UNREADABLE, space, do) from None
+        raise UserError(
+            "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten",
+            space,
+            "Wrap it so that it gives those, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env)).",
+        ) from None
     if not name:
         return [f"x{place}" for place in range(size)]
     if size == 1:

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Bytes, Ints
+from hypogoal.core.arrays import Bytes, Doubles, Ints
 from hypogoal.core.errors import UserError
 
 GAME = "montezuma_revenge"
@@ -106,8 +105,9 @@ class Emulator:
             from ale_py import ALEInterface, LoggerMode
             from ale_py.roms import get_rom_path
         except ImportError as error:
-            fault = f"Montezuma's Revenge cannot be played ({error})"
-            raise UserError(fault, GAME, "pip install 'hypogoal[montezuma]'.") from None
+            raise UserError(
+                f"Montezuma's Revenge cannot be played ({error})", GAME, "pip install 'hypogoal[montezuma]'."
+            ) from None
         self._cv2 = cv2
         ALEInterface.setLoggerMode(LoggerMode.Error)
         self.ale = ALEInterface()
@@ -220,7 +220,7 @@ class Emulator:
         return self.ale.cloneState()
 
 
-def pixel(positions: Ints) -> NDArray[np.float64]:
+def pixel(positions: Ints) -> Doubles:
     """The agent's middle in the console's picture: column, row (n, 2), for positions (n, 3) of room, x, y."""
     _, x, y = positions.T
     columns = x + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2

@@ -70,8 +70,7 @@ def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> li
             break
     starts = [*by_look.values(), *alike]
     if len(starts) < max(count, 1):
-        fault = f"only {len(starts)} of {count} start states survive the script"
-        raise UserError(fault, name, "Ask for fewer.")
+        raise UserError(f"only {len(starts)} of {count} start states survive the script", name, "Ask for fewer.")
     return starts[:count]
 
 

@@ -129,8 +129,9 @@ def gather(split: str, room: int, wanted: int, seed: int, sub_goals: Sequence[Su
         if not shown.dying:
             reached.update(places)
     if len(pool) < wanted:
-        fault = f"room {room} does not show {wanted} different states"
-        raise UserError(fault, f"{len(pool)} in {step} steps", "Ask for fewer.")
+        raise UserError(
+            f"room {room} does not show {wanted} different states", f"{len(pool)} in {step} steps", "Ask for fewer."
+        )
     states = states_of(pool, sub_goals)
     kinds = np.where(states.labels.any(1), POSITIVE, states.origins["kind"])
     positions = np.stack([states.origins[name] for name in ("room", "x", "y")], axis=1)

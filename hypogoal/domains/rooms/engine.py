@@ -35,12 +35,10 @@ class RoomsConfig(Config):
         """Each feature is planted once, the true one among them."""
         twice = len({*self.factors}) < len(self.factors)
         if twice or self.truth not in self.factors:
-            where = f"factors={','.join(self.factors)}, truth={self.truth}"
-            do = f"Choose from {', '.join(FACTORS)}."
             raise UserError(
                 "each feature is planted once, the true one among them",
-                where,
-                do,
+                f"factors={','.join(self.factors)}, truth={self.truth}",
+                f"Choose from {', '.join(FACTORS)}.",
             )
         return self
 

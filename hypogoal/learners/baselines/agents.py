@@ -152,9 +152,8 @@ def make_agent(
         agent.exploration_schedule = lambda _: epsilon(chosen, env.episodes)
         agent.exploration_rate = 1.0
     elif env.num_envs > chosen.rollout:
-        fault = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
         raise UserError(
-            fault,
+            f"PPO updates every {chosen.rollout} steps, fewer than there are environments",
             f"environments={env.num_envs}",
             f"Give --set environments={chosen.rollout} or fewer.",
         )
