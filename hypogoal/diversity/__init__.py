@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 ENTRY_POINTS = "hypogoal.diversity"
-OBJECTIVES: tuple[str, ...] = tuple(sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__)))
+OBJECTIVES = tuple(sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__)))
 """Names of the objectives that come with hypogoal."""
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core import own_code
 from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
-from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.config import Config, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
@@ -242,7 +242,7 @@ class TurnEngine(Engine):
         """The observation of what was seen."""
         return seen
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> State:
         return {**super().snapshot(), "facts": np.frombuffer(self._facts, np.uint8).copy()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:

@@ -82,15 +82,14 @@ def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
         range(len(shorter)),
         key=lambda axis: (shorter[axis], axis == 1),
     )
-    width = height + 1
-    sides_at = (height, width)
-    others = [axis for axis in range(len(shape)) if axis not in sides_at]
+    sides = (height, height + 1)
+    others = [axis for axis in range(len(shape)) if axis not in sides]
     others.sort(key=lambda axis: shape[axis] in (1, 3))  # colours last
     channels = prod(shape[axis] for axis in others)
-    target = (*shape[height : width + 1], channels)
+    target = (*shape[height : height + 2], channels)
     if channels_first(target):
         return (), shape
-    return (height, width, *others), target
+    return (*sides, *others), target
 
 
 def shrunk_picture(picture: Bytes, longest: int) -> Bytes:

@@ -1,12 +1,7 @@
 """The states that an ensemble is trained on: drawn in batches and passed through the members."""
 
 from collections.abc import Iterator, Sequence
-from itertools import (
-    chain,
-    cycle,
-    islice,
-    repeat,
-)
+from itertools import chain, cycle, islice, repeat
 
 import numpy as np
 import torch
@@ -48,7 +43,6 @@ class TrainingStates(Resumable):
     """
 
     CHANGING = ("changes",)
-    changes: list[np.random.Generator]
 
     def __init__(
         self,

@@ -174,7 +174,7 @@ def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
     others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum is
     taken over separate windows. ``example`` is an input, from which shapes follow.
     """
-    layers: list[nn.Module] = []
+    layers = []
     values = example
     with torch.no_grad():
         for layer in network.children():

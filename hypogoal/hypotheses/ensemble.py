@@ -15,31 +15,11 @@ from torch import Tensor, nn
 
 from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.errors import UserError
-from hypogoal.core.tensors import (
-    load_fitting,
-    load_tensors,
-    save_tensors,
-)
-from hypogoal.hypotheses import (
-    deep_lift,
-    networks,
-    patches,
-)
+from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
+from hypogoal.hypotheses import deep_lift, networks, patches
 from hypogoal.hypotheses.thresholds import log_odds_of
-from hypogoal.hypotheses.views import (
-    FullView,
-    View,
-    view_of,
-)
-from hypogoal.observations import (
-    NUMBERS,
-    Observations,
-    Shape,
-    packed,
-    type_of,
-    type_text,
-    values_in,
-)
+from hypogoal.hypotheses.views import FullView, View, view_of
+from hypogoal.observations import NUMBERS, Observations, Shape, packed, type_of, type_text, values_in
 
 THRESHOLD = 0.5  # of the probability, unless another is set
 IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many
@@ -94,7 +74,7 @@ class Ensemble(nn.Module):
         built = []
         for _ in range(members):
             built.append(networks.build_network(self.network, self.view.shape, generator, self.view.dtype))
-        weights: list[Tensor] = []
+        weights = []
         for member in built:
             weights += [*member.parameters(), *member.buffers()]
         if len({*weights}) < len(weights):

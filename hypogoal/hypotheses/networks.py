@@ -16,7 +16,7 @@ import inspect
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from math import prod
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,21 +27,14 @@ from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load, place_of
 from hypogoal.hypotheses.load import ByKey
-from hypogoal.observations import (
-    PICTURE,
-    DType,
-    Observations,
-    Shape,
-    fields_of,
-    values_in,
-)
+from hypogoal.observations import PICTURE, DType, Observations, Shape, fields_of, values_in
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
 LEAST = {"doorkey": 41, "montezuma": 36, "tiles": 24}  # pixels of a picture's shorter side
 OTHERWISE = "mlp"
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
-Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
+Parts = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
 ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
 
@@ -104,7 +97,7 @@ def mlp(channels: int) -> Parts:
     return [], (256, 256)
 
 
-NETWORKS: dict[str, Callable[[int], Parts]] = {
+NETWORKS = {
     "doorkey": doorkey,
     "montezuma": montezuma,
     "tiles": tiles,
@@ -214,7 +207,7 @@ def build_network(
     with DrawsFrom(torch.Generator().manual_seed(seed)):
         layers, hidden = ([by_key], (JOINT,)) if by_key else load_network(name)(observation_shape)
         widths = [_features(name, layers, example, observation_shape), *hidden]
-        dense: list[nn.Module] = []
+        dense = []
         for inputs, outputs in pairwise(widths):
             dense += [nn.Linear(inputs, outputs), nn.ReLU()]
         dense.append(nn.Linear(widths[-1], CLASSES))

@@ -136,7 +136,7 @@ def _tables(
     rows, colours = _distinct_items(pixel_rows.reshape(-1, channels))
     rows = rows.reshape(-1, width)
     distinct = len(colours)
-    levels: list[Level] = []
+    levels = []
     for kernel, stride in windows:
         strip_rows, strips = _join(_strided(rows, kernel, stride), distinct)
         lines, bands = _join(_strided(lines, kernel, stride), len(rows))
@@ -186,7 +186,7 @@ def _distinct_items(items: Bytes) -> tuple[Ids, Bytes]:
     """Items (N, bytes) -> (indices of distinct items (N,), the distinct items in order of appearance)."""
     size = items.shape[1]
     together = np.ascontiguousarray(items).view(f"V{size}")
-    whole: list[bytes] = together.ravel().tolist()
+    whole = together.ravel().tolist()
     index_of = {item: index for index, item in enumerate(dict.fromkeys(whole))}
     index = np.fromiter(
         map(index_of.__getitem__, whole),
@@ -256,8 +256,10 @@ def forward(
             windows = rows.index_select(0, parts.flatten()).view(*parts.shape, -1)
             if isinstance(layer, nn.Conv2d):
                 rows = _convolved(layer, windows)
+            elif torch.is_grad_enabled():
+                rows = windows.max(dim=1).values  # of equals the gradient goes to the first
             else:
-                rows = _pooled(windows)
+                rows = windows.amax(dim=1)  # the same values in a third of the time
         elif isinstance(layer, nn.BatchNorm2d):
             rows = _batch_norm(layer, rows, batch.shares[level], counted)
         elif isinstance(layer, nn.Flatten):
@@ -275,16 +277,6 @@ def _convolved(layer: nn.Conv2d, windows: Tensor) -> Tensor:
     ordered = layer.weight.permute(2, 3, 1, 0)
     weight = ordered.reshape(-1, layer.out_channels)
     return functional.linear(windows.flatten(1), weight.T, layer.bias)
-
-
-def _pooled(windows: Tensor) -> Tensor:
-    """The maxima of windows (U, k * k, C) -> (U, C).
-
-    Of equals the gradient goes to the first; where there is none, the values alone take a third of the time.
-    """
-    if torch.is_grad_enabled():
-        return windows.max(dim=1).values
-    return windows.amax(dim=1)
 
 
 def _batch_norm(

@@ -10,11 +10,7 @@ from torch.nn import functional
 
 from hypogoal.core.arrays import Bytes, Floats, tensor
 from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble, predicting, together
-from hypogoal.hypotheses.networks import (
-    as_input,
-    at_once,
-    folded,
-)
+from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.observations import Observations
 
 MANY = 256  # states from which an ensemble's own prediction, which computes distinct patches once, is faster

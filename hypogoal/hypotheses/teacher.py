@@ -14,7 +14,7 @@ from hypogoal.observations import digest
 
 def load_teacher(name: str) -> Callable[..., Any]:
     """The function ``module:function``, or of an entry point; any other name is a ``UserError``."""
-    teacher: Callable[..., Any] = load(name, "teacher", "hypogoal.teachers", {})
+    teacher = load(name, "teacher", "hypogoal.teachers", {})
     if not callable(teacher):
         raise UserError("this is no teacher", name, "Give a function, see docs/extending.md.")
     return teacher

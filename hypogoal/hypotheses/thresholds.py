@@ -6,11 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.arrays import (
-    Bools,
-    Doubles,
-    Floats,
-)
+from hypogoal.core.arrays import Bools, Doubles, Floats
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 

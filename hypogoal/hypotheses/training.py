@@ -20,17 +20,9 @@ from hypogoal.hypotheses import views
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.fit import (
-    Losses,
-    fit,
-    objective_of,
-)
+from hypogoal.hypotheses.fit import Losses, fit, objective_of
 from hypogoal.hypotheses.teacher import taught_by
-from hypogoal.hypotheses.thresholds import (
-    PAPER,
-    SPLIT,
-    thresholds,
-)
+from hypogoal.hypotheses.thresholds import PAPER, SPLIT, thresholds
 from hypogoal.observations import Observations
 
 CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
@@ -160,7 +152,7 @@ class EnsembleTraining(Resumable):
             self.done,
             None,
         )
-        unchecked: list[Losses] = []
+        unchecked = []
         for losses in fit(self.networks, earlier, self.states, batches, self.optimiser, config, taught):
             self.done += 1
             unchecked.append(losses)

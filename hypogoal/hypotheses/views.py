@@ -151,9 +151,9 @@ def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype:
     """
     if name == FULL:
         return FullView(observation_shape, dtype)
-    kind: type[Any] = load_class(name, "view", View, {}, ENTRY_POINTS)
+    kind = load_class(name, "view", View, {}, ENTRY_POINTS)
     chosen = resolve(kind.Settings, assigned(settings), stage=name)
-    view: View = kind(observation_shape, chosen)
+    view = kind(observation_shape, chosen)
     if view.dtype != dtype:
         raise UserError(f"the view is of {view.dtype}, these observations are {dtype}", name)
     return view

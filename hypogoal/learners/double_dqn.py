@@ -48,7 +48,7 @@ def double_q_targets(
     """
     best = next_online.argmax(-1, keepdim=True)
     following = next_target.gather(-1, best).squeeze(-1)
-    targets = rewards + gamma * following * (~terminal)
+    targets = rewards + gamma * following * ~terminal
     return targets.clamp(0.0, 1.0) if bounded else targets
 
 

@@ -98,7 +98,7 @@ class StepsAhead(Resumable):
         """
         if self.n == 1:
             return rows
-        complete: list[tuple[int, int, int, int]] = []  # sequence, steps, state, action
+        complete = []  # sequence, steps, state, action
         for sequence, steps in enumerate(self.open):
             now = rows.at(sequence)
             steps.append((now.state.item(), now.action.item()))

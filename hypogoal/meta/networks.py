@@ -38,7 +38,7 @@ class PaperMetaNetwork(nn.Module):
     def __init__(self, observation_shape: Shape, options: int):
         super().__init__()
         height, width, depth = observation_shape
-        layers: list[nn.Module] = []
+        layers = []
         for before, after in ((depth, 16), (16, 32), (32, 32)):
             layers += [Conv2d(before, after, 3, stride=2), ReLU()]
         self.features = nn.Sequential(*layers, nn.Flatten())
@@ -138,7 +138,7 @@ class GaussianHead(CategoricalHead):
         return self.log_std.to(scores.device).exp()
 
 
-HEADS: dict[str, type[CategoricalHead]] = {
+HEADS = {
     "categorical": CategoricalHead,
     "gaussian": GaussianHead,
 }

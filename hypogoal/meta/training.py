@@ -80,7 +80,7 @@ def train(
     recorder, begin = loop.recorder, loop.recorder.steps
     checkpoints = checkpoints if loop.engine.resumes else Checkpoints(None)
     logged = begin  # the steps at the last line of the log
-    numbers: dict[str, float] = {}  # of the last updates
+    numbers = {}  # of the last updates
     saved = checkpoints.load()
     if saved:
         loop.restore(saved["loop"])

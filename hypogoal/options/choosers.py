@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -25,7 +25,7 @@ CHOOSERS = {
     "ppo": "hypogoal.meta.ppo:MetaPolicy",
 }
 
-Offered: TypeAlias = Bools  # (n, O), the options that may be chosen
+Offered = Bools  # (n, O), the options that may be chosen
 FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
 
 

@@ -238,7 +238,7 @@ class PaperLearner(Learner):
 
     def learn(self) -> dict[str, float]:
         """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
-        numbers: dict[str, float] = {}
+        numbers = {}
         for option, member in enumerate(self.members):
             if member.replay.size < min(self.config.warm_up, self.config.replay):
                 member.due = 0

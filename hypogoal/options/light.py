@@ -124,7 +124,7 @@ class LightLearner(Learner):
     def learn(self) -> dict[str, float]:
         if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
             self.due = 0
-        numbers: dict[str, float] = {}
+        numbers = {}
         while self.due >= self.config.update_interval:
             self.due -= self.config.update_interval
             numbers = {"option_loss": self._update()}

@@ -108,7 +108,7 @@ class Recorder(Resumable):
             self.paths[environment] = []
             if not run.reached:
                 continue
-            stop: Any = run.states[-1]
+            stop = run.states[-1]
             if self.engine.memory is not None:
                 [stop] = self.engine.images(np.array([stop]))
             self.stops[run.option].append(stop)
@@ -117,7 +117,7 @@ class Recorder(Resumable):
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
         if not restarted:
             return self.episodes.recent() if self.episodes else {}
-        numbers: dict[str, float] = {}
+        numbers = {}
         if runs := self._executions():
             for name in ("reached", "terminated", "duration"):
                 numbers[name] = fmean(getattr(run, name) for run in runs)

@@ -6,7 +6,7 @@ import copy
 import os
 import warnings
 from pathlib import Path
-from typing import Any, SupportsFloat, TypeAlias
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.options.termination import load_rule
 
-Env: TypeAlias = gymnasium.Env[Any, Any]
+Env = gymnasium.Env[Any, Any]
 STARTS = ("unpaid", "paid", "refuse")
 MEANINGS = {
     "unpaid": "nothing is paid until it has been negative (start='unpaid')",

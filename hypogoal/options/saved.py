@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from hypogoal.options.networks import LightQNetwork
 
 FILE = "options.safetensors"  # of an artefact
 # Starts an execution of an option: gives a function from an observation (*obs) to the action.
-Policies: TypeAlias = Callable[[int], Callable[[Observations], int]]
+Policies = Callable[[int], Callable[[Observations], int]]
 
 
 @dataclass(frozen=True)

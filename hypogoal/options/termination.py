@@ -56,7 +56,7 @@ class Terminations(Part):
         thresholds: Floats | None = None,
         environments: int = 1,
     ):
-        self.classify = classify
+        self.classify: Any = classify
         self.classify_one = classify_one
         self.options = options
         self.thresholds = np.zeros(options, np.float32) if thresholds is None else thresholds
@@ -122,7 +122,6 @@ class Terminations(Part):
         unknown = np.isnan(judged).any(axis=1)
         if not unknown.any():
             return judged
-        assert self.classify is not None
         fresh = np.unique(ids[unknown])
         before = self.judged[fresh]
         new = np.isnan(before)

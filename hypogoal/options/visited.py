@@ -43,7 +43,7 @@ class Visited(Resumable):
 
     def _smallest(self) -> dict[str, Observations]:
         """Those that are kept, in the order of their hashes, without surplus."""
-        return {digest: self.kept[digest] for digest in sorted(self.kept)[: self.most]}
+        return dict(sorted(self.kept.items())[: self.most])
 
     def states(self) -> Observations:
         """The states kept, (n, *obs)."""

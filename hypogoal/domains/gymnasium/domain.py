@@ -114,7 +114,7 @@ class GymnasiumDomain(Domain):
         """
         fields = self.config_class.model_fields
         defaults = {name: fields[name].default for name in self.engine_settings}
-        env: Any = self.make(**{**defaults, **arguments})
+        env = self.make(**{**defaults, **arguments})
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0:
             raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from hypogoal.core.arrays import Bools, Ints
-from hypogoal.core.checkpoints import ANEW
+from hypogoal.core.checkpoints import ANEW, State
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Layouts, TurnEngine
 from hypogoal.observations import digest
@@ -125,7 +125,7 @@ class GymnasiumEngine(TurnEngine):
     def labels(self, ids: Ints) -> Bools:
         return self.facts_of(ids).view(np.bool_)
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> State:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
         return {**super().snapshot(), "images": np.stack([*self._seen.values()])}
 

@@ -124,7 +124,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
     training: set[bytes] = set()  # digests of labelled and unlabelled states
     sets = []
     for name, seeds in zip(SEEDS, seeds_of_sets, strict=True):
-        met: list[Met] = []
+        met = []
         for layout_seed in seeds:
             seen = set(training) if name == "heldout_seeds" else set()
             rng = rng_for(seed, "play", layout_seed)

@@ -123,7 +123,7 @@ def _by_key(space: spaces.Dict) -> Reader:
 
 def _numbers(space: spaces.Space[Any]) -> Reader:
     """A reader of a space without pictures, which Gymnasium flattens."""
-    features: list[str] = []
+    features = []
     for name, part in _leaves(space):
         if _is_picture(part):
             raise UserError(

@@ -27,7 +27,7 @@ from hypogoal.domains.montezuma.ladders import distance_to
 from hypogoal.domains.montezuma.states import gather
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ROOMS, SUB_GOALS
 
-TABLE_1: Mapping[str, Any] = {
+TABLE_1 = {
     "network": "montezuma",
     "members": 6,
     "diversity_weight": 3e-4,
@@ -37,7 +37,7 @@ TABLE_1: Mapping[str, Any] = {
     "class_weight_positive": 0.2,
 }
 # What lets options learn on a laptop, alone or under a meta-policy.
-LEARNING: Mapping[str, Any] = {
+LEARNING = {
     "option_timeout": MAX_STEPS,
     "experience": "own",
     "option_gamma": 0.99,
@@ -49,7 +49,7 @@ LEARNING: Mapping[str, Any] = {
     "epsilon_final": 0.01,
 }
 # Options learned alone, ladder by ladder.
-ALONE: Mapping[str, Any] = {
+ALONE = {
     **LEARNING,
     "max_episode_steps": MAX_STEPS,
     "restart_options": True,

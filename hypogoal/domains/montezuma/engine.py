@@ -52,7 +52,7 @@ class MontezumaEngine(TurnEngine):
         self.memory = self.room = memory
         self._emulators = [game.Emulator() for _ in range(count)]
         emulator = self._emulators[0]
-        self.starts: list[game.Snapshot] = make_starts(emulator, start, start_states, seed)
+        self.starts = make_starts(emulator, start, start_states, seed)
         self._rng = rng_for(seed, "start-of-episode")
         for begin in self.starts:
             emulator.restore(begin)

@@ -55,8 +55,8 @@ def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> li
         raise UserError("unknown start", name, f"Choose one of {', '.join(BEGINNINGS)}.")
     rng = rng_for(seed, "start-states", name)
     phases = rng.permutation(PHASES)
-    by_look: dict[bytes, game.Snapshot] = {}
-    alike: list[game.Snapshot] = []
+    by_look = {}
+    alike = []
     for phase in phases[: TRIES * count].tolist():
         start = _start(emulator, name, phase)
         if start is None:

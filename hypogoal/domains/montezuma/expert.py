@@ -74,7 +74,7 @@ class Expert:
         self.rng = rng
         self.places = standing_places(emulator, room)
         self.spots: list[Position] = []
-        sides: list[Position] = []
+        sides = []
         for goal in sub_goals:
             self.spots += [spot for spot in goal.spots if spot.room == room]
             sides += [side for side in goal.sides if side.room == room]

@@ -99,7 +99,7 @@ def gather(split: str, room: int, wanted: int, seed: int, sub_goals: Sequence[Su
                 chosen = left_out if index in unclear else sought
                 chosen.add((goal.name, index))
     reached: Counter[At] = Counter()
-    looks: set[bytes] = set()
+    looks = set()
     pool: list[Shown] = []
 
     def enough() -> bool:
@@ -147,7 +147,7 @@ def choose(kinds: Ints, positions: Ints, wanted: int, rng: Generator) -> Ints:
     alike = DataFrame(rows[order])
     ranks = alike.groupby([*alike]).cumcount()  # the first of a kind and position come before the second of any
     spread = order[np.argsort(ranks, kind="stable")]
-    first: list[int] = []
+    first = []
     for kind, share in KIND_SHARES.items():
         of_kind = spread[kinds[spread] == kind]
         count = int(share * wanted)

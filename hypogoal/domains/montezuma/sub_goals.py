@@ -7,7 +7,7 @@ enemies and lasers are is in ``measured.toml``; where the authors' code differs,
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ ROOMS = MEASURED["rooms"]  # by sub-goal
 ENEMIES = [*MEASURED["enemies"].values()]
 # By room, where an agent stands left of each laser gate, and right of it.
 GATES = {int(room): gates for room, gates in MEASURED["gates"].items()}
-Places: TypeAlias = tuple[Position, ...]
+Places = tuple[Position, ...]
 
 
 class Region(NamedTuple):

@@ -17,7 +17,7 @@ from hypogoal.domains.rooms.states import MEANINGS, SIDE, Scenes, crossed_states
 SUB_GOALS = ("right-room",)
 HELDOUT = 20  # layouts of held-out states
 
-DEFAULTS: Mapping[str, Mapping[str, Any]] = {
+DEFAULTS = {
     "train-ensemble": {
         "network": "tiles",
         "schedule": "sequential",

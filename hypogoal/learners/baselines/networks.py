@@ -1,7 +1,7 @@
 """Feature networks of the baselines: RGB image in, vector out."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -71,13 +71,13 @@ class CellNetwork(BaseFeaturesExtractor):
         )
         pixels = None if tiles is None else torch.from_numpy(tiles.astype(np.float32) / 255.0)
         self.register_buffer("tiles", pixels, persistent=False)
-        further: list[nn.Module] = []
+        further = []
         for before, after in itertools.pairwise(channels):
             further += [BlockConvolution(before, after, 2), nn.ReLU()]
         self.further = nn.Sequential(*further, nn.Flatten())
         with torch.no_grad():
             width = self.further(self._cells(torch.zeros(1, *space.shape))).shape[1]
-        layers: list[nn.Module] = []
+        layers = []
         for before, after in itertools.pairwise([width, *[FEATURES] * dense]):
             layers += [nn.Linear(before, after), nn.ReLU()]
         self.dense = nn.Sequential(*layers)
@@ -101,7 +101,7 @@ class CellNetwork(BaseFeaturesExtractor):
 
 # The paper's three convolutions with ReLU between and a dense layer shared by actor and critic, for which it gives no
 # sizes (these are small), and the tuned one: one convolution over cells, two dense layers.
-NETWORKS: dict[str, Callable[..., CellNetwork]] = {
+NETWORKS = {
     "three-conv": partial(CellNetwork, channels=(16, 32, 64), dense=1),
     "cells": partial(CellNetwork, channels=(8,), dense=2),
 }
