@@ -26,7 +26,6 @@ IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 1
 PATCH_CHUNK = 4096  # images with few distinct patches
 FOLD_FROM = 32  # images from which folding BatchNorm into the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
-NO_OBSERVATIONS = "these observations do not fit the ensemble"
 
 
 @contextmanager
@@ -111,12 +110,12 @@ class Ensemble(nn.Module):
             if dtype.names and isinstance(observations, Mapping):
                 observations = packed(observations, dtype)
             observations = np.asarray(observations)
-        except ValueError as error:  # other keys, or of different shapes
-            raise UserError(NO_OBSERVATIONS, error, f"Give {expected}.") from None
-        if dtype == NUMBERS and observations.dtype == np.float64:
-            observations = observations.astype(NUMBERS)
-        if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
-            raise UserError(NO_OBSERVATIONS, f"{observations.dtype} {observations.shape}", f"Give {expected}.")
+            if dtype == NUMBERS and observations.dtype == np.float64:
+                observations = observations.astype(NUMBERS)
+            if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
+                raise ValueError(f"{observations.dtype} {observations.shape}")
+        except ValueError as error:  # also of other keys, or of states of different shapes
+            raise UserError("these observations do not fit the ensemble", error, f"Give {expected}.") from None
         return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
     def predictions(self, observations: Observations) -> Bools:

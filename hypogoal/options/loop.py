@@ -148,19 +148,20 @@ class OptionLoop(Resumable):
         done = np.flatnonzero(moved.ended)
         if not len(done):
             return
-        outcome = Outcome(
-            environments=done,
-            options=self.option[done],
-            began=self.began[done],
-            reached=moved.reached[done],
-            inside=self.inside[done],
-            returns=self.returns[done],
-            durations=self.age[done],
-            discounts=np.power(self.gamma, self.age[done], dtype=np.float64),
-            next_ids=step.next_ids[done],
-            terminated=step.terminated[done],
-            truncated=step.truncated[done],
+        every = Outcome(
+            environments=np.arange(self.engine.count),
+            options=self.option,
+            began=self.began,
+            reached=moved.reached,
+            inside=self.inside,
+            returns=self.returns,
+            durations=self.age,
+            discounts=np.power(self.gamma, self.age, dtype=np.float64),
+            next_ids=step.next_ids,
+            terminated=step.terminated,
+            truncated=step.truncated,
         )
+        outcome = every.at(done)
         if learning:
             self.terminations.finished(done, outcome.options, outcome.reached)
         self.recorder.finished(outcome)

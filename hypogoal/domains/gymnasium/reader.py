@@ -107,9 +107,7 @@ def _by_key(space: spaces.Dict) -> Reader:
     if len(parts) == 1:
         [(key, part)] = parts.items()
         return replace(part, key=key)
-    fields = {}
-    for key, part in parts.items():
-        fields[key] = (part.dtype, part.shape)
+    fields = {key: (part.dtype, part.shape) for key, part in parts.items()}
     try:
         dtype = mixed_type(fields)
     except (ValueError, KeyError, TypeError):
