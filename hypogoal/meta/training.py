@@ -100,10 +100,10 @@ def train(
             logged = recorder.steps
             shown = recorder.recent(restarted=loop.config.restart_options)
             reached = {"until_reached": solved} if until else {}
-            counts = {"episodes": len(recorder.episodes), "states": loop.engine.n_states}
             log.write(
                 step=logged,
-                **counts,
+                episodes=len(recorder.episodes),
+                states=loop.engine.n_states,
                 **shown,
                 **numbers,
                 **reached,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -79,7 +79,7 @@ class Chooser(Part, ABC):
 class RandomChooser(Chooser):
     """Spec E6: uniform choice among the options offered, the lower control and the way of ``train-options``."""
 
-    CHANGING: ClassVar[tuple[str, ...]] = ("rng",)
+    CHANGING = ("rng", "steps")
 
     def __init__(self, rng: np.random.Generator, options: int = 0):
         self.rng = rng
@@ -98,8 +98,6 @@ class EvenChooser(RandomChooser):
 
     Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
     """
-
-    CHANGING = ("rng", "steps")
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         """For each environment in turn, int64 (n,); an option that runs counts as one step more."""

@@ -48,7 +48,7 @@ class GymnasiumEngine(TurnEngine):
     each, see ``GymnasiumDomain``.
     """
 
-    CHANGING = (*TurnEngine.CHANGING, "_played")
+    CHANGING = (*TurnEngine.CHANGING, "_earned", "_played")
 
     def __init__(
         self,
@@ -149,10 +149,8 @@ class GymnasiumEngine(TurnEngine):
         env = self._envs[number]
         seed = self.layouts.now[number]
         observation, _info = env.reset(seed=seed)
-        self._earned[number] = 0.0
         for action in self._played[number]:
-            observation, reward, *_ = env.step(action)
-            self._earned[number] += float(reward)
+            observation, *_ = env.step(action)
         [kept] = self.images(self.ids[number : number + 1])
         if not np.array_equal(self.domain.reader.read(observation), kept):
             raise UserError(
