@@ -70,9 +70,7 @@ def load_objective(name: str) -> Objective:
     Raises ``UserError`` if it is unknown, cannot be loaded or is no objective, or if the user did not allow the code
     (see :mod:`hypogoal.core.own_code`).
     """
-    built_in = {}
-    for objective in OBJECTIVES:
-        built_in[objective] = f"{__name__}.{objective.replace('-', '_')}"
+    built_in = {objective: f"{__name__}.{objective.replace('-', '_')}" for objective in OBJECTIVES}
     loaded = load(name, "diversity objective", ENTRY_POINTS, built_in)
     for kind in ("ensemble_loss", "pair_loss"):  # the first may use the second
         if hasattr(loaded, kind):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -300,8 +299,8 @@ class Domain(ABC):
     sub_goals: tuple[str, ...]
     config_class: type[Config]
     engine_settings: tuple[str, ...] = ()
-    defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
-    sources: Mapping[str, str] = MappingProxyType({})
+    defaults: Mapping[str, Mapping[str, Any]] = {}
+    sources: Mapping[str, str] = {}
     env_id: str = ""
     starts: tuple[str, ...] = ()
     many_layouts = False

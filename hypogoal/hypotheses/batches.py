@@ -58,7 +58,7 @@ class TrainingStates(Resumable):
         self._origins = origins
         self._targets = tensor(labels.astype(np.int64), self.device)
         kept = self.view.to_change(observations), self.view.to_change(unlabelled)
-        self._tables: patches.Tables | None = None
+        self._tables = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
             self._tables = patches.make_tables(ensemble.networks[0], *kept)
         self._states = kept if self._tables is None else ()

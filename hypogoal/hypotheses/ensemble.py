@@ -69,10 +69,9 @@ class Ensemble(nn.Module):
         super().__init__()
         self.observation_shape = tuple(observation_shape)
         self.view = view or FullView(self.observation_shape)
-        self.network = networks.network_for(network, self.view.shape, self.view.dtype)
-        built = []
-        for _ in range(members):
-            built.append(networks.build_network(self.network, self.view.shape, generator, self.view.dtype))
+        shape, dtype = self.view.shape, self.view.dtype
+        self.network = networks.network_for(network, shape, dtype)
+        built = [networks.build_network(self.network, shape, generator, dtype) for _ in range(members)]
         weights = []
         for member in built:
             weights += [*member.parameters(), *member.buffers()]

@@ -1,7 +1,11 @@
 """Members of a sub-goal, with torch and safetensors alone: ``load("door-open")(observations)`` -> P (N, K)."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import (
+    Callable,
+    Iterable,
+    Sequence,
+)
 from pathlib import Path
 from typing import Any
 

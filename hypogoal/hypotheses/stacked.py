@@ -36,10 +36,9 @@ class StackedMembers:
             self.networks += map(folded, ensemble.eval().networks)
         self.count = len(self.networks)
         self.joined = self.every is not None and _can_be_joined(self.networks[0])
-        self._layers: list[tuple[nn.Module, dict[str, Tensor]]] = []
+        self._layers = []
         if self.joined:
-            for layers in zip(*self.networks, strict=True):
-                self._layers.append((layers[0], _stack(layers)))
+            self._layers = [(layers[0], _stack(layers)) for layers in zip(*self.networks, strict=True)]
 
     def log_odds(self, observations: Observations) -> Floats:
         """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""

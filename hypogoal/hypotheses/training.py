@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from hypogoal.core import seeding
 from hypogoal.core.adam import Adam
@@ -80,7 +80,7 @@ class EnsembleTraining(Resumable):
             views.learn_from(view, observations, unlabelled, origins, seed)
         weights = seeding.torch_generator(seed, "weights")
         self.ensemble = Ensemble(config.network, shape, config.members, weights, view).to(device)
-        self.taught: Tensor | None = None
+        self.taught = None
         if saved:
             self.ensemble.load_state_dict(saved["ensemble"])  # with what the view has learned
         elif config.teacher:
@@ -96,7 +96,7 @@ class EnsembleTraining(Resumable):
         members = list(range(config.members))
         self.rounds = [[member] for member in members] if config.schedule == "sequential" else [members]
         self._begin(saved["number"] if saved else 0)
-        self._layers: Tensor | None = None
+        self._layers = None
         if saved:
             super().restore(saved)
             self._layers = saved["layers"]

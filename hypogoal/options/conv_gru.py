@@ -134,10 +134,8 @@ class PaperPolicies:
         self.recurrence = options.config["recurrence"]
         actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
         make = partial(PaperQNetwork, options.shape, actions)
-        self.networks = []
-        for option in range(options.count):
-            network = load_fitting(make, below(f"{option}.", options.weights), saved.FILE)
-            self.networks.append(network.eval())
+        each = [below(f"{option}.", options.weights) for option in range(options.count)]
+        self.networks = [load_fitting(make, weights, saved.FILE).eval() for weights in each]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""

@@ -46,7 +46,7 @@ class Recorder(Resumable):
         self.options, self.engine = options, engine
         self.episodes = EpisodeRecorder(engine.count)
         self.choices: list[tuple[float, ...]] = []
-        self.stops: list[deque[Any]] = latest(options, STOPS_KEPT)
+        self.stops = latest(options, STOPS_KEPT)
         self.executions: list[deque[Execution]] = latest(options, LAST)
         self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # states that running executions came to
         self.counts = np.zeros((options, 5))  # in the window: offered, chosen, expected, reached, duration
@@ -173,9 +173,7 @@ class Recorder(Resumable):
         options = np.array([run.option for run in runs], np.int64)
         places = self.engine.positions(stops)
         aways = distances(places, options)
-        rows = []
-        for run, place, away in zip(runs, places, aways, strict=True):
-            rows.append((*run[:6], *place, away))
+        rows = [(*run[:6], *place, away) for run, place, away in zip(runs, places, aways, strict=True)]
         Executions.of_rows(rows).write(folder)
 
     def write_exploits(

@@ -73,7 +73,7 @@ class Expert:
         self.room = room
         self.rng = rng
         self.places = standing_places(emulator, room)
-        self.spots: list[Position] = []
+        self.spots = []
         sides = []
         for goal in sub_goals:
             self.spots += [spot for spot in goal.spots if spot.room == room]
@@ -83,7 +83,7 @@ class Expert:
             "side": sides,
             "ladder": climbs_in(room),
         }
-        self.in_turn: dict[str, Iterator[Any]] = {}  # each kind's starts, in a random order, again and again
+        self.in_turn = {}  # each kind's starts, in a random order, again and again
         for kind, rows in starts.items():
             if rows:
                 order = rng.permutation(rows)
