@@ -110,7 +110,7 @@ def test_frames_and_colours_are_stacked_in_their_order() -> None:
 
 def test_minigrids_dictionary_is_read_without_its_text() -> None:
     """Spec B6: a picture and a number by key; a line says so."""
-    env = gymnasium.make("MiniGrid-Empty-8x8-v0")
+    env = gymnasium.make("minigrid:MiniGrid-Empty-8x8-v0")
     with pytest.warns(UserWarning, match="observations are read without their text: mission"):
         reader = reader_of(env.observation_space)
     seen, _ = env.reset(seed=0)
