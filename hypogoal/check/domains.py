@@ -12,10 +12,14 @@ from gymnasium.utils.env_checker import check_env
 
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.config import resolve
+from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, Unmet, require_classes, write_dataset
 from hypogoal.domains.base import Domain, Engine
+from hypogoal.hypotheses.networks import AUTO
+from hypogoal.observations import PICTURE
+from hypogoal.options.networks import embedding_for
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
 STEP_KINDS = {"next_ids": "iu", "rewards": "iuf", "terminated": "b", "truncated": "b", "succeeded": "b"}
@@ -80,6 +84,8 @@ class _Played:
         if len(looks) < len(seen):
             text = f"{len(looks)} observations have {len(seen)} different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=1)
+        if images.dtype == PICTURE:
+            _warn_of_small(images.shape[1:])
         return f"{images.dtype} {images.shape[1:]}"
 
     def two_engines(self) -> None:
@@ -152,6 +158,14 @@ class _Played:
             shown["images"] = engine.images(ids)
             shown["labels"] = engine.labels(ids)
             yield shown
+
+
+def _warn_of_small(picture: tuple[int, ...]) -> None:
+    """Members see pictures of any size."""
+    try:
+        embedding_for(picture, None, AUTO)
+    except UserError as error:
+        warnings.warn(f"options cannot be learned from these pictures: {error}", stacklevel=1)
 
 
 def _require_step(step: Any) -> None:

@@ -292,6 +292,8 @@ def _refusal(model: type[Config], whole: type[Config], error: ValidationError, s
         return UserError(fault["msg"].removeprefix("Value error, "), where, do)
     if name in whole.model_fields:
         return UserError(f"{stage} has this setting only beside another choice", name, advice)
+    if stage == "run":
+        advice = f"Of a stage: --set STAGE.{name}=VALUE. {advice}"
     for close in difflib.get_close_matches(name, [*whole.model_fields], n=1):
         advice = f"Did you mean {close!r}? {advice}"
     return UserError(f"{stage} has no setting", name, advice)

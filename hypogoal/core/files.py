@@ -37,6 +37,8 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
             do = f"If no program writes it any more, one has crashed: h5clear -s {path}"
         elif "unable to lock" in fault:
             do = "It is open in another program: close it there first."
+        elif "signature not found" in fault:
+            fault = f"{subject} is no HDF5 file"
         elif path.is_file() and path.read_bytes().startswith(POINTER):
             fault, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
         raise UserError(fault, path, do) from None

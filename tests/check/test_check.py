@@ -13,6 +13,7 @@ import torch
 from command_line import fails, refuses, run, settings
 from corridor import Corridor
 from corridor_env import NEVER, SUB_GOALS, CorridorEnv, swift
+from gymnasium import spaces
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -127,16 +128,27 @@ def test_domains_that_keep_the_contract_pass() -> None:
     require(check_domain(both, SMALL))
 
 
+class Low(CorridorEnv):
+    """Its pictures are fewer pixels high than options' convolutions need."""
+
+    observation_space = spaces.Box(0, 255, (12, 48, 3), np.uint8)
+
+    def image(self) -> np.ndarray:
+        return super().image()[:12]
+
+
 def test_what_may_surprise_is_a_warning() -> None:
-    """Spec B6: labels that pictures do not show, training that cannot be resumed, states that play did not reach."""
+    """Spec B6: labels that pictures do not show, no resuming, states that play did not reach, pictures for members."""
 
     def hidden(self: Any, ids: np.ndarray) -> np.ndarray:
         return np.stack([ids == 0, np.full(len(ids), self.elapsed[0] % 2 == 0)], axis=1)
 
+    low = GymnasiumDomain(Low, SUB_GOALS)
     surprises = [
         (check_domain(domain_of(labels=hidden)), "steps", "different labels: no classifier"),
         (check_domain(domain_of(resumes=False)), "restore", "cannot be resumed"),
         (check_domain(NEVER, SMALL), "collect", "on-the-moon has no positives"),
+        (check_domain(low, SMALL), "steps", "options cannot be learned from these pictures: images are too small"),
     ]
     for found, law, warning in surprises:
         verdicts = {verdict.name: verdict for verdict in found}
