@@ -44,6 +44,8 @@ def page_of(folder, **how):
 def test_the_page_opens_with_the_task_and_a_verdict_of_its_numbers(tiny_run):
     """Spec I1: recomputed from ``numbers.csv``."""
     agrees(tiny_run, "Take the red key, open the red door and reach the goal", "One run is not")
+    page = (tiny_run / "report" / "index.html").read_text()
+    assert 'The latter is under <a href="#choosing">What choosing is worth</a>.' in page and 'id="choosing"' in page
 
 
 def test_agents_are_grouped_and_counted_whole(tiny_run, results):
