@@ -111,7 +111,7 @@ def settings() -> str:
     ]
     for domain in BUILT_IN:
         for stage in TABLES:
-            rows = described(config_class_of(stage, domain), *layers_of(stage, domain))
+            rows = described(config_class_of(stage, domain), *layers_of(stage, domain, None))
             lines += [f"## {stage}, {domain}", "", "| setting | default | meaning | source |", "|---|---|---|---|"]
             lines += [_row(row) for row in rows]
             lines.append("")

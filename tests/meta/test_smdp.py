@@ -99,10 +99,13 @@ def test_masked_options_are_never_drawn() -> None:
     assert float(entropy.detach()) == pytest.approx(-(p * np.log(p) + (1 - p) * np.log(1 - p)), rel=1e-5)
 
 
-@pytest.mark.parametrize("network", [LightMetaNetwork, PaperMetaNetwork])
-def test_networks_give_a_score_per_option_and_a_value(network: type) -> None:
+@pytest.mark.parametrize(
+    "network",
+    [LightMetaNetwork((64, 64, 3), 15, None, "light"), PaperMetaNetwork((64, 64, 3), 15)],
+)
+def test_networks_give_a_score_per_option_and_a_value(network: torch.nn.Module) -> None:
     """Spec E2: shared features, an actor and a critic; early choices are nearly uniform."""
-    out = network((64, 64, 3), 15)(torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8))
+    out = network(torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8))
     assert out.shape == (2, 16)
     assert float(out.detach()[:, :15].softmax(1).max()) < 0.08
 
