@@ -27,8 +27,7 @@ class Columns(Resumable):
     """Arrays (n, ...), one for each field."""
 
     def __len__(self) -> int:
-        columns = vars(self).values()
-        first, *_ = columns
+        first = next(iter(vars(self).values()))
         return len(first)
 
     @classmethod

@@ -130,7 +130,7 @@ class MetaPolicy(Chooser):
         return self.update(draws.at(order), outcomes.at(order))
 
     def _outputs(self, ids: Ints) -> Tensor:
-        return apply_to_states(self.network, self.engine, ids)
+        return apply_to_states(self.network, self.engine, ids, self.device)
 
     def update(self, draws: Draws, outcomes: Outcome) -> dict[str, float]:
         """Learn from decisions, those of an environment side by side in the order in which they were taken."""

@@ -86,7 +86,7 @@ class LightLearner(Learner):
         options: Ints,
         age: Ints,
     ) -> Ints:
-        values = networks.apply_to_states(self.networks.online, self.engine, ids).cpu().numpy()
+        values = networks.apply_to_states(self.networks.online, self.engine, ids, self.device).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
@@ -148,6 +148,7 @@ class LightLearner(Learner):
             self.engine,
             lessons.state,
             lessons.next_state,
+            self.device,
         )
         loss, errors = self.networks.update(
             *values,
@@ -173,7 +174,9 @@ class LightLearner(Learner):
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
             ranks = (self.rng.random(extra) * counts[options]).astype(np.int64)
-            slots = (kept[options].cumsum(axis=1) <= ranks[:, None]).sum(axis=1)
+            _options, filled = np.nonzero(kept)
+            begins = counts.cumsum() - counts  # of each option in these
+            slots = filled[begins[options] + ranks]
             batch = Lessons.joined([batch, self.positive.at((options, slots))])
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
         return batch, indices, weights

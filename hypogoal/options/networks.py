@@ -207,9 +207,13 @@ class LightQNetwork(LightNetwork):
         return self.heads(features).view(-1, self.members, self.actions)
 
 
-def apply_to_states(network: nn.Module, engine: Engine, ids: Ints) -> Tensor:
-    """A network's output on states of an engine: by tile codes where both know them, else by images."""
-    device = next(network.parameters()).device
+def apply_to_states(
+    network: nn.Module,
+    engine: Engine,
+    ids: Ints,
+    device: torch.device,
+) -> Tensor:
+    """Output of a network on ``device`` for states of an engine: by tile codes where both know them, else by images."""
     tiles = engine.tiles
     if tiles is not None and isinstance(getattr(network, "cells", None), CellEmbedding):
         codes = tensor(engine.codes(ids).astype(np.int64), device)
@@ -223,10 +227,10 @@ def values_of(
     engine: Engine,
     states: Ints,
     next_states: Ints,
+    device: torch.device,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The online network in states (with gradients) and in next states, the target in these; (n, O, A) each."""
     both = np.concatenate([states, next_states])
-    device = next(online.parameters()).device
     if isinstance(online.cells, PictureEmbedding):  # whose states hardly ever occur twice
         now, later = tensor(engine.images(both), device).float().split(len(states))
         with torch.no_grad():
@@ -236,8 +240,8 @@ def values_of(
     # A batch has few distinct states, late in training 40 of 256: the networks see each once.
     distinct, places = np.unique(both, return_inverse=True)
     before, after = tensor(places, device).split(len(states))
-    values = apply_to_states(online, engine, distinct)
-    others = apply_to_states(target, engine, distinct)
+    values = apply_to_states(online, engine, distinct, device)
+    others = apply_to_states(target, engine, distinct, device)
     # index_select, not indexing, whose gradient takes several times as long.
     now = values.index_select(0, before)
     next_online = values.detach().index_select(0, after)

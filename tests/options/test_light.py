@@ -28,7 +28,8 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
         gradients = torch.autograd.grad(loss, [*learner.networks.online.parameters()])
         return torch.cat([gradient.flatten() for gradient in gradients])
 
-    here, next_online, next_target = values_of(learner.networks.online, learner.networks.target, engine, s, following)
+    online, target = learner.networks.online, learner.networks.target
+    here, next_online, next_target = values_of(online, target, engine, s, following, learner.device)
     fast = slopes(here)
     images, after = (torch.from_numpy(engine.images(states)) for states in (s, following))
     plain = learner.networks.online(images)

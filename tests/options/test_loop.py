@@ -141,7 +141,7 @@ def test_the_meta_policy_learns_which_option_pays() -> None:
         restored.load(policy.state())
         for chooser in (policy, restored):
             with torch.no_grad():
-                scores = apply_to_states(chooser.network, engine, np.array([2]))[:, :-1]
+                scores = apply_to_states(chooser.network, engine, np.array([2]), chooser.device)[:, :-1]
             assert int(among(scores, torch.ones(1, 2, dtype=torch.bool)).argmax(1)) == 1, head
 
 
