@@ -125,17 +125,20 @@ def played(config: TrainOptionsConfig, options: int, steps: int) -> OptionLoop:
     return loop
 
 
+def update(loop: OptionLoop) -> float:
+    """CPU seconds of one update."""
+    learner = loop.learner
+    if isinstance(learner, PaperLearner):
+        learner.members[0].due = learner.config.update_interval
+    else:
+        assert isinstance(learner, LightLearner)
+        learner.due = learner.config.update_interval
+    return timing.cpu_seconds(learner.learn)
+
+
 def learning(loop: OptionLoop, updates: int) -> float:
     """CPU seconds of an update: the median of some, the first left out."""
-    learner = loop.learner
-    times = []
-    for _ in range(updates + 1):
-        if isinstance(learner, PaperLearner):
-            learner.members[0].due = learner.config.update_interval
-        else:
-            assert isinstance(learner, LightLearner)
-            learner.due = learner.config.update_interval
-        times.append(timing.cpu_seconds(learner.learn))
+    times = [update(loop) for _ in range(updates + 1)]
     return statistics.median(times[1:])
 
 
