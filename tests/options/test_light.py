@@ -1,11 +1,14 @@
-"""The light learner's fast path: distinct states of a batch once, by their tiles (Spec D2)."""
+"""The light learner's batches: distinct states once, by their tiles; what reached sub-goals again (Spec D2, D3)."""
+
+from collections import Counter
 
 import numpy as np
 import torch
+from corridor import LongCorridor
 
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.light import LightLearner
+from hypogoal.options.light import Lessons, LightLearner
 from hypogoal.options.networks import values_of
 from hypogoal.options.termination import oracle_terminations
 
@@ -40,3 +43,27 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
     assert not next_online.requires_grad
     assert not next_target.requires_grad
     assert not torch.allclose(next_online, next_target)
+
+
+def test_what_reached_is_drawn_while_its_states_are_remembered() -> None:
+    """A quarter of a batch: of the options that have some, each of what an option has alike."""
+    engine = LongCorridor(1, memory=120)
+    config = OptionConfig.of(environments=1, replay=100, option_batch=8)
+    learner = LightLearner(engine, oracle_terminations(engine, [0, 1, 0]), config, 0)
+    for _ in range(200):
+        engine.step(np.array([0]))
+    assert engine.oldest == 84
+    learner.replay.add(Lessons.cast([199], [0], [200], [1], [0], [False]))
+    reached = {0: [(10, 11), (90, 91), (83, 84), (95, 96)], 1: [(12, 13)], 2: [(0, 150), (0, 20)]}  # 0: the start
+    for option, states in reached.items():
+        for slot, (state, following) in enumerate(states):
+            learner.positive.put((option, slot), Lessons(state, 0, following, 1, option, False))
+        learner.positives[option] = len(states)
+    drawn: Counter[tuple[int, int]] = Counter()
+    for _ in range(200):
+        batch, indices, weights = learner._batch()
+        assert (len(indices), len(batch), len(weights)) == (6, 8, 8)
+        again = batch.at(slice(6, None))
+        drawn.update(zip(again.state.tolist(), again.next_state.tolist(), strict=True))
+    assert drawn.keys() == {(90, 91), (95, 96), (0, 150)}
+    assert all(70 <= drawn[pair] <= 130 for pair in [(90, 91), (95, 96)])
