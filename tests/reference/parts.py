@@ -336,7 +336,7 @@ def add_predictions(name: str, data: Callable[[Path], Path], objective: str, *, 
 
 for objective in OBJECTIVES:
     add_predictions("vector", vector_data, objective, slow=False)
-    add_predictions("doorkey", doorkey_data, objective, slow=objective != "dbat", batch_size=32)
+add_predictions("doorkey", doorkey_data, "dbat", slow=False, batch_size=32)
 add_predictions("montezuma", montezuma_data, "dbat", slow=True, batch_size=16, members=2)
 
 
