@@ -3,7 +3,7 @@ PYTHON ?= python3
 JOBS ?= 2
 DEMO ?= runs/demo
 ROOMS ?= runs/rooms
-ONLY ?= doorkey training options loop
+ONLY ?= doorkey training options loop limits
 
 VENV := .venv
 BIN := $(VENV)/bin
