@@ -38,7 +38,7 @@ $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 # An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(ROOMS) and $(DEMO).
 # The rooms take what DoorKey leaves of the cores. A shell has what it runs beside it ignore Ctrl-C: hence the trap.
 demo: $(USER) ## three-key DoorKey, in runs/demo, and where an ensemble is needed, in runs/rooms: from nothing to a report
-	@nice $(BIN)/hypogoal run rooms --preset demo --out $(ROOMS) --quiet $(if $(wildcard $(ROOMS)),--resume) & rooms=$$!; \
+	@nice -n 19 $(BIN)/hypogoal run rooms --preset demo --out $(ROOMS) --quiet $(if $(wildcard $(ROOMS)),--resume) & rooms=$$!; \
 	trap 'kill $$rooms 2>/dev/null; wait $$rooms' EXIT; trap 'exit 130' INT TERM; \
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume) && \
 	{ echo "waiting for $(ROOMS)"; wait $$rooms; }

@@ -20,7 +20,6 @@ from hypogoal.core.processes import CORES, cores, surroundings
 from hypogoal.experiments import slurm
 
 PRELOADED = [  # what stages import when they are called
-    "torch._dynamo",
     "networkx",
     "h5py",
     "minigrid",
