@@ -197,7 +197,7 @@ class Learner(LightLearner):
         leads = best.any(axis=2)
         best[~leads] = True  # where no way leads to a sub-goal nothing is wrong
         networks = self.networks
-        scores = apply_to_states(networks.online, self.engine, states).log_softmax(2)
+        scores = apply_to_states(networks.online, self.engine, states, self.device).log_softmax(2)
         of_best = scores.masked_fill(tensor(~best, self.device), -torch.inf).logsumexp(2)
         loss = of_best.neg().sum() / max(1, int(leads.sum()))
         fallen = min(1.0, self.steps / self.last)
