@@ -86,6 +86,7 @@ def _begin(environment: Mapping[str, str]) -> None:
     """What a process does first."""
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C, and ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: a fork has its parent's handler, which ends a task alone
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

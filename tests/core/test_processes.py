@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.processes import CORES, allowed, cores, in_processes
+from hypogoal.core.processes import CORES, allowed, cores, in_processes, stop
 
 
 def ignore(number: int, result: object) -> None:
@@ -49,11 +49,16 @@ def sleep(begun: Path) -> None:
     time.sleep(600)
 
 
-def test_what_fails_ends_the_others(tmp_path: Path) -> None:
-    """At once, with the place of its error in user code."""
-    tasks = [partial(each, tmp_path / "begun") for each in (fail_after, sleep)]
-    with pytest.raises(UserError, match=r"your code raised ValueError: first: test_processes.py, line \d+"):
-        in_processes(tasks, 2, ignore)
+@pytest.mark.parametrize("forked", [False, True])
+def test_what_fails_ends_the_others(tmp_path: Path, forked: bool) -> None:
+    """At once, with the place of its error in user code, and in a stage, whose signals have a handler."""
+    tasks = [partial(each, tmp_path / "begun") for each in (fail_after, *[sleep] * 4)]
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        with pytest.raises(UserError, match=r"your code raised ValueError: first: test_processes.py, line \d+"):
+            in_processes(tasks, 2, ignore, forked=forked)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 NO_GUARD = """
