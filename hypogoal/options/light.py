@@ -174,9 +174,9 @@ class LightLearner(Learner):
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
             ranks = (self.rng.random(extra) * counts[options]).astype(np.int64)
-            _options, filled = np.nonzero(kept)
-            begins = counts.cumsum() - counts  # of each option in these
-            slots = filled[begins[options] + ranks]
+            _options, kept_slots = np.nonzero(kept)
+            firsts = counts.cumsum() - counts  # of each option among them
+            slots = kept_slots[firsts[options] + ranks]
             batch = Lessons.joined([batch, self.positive.at((options, slots))])
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
         return batch, indices, weights

@@ -86,7 +86,7 @@ def test_forked_and_fresh_cells_make_the_same_bytes(whole: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_stopped_each_cell_saves(whole: Path, tmp_path: Path, sent: signal.Signals, code: int) -> None:
+def test_a_signal_has_each_cell_save(whole: Path, tmp_path: Path, sent: signal.Signals, code: int) -> None:
     """Spec G1: 128 + the signal and no process left over; the cell goes on from its checkpoint."""
     toy = tmp_path / "toy.toml"
     toy.write_text((whole / "toy.toml").read_text().replace("steps=20", "steps=100000"))
