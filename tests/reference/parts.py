@@ -35,8 +35,8 @@ EXECUTIONS = {LAYOUT: 160, 102: 40}  # of options that learned on the first layo
 EPISODE = 40  # steps at most, so that episodes end
 CURVE_POINTS = 20  # that are kept of each curve
 CLOSE = 1e-4
-# Where pictures are trained on, forty steps part further on a processor that adds up otherwise: by 0.012 at most between
-# an AMD EPYC and an Intel Xeon. Another objective parts by 0.17 at least.
+# Where pictures are trained on, forty steps part further on a processor that adds up otherwise: by 0.012 at most
+# between an AMD EPYC and an Intel Xeon. Another objective parts by 0.17 at least.
 LOOSE = 0.03
 LOOSE_ELSEWHERE = ("predictions-doorkey-dbat", "predictions-montezuma-dbat", "evaluation-ladders")
 EVALUATED = 1e-8
