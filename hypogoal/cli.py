@@ -302,7 +302,7 @@ for _stage, _help in stages.LISTED.items():  # their commands come from them
 
 @command(OWN, "check mine:DOMAIN")
 def check(
-    domain: Annotated[str | None, Argument(help=stages.DOMAINS)] = None,
+    domain: Annotated[str | None, Argument(help=f"{stages.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
     view: Annotated[str | None, Option(help="What members see: module:Class.")] = None,
@@ -313,7 +313,10 @@ def check(
     set_: stages.Set = None,
     seed: stages.Seed = 0,
 ) -> None:
-    """Check that your domain, or part of an agent, keeps its contract.
+    """Check that your domain, or part of an agent, keeps its contract; or that data suffice.
+
+    Of a data file, in a minute: are there enough labels, do they leave more
+    than one hypothesis, how long will training take? --set is train-ensemble's.
 
     Exit code 2 if not. It collects a few states of the domain twice; --set
     changes how, as for 'collect'. Parts see, or play in, that domain; without
@@ -321,14 +324,19 @@ def check(
     """
     from hypogoal import check as contracts
     from hypogoal.core import config as settings
+    from hypogoal.data import open_dataset
     from hypogoal.domains import base as domains
 
     checks: list[Any] = []
     observations: tuple[Any, ...] = ()
     loaded = chosen = None
-    if domain is not None:
+    assigned = settings.assigned(set_ or ())
+    if domain is not None and domain.endswith(".h5"):
+        in_file = open_dataset(Path(domain)).domain
+        training = domains.settings_of("train-ensemble", in_file, typed=assigned)
+        checks.append(contracts.check_data(Path(domain), training, seed=seed))
+    elif domain is not None:
         loaded = domains.load_domain(domain)
-        assigned = settings.assigned(set_ or ())
         chosen = domains.settings_of("collect", domain, typed=assigned)
         checks.append(contracts.check_domain(loaded, chosen, seed=seed))
         observations = loaded.observation_shape, loaded.observation_dtype

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from examples.one_room import observed_pixel
 from hypogoal.core.processes import prepare
 from hypogoal.core.seeding import seed_for
-from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE
+from hypogoal.domains.montezuma.domain import SEEN_NOWHERE, TABLE_1
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import attributed, mean_state
@@ -120,7 +120,7 @@ def run_cell(method: str, seed: int) -> list[Row]:
             place = {"method": method, "seed": seed, "step": step, "member": member}
             rows.append(place | {name: float(numbers[member]) for name, numbers in columns.items()})
 
-    config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": LOOKS[-1]})
+    config = EnsembleConfig.of(**{**TABLE_1, "members": MEMBERS, "steps": LOOKS[-1]})
     training = EnsembleTraining(
         data.labelled.observations,
         data.labelled.labels[:, 0],

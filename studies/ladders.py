@@ -27,7 +27,7 @@ from hypogoal.core.processes import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
-from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE, MontezumaConfig
+from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE, TABLE_1, MontezumaConfig
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.evaluation.house import above
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -85,7 +85,7 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> lis
             place = {"groups": groups, "method": method, "seed": seed, "step": step, "member": member}
             rows.append(place | {name: float(values[member]) for name, values in columns.items()})
 
-    config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": looks[-1]})
+    config = EnsembleConfig.of(**{**TABLE_1, "members": MEMBERS, "steps": looks[-1]})
     training = EnsembleTraining(
         data.labelled.observations,
         data.labelled.labels[:, 0],

@@ -3,6 +3,7 @@
 ``hypogoal check`` prints a line for each law. In your own test suite: ``require(check_domain(DOMAIN))``.
 """
 
+from hypogoal.check.data import check_data
 from hypogoal.check.domains import check_domain
 from hypogoal.check.members import check_network, check_teacher, check_view
 from hypogoal.check.objectives import check_objective
@@ -11,6 +12,7 @@ from hypogoal.check.verdict import Verdict, require
 
 __all__ = [
     "Verdict",
+    "check_data",
     "check_domain",
     "check_network",
     "check_objective",

@@ -14,7 +14,7 @@ from functools import cache
 from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -78,13 +78,14 @@ class Config(BaseModel):
 class Details:
     """What is said of a setting, and which values it, or each item of a tuple, may have.
 
-    It is ``low`` to ``high``, or among ``choices``; ``own``: or ``module:object``.
+    It is ``low`` to ``high`` or one of ``words``, or among ``choices``; ``own``: or ``module:object``.
     """
 
     unit: str = ""
     source: str = ""
     low: float = -inf
     high: float = inf
+    words: Sequence[str] = ()
     choices: Sequence[Any] | Mapping[Any, Any] = ()
     own: bool = False
 
@@ -92,6 +93,8 @@ class Details:
         """Whether the setting may have this value."""
         if self.choices:
             return value in self.choices or (self.own and ":" in value)
+        if value in self.words:
+            return True
         return not self.is_bounded or self.low <= value <= self.high
 
     @property
@@ -106,7 +109,8 @@ class Details:
             if self.own:
                 choices.append(OWN)
             return "|".join(choices)
-        return f"{self.low} .. {self.high}" if self.is_bounded else ""
+        numbers = [f"{self.low} .. {self.high}"] if self.is_bounded else []
+        return "|".join([*self.words, *numbers])
 
 
 def setting(default: Any, meaning: str, **details: Any) -> Any:
@@ -202,7 +206,7 @@ def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str
             details = _details(field)
             rows[name] = {
                 "name": name,
-                "type": getattr(field.annotation, "__name__", str(field.annotation)),
+                "type": _type_text(field.annotation),
                 "default": defaults[name],
                 "unit": details.unit,
                 "meaning": field.description or "",
@@ -230,7 +234,8 @@ def _typed(raw: Any, kind: Any) -> Any:
         if not isinstance(items, list | tuple):
             return items
         return [_typed(item, kind) for item in items]
-    if kind in (int, float) and isinstance(raw, bool):
+    kinds = get_args(kind) or (kind,)
+    if (int in kinds or float in kinds) and isinstance(raw, bool):
         raise ValueError("this must be a number")
     if kind is int and isinstance(raw, str) and "e" in raw.lower():
         return float(raw)
@@ -251,6 +256,14 @@ def _items(text: str, kind: Any) -> list[Any]:
             raise ValueError(f"a range goes up, over at most {MOST} integers")
         numbers += range(first, last + 1)
     return numbers
+
+
+def _type_text(kind: Any) -> str:
+    """A setting's type: ``float``, ``tuple[int, ...]``, ``float|auto``."""
+    if get_origin(kind) is not Union:
+        return getattr(kind, "__name__", str(kind))
+    number, words = get_args(kind)
+    return "|".join([number.__name__, *get_args(words)])
 
 
 def _details(field: FieldInfo) -> Details:

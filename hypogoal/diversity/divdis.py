@@ -12,11 +12,11 @@ RATIO_WEIGHT = 1.0  # of the ratio term beside the mutual information: own choic
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """Mutual information of all ordered pairs, plus each member's deviation from the labelled share of positives.
+    """Mutual information of all ordered pairs, plus each member's deviation from an expected share of positives.
 
-    ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``, with p(y) the labelled states' share of
-    positives. The second term keeps members from predicting one class for all unlabelled states, where the first is 0
-    without a gradient.
+    ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``, with p(y) from the setting ``share``, at
+    the source the labelled states' share of positives. The second term keeps members from predicting one class for all
+    unlabelled states, where the first is 0 without a gradient.
 
     Returns:
         float (), in nats, at least 0 up to rounding; 0 for no states.

@@ -28,6 +28,7 @@ BUILT_IN = {
 }
 ENTRY_POINTS = "hypogoal.domains"
 REGISTERED: dict[str, Domain] = {}  # domains that the running program defined, by name
+EQUATION_1 = {"schedule": "simultaneous", "restarts": 1, "share": "labels"}  # of train-ensemble, beside the weight
 IMPORTED = "imported"  # the domain of states that 'hypogoal import' got without --domain
 
 

@@ -5,6 +5,7 @@ Also whatever their thresholds, and without the luck of picking the best; and wh
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -178,7 +179,23 @@ def context(results):
     )
     label = "Members' balanced accuracy on held-out states"
     figure = Drawn("members", label, partial(members_figure, means))
-    return tables | {"figures": [figure] if len(means) else []}
+    return tables | chosen_in(results) | {"figures": [figure] if len(means) else []}
+
+
+def chosen_in(results) -> dict[str, Any]:
+    """For the template: the weights that ``diversity_weight=auto`` tried, a row each, and members that are idle."""
+    rows, idle = [], []
+    for artefact in results.facts["provenance"]["artefacts"]:
+        for sub_goal, chosen in artefact["config"].get("chosen", {}).items():
+            place = f"{artefact['path']}, {sub_goal}"
+            idle += [f"{place}: {text}" for text in chosen["idle"]]
+            for tried in chosen["tried"]:
+                remark = "chosen" if tried["kept"] else "a member is constant" if tried["constant"] else ""
+                disagreement = tried["disagreement"]
+                shown = "–" if disagreement is None else f"{disagreement:.2f}"
+                numbers = f"{tried['weight']:g}", f"{tried['accuracy']:.3f}", f"{chosen['lowest']:.3f}", shown
+                rows.append((place, *numbers, remark))
+    return {"tried": rows, "idle": idle}
 
 
 def members_figure(means: pd.DataFrame) -> Figure:

@@ -18,14 +18,14 @@ NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
         *("world", "members", "observation_dtype", "groups", "domain_config"),  # which the names or the column N say
-        *("ended_at", "until_reached", "options_ended_at", "options_steps"),  # which came out
+        *("ended_at", "until_reached", "options_ended_at", "options_steps", "chosen"),  # which came out
     }
 )
 ON_LADDERS = dict.fromkeys(
     ("start", "domain_config", "termination"),
     "",
 )  # of options, said in other columns
-IDLE = {"diversity", "diversity_weight", "schedule"}  # settings without effect where there is one member
+OF_DIVERSITY = {"diversity_weight", "schedule", "restarts", "share"}  # settings without effect where there is none
 OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "none": "no diversity"}
 ONE = "one classifier"
 ORACLE = "oracle termination"
@@ -95,9 +95,9 @@ def _texts(config):
     flat = {**(config.get("domain_config") or {}), **config}
     unsaid = NOT_A_VARIANT
     if config.get("members") == 1:
-        unsaid |= IDLE
+        unsaid |= OF_DIVERSITY | {"diversity"}
     if config.get("diversity") == "none":
-        unsaid |= {"diversity_weight"}
+        unsaid |= OF_DIVERSITY
     return {key: as_text(flat[key]) for key in flat.keys() - unsaid}
 
 

@@ -59,7 +59,8 @@ def settings_of(results: Results) -> pd.DataFrame:
                 parts.append(("data", {"sha256": item["sha256"][:10]}))
     rows = []
     for kind, settings in parts:
-        settings.pop("domain_config", None)  # the data's own
+        for name in ("domain_config", "chosen"):  # the data's own, and what came out
+            settings.pop(name, None)
         rows += [(kind, name, as_text(value)) for name, value in settings.items()]
     return pd.DataFrame(rows, columns=["of", "setting", "text"]).drop_duplicates()
 

@@ -1,6 +1,6 @@
 """The settings of ensemble training, without PyTorch, so that ``hypogoal config`` starts fast."""
 
-from typing import Any
+from typing import Any, Final, Literal
 
 from pydantic import model_validator
 
@@ -9,27 +9,23 @@ from hypogoal.core.config import Config, setting
 BEYOND = "own: beyond the paper"
 FULL = "full"  # the view that shows all of an observation
 VIEW = "view."  # before a setting of a view of one's own
+AUTO: Final = "auto"  # a value that is chosen from the user's own states
+SCHEDULES = ("simultaneous", "sequential")
+LABELS: Final = "labels"  # the share of positives that the labelled states have
 
 
-class EnsembleConfig(Config):
-    """The members and their training. Spec C6: the defaults are DoorKey's values (Table 3)."""
+class MembersConfig(Config):
+    """The members and their training but for the weight of diversity. Spec C6: the defaults are DoorKey's (Table 3)."""
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(
         "dbat", "diversity objective: dbat, none, another of docs/concepts.md, or module:function", source="Eq. (1)"
     )
-    diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     teacher: str = setting(
         "",
         "own code, module:function, that gives scores of the unlabelled states, which members learn beside the labels; "
         "empty: none",
         source=f"{BEYOND}: docs/extending.md",
-    )
-    schedule: str = setting(
-        "simultaneous",
-        "all members at once (the double sum of Eq. (1)), or one after the other, each against the earlier ones",
-        source="Eq. (1); sequential: D-BAT (arXiv:2202.04414)",
-        choices=("simultaneous", "sequential"),
     )
     network: str = setting(
         "auto",
@@ -89,8 +85,54 @@ class EnsembleConfig(Config):
         return others | {"view_settings": settings}
 
 
-class TrainEnsembleConfig(EnsembleConfig):
+class EnsembleConfig(MembersConfig):
+    """One training of an ensemble, with the paper's weight and schedule by default."""
+
+    diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
+    schedule: str = setting("simultaneous", "all members at once, or one after the other", choices=SCHEDULES)
+    share: float | Literal["labels"] = setting(
+        LABELS, "share of positives that divdis expects among unlabelled states", low=0.0, high=1.0, words=[LABELS]
+    )
+
+
+class TrainEnsembleConfig(MembersConfig):
     """The settings of ``train-ensemble``: ensembles of some sub-goals."""
 
+    diversity_weight: float | Literal["auto"] = setting(
+        AUTO,
+        "weight of the diversity loss (alpha); auto: the largest of 1, 0.3, 0.1, ... at which every member is as right "
+        "about held-out labels as one trained without diversity, within a standard error",
+        source=f"{BEYOND}: docs/concepts.md",
+        low=0.0,
+        words=[AUTO],
+    )
+    schedule: str = setting(
+        "sequential",
+        "one member after the other, each against the earlier ones, or all at once (the double sum of Eq. (1))",
+        source="D-BAT (arXiv:2202.04414); simultaneous: Eq. (1)",
+        choices=SCHEDULES,
+    )
+    restarts: int = setting(
+        4,
+        "first members of a sequential ensemble that begin; the one that is most certain of unlabelled states stays",
+        source=f"{BEYOND}: docs/results/hypotheses.md",
+        low=1,
+        high=64,
+    )
+    share: float | Literal["auto", "labels"] = setting(
+        AUTO,
+        "share of positives that divdis expects among unlabelled states; auto: what a member without diversity "
+        "predicts; labels: that of the labelled states",
+        source=f"labels: DivDis (arXiv:2202.03418); auto: {BEYOND}",
+        low=0.0,
+        high=1.0,
+        words=[AUTO, LABELS],
+    )
     sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
     workers: int = setting(0, "processes; 0 for one per core", low=0, high=1024)
+
+    def training(self, weight: float, share: float | Literal["labels"], **others: Any) -> EnsembleConfig:
+        """The settings of one training with this weight and share; ``others`` replace the user's."""
+        shared = {name: getattr(self, name) for name in MembersConfig.model_fields}
+        settings = {**shared, "schedule": self.schedule, "diversity_weight": weight, "share": share, **others}
+        return EnsembleConfig(**settings)

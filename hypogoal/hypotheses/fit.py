@@ -40,7 +40,7 @@ from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import tensor
 from hypogoal.diversity import Context, Objective, load_objective
 from hypogoal.hypotheses.batches import Numbers, TrainingStates
-from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.config import LABELS, EnsembleConfig
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ def fit(
         states: the states, with their classes.
         batches: numbers of the labelled (B,) and of the unlabelled states (N,) of each step.
         optimiser: of the members' weights.
-        config: diversity and its weight, class weights, ``unlabelled_bn``.
+        config: diversity, its weight and share, class weights, ``unlabelled_bn``.
         taught: a teacher's scores, float (K, M), of all unlabelled states.
     """
     objective = objective_of(config)
     class_weights = torch.tensor([config.class_weight_negative, config.class_weight_positive], device=states.device)
     frozen_logits = states.frozen_logits(frozen if objective else [])  # (F, M, 2)
-    positives = float(states.labels.mean())
+    positives = config.share if config.share != LABELS else float(states.labels.mean())
     compared = objective is not None or taught is not None
     for labelled, unlabelled in batches:
         classes = states.targets(labelled)

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 
+SAME = 0.99  # of unlabelled states: a member that predicts so many as another one does is no other hypothesis
+
 
 def member_scores(
     predictions: Bools,
@@ -151,3 +153,22 @@ def mean_disagreement(predictions: Bools) -> float:
     positive = predictions.sum(1)
     differing = positive * (members - positive)  # pairs of members, in each state
     return float(differing.mean()) / math.comb(members, 2)
+
+
+def idle_members(predictions: Bools, layouts: Ints | None = None) -> list[str]:
+    """A line for each member that is no hypothesis of its own, from predictions (M, K) on unlabelled states.
+
+    It is constant, or constant within each of several ``layouts`` (M,), or the same as an earlier member on ``SAME`` of
+    the states.
+    """
+    lines = []
+    kinds = [] if layouts is None else [layouts == layout for layout in np.unique(layouts)]
+    for member, own in enumerate(predictions.T):
+        alike = [other for other in range(member) if (predictions[:, other] == own).mean() >= SAME]
+        if own.all() or not own.any():
+            lines.append(f"member {member} predicts {'positive' if own.all() else 'negative'} everywhere")
+        elif len(kinds) > 1 and all(len(np.unique(own[inside])) == 1 for inside in kinds):
+            lines.append(f"member {member} tells layouts apart, not states")
+        elif alike:
+            lines.append(f"member {member} predicts what member {alike[0]} does")
+    return lines

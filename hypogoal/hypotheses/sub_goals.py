@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,28 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
+from hypogoal.hypotheses.auto import AutoTraining, Choice
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.hypotheses.training import EnsembleTraining
+from hypogoal.hypotheses.training import CHECKED_EVERY
 from hypogoal.observations import spread_rows
 
-LOOKED_AT = 1_000  # held-out states, cheap beside training
+LOOKED_AT = 1_000  # held-out or unlabelled states, cheap beside training
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of one sub-goal's training.
+
+    Attributes:
+        accuracies: see :func:`heldout_accuracy`.
+        choice: what was chosen where settings are ``auto``.
+        idle: see :func:`scores.idle_members`.
+    """
+
+    accuracies: dict[str, float]
+    choice: Choice
+    idle: list[str]
 
 
 def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
@@ -56,10 +73,10 @@ def train_sub_goal(
     device: str,
     tensorboard: Path | None,
     quiet: bool,
-) -> dict[str, float]:
-    """Train a sub-goal's ensemble, in a process of its own, and write it; returns its :func:`heldout_accuracy`.
+) -> Trained:
+    """Train a sub-goal's ensemble, in a process of its own, and write it.
 
-    ``others`` are the files of unlabelled states, if not ``data``.
+    ``others`` are the files of unlabelled states, if not ``data``. The log has the steps of the last training.
     """
     prepare()
     dataset = open_dataset(data)
@@ -67,7 +84,7 @@ def train_sub_goal(
     unlabelled = joined([open_dataset(file).unlabelled_states() for file in others or [data]])
     checkpoints = draft.checkpoints(sub_goal)
     saved = checkpoints.load()
-    training = EnsembleTraining(
+    training = AutoTraining(
         labelled.observations,
         labelled.labels,
         unlabelled.observations,
@@ -83,17 +100,24 @@ def train_sub_goal(
     def state() -> dict[str, Any]:
         return {"training": training.snapshot(), "log": log.snapshot()}
 
-    steps = config.steps * len(training.rounds)
-    with contextlib.closing(log), Progress(f"train-ensemble {sub_goal}", steps, quiet) as progress:
+    with contextlib.closing(log), Progress(f"train-ensemble {sub_goal}", training.most, quiet) as progress:
         progress.resume(training.step)
-        for step, losses in training.steps():
-            if training.due:
-                log.write(sub_goal=sub_goal, step=step, **losses.numbers())
-                progress.update(step)
+        for losses in training.steps():
+            last = training.last
+            if last and last.due:
+                log.write(sub_goal=sub_goal, step=last.step, **losses.numbers())
+            if training.step % CHECKED_EVERY == 0:
+                progress.total = training.most
+                progress.update(training.step)
             checkpoints.offer(state)
+        progress.total = training.step
+        progress.update(training.step)
     checkpoints.save(state())
     write_ensemble(draft.files, sub_goal, training.ensemble)
-    return heldout_accuracy(training.ensemble, dataset, sub_goal)
+    some = unlabelled.where(spread_rows(len(unlabelled.observations), LOOKED_AT))
+    predictions = training.ensemble.predictions(some.observations)
+    idle = scores.idle_members(predictions, some.origins.get("layout_seed")) if len(predictions) else []
+    return Trained(heldout_accuracy(training.ensemble, dataset, sub_goal), training.choice, idle)
 
 
 def log_of(draft: Draft, sub_goal: str) -> Path:

@@ -42,6 +42,7 @@ class EnsembleTraining(Resumable):
         seed: of weights, batches, and whatever else is random.
         origins: the states' origins, for a view that needs them.
         device: where to train; the ensemble stays there.
+        first: the weights of the first member of a sequential ensemble, which is trained already.
         saved: a ``snapshot`` of the same training, to go on from.
 
     Attributes:
@@ -63,6 +64,7 @@ class EnsembleTraining(Resumable):
         *,
         origins: views.StateOrigins | None = None,
         device: torch.device | str = "cpu",
+        first: Mapping[str, Any] | None = None,
         saved: Mapping[str, Any] | None = None,
     ):
         if not len(unlabelled) and (objective_of(config) or config.teacher or config.threshold == SPLIT):
@@ -80,6 +82,8 @@ class EnsembleTraining(Resumable):
             views.learn_from(view, observations, unlabelled, origins, seed)
         weights = seeding.torch_generator(seed, "weights")
         self.ensemble = Ensemble(config.network, shape, config.members, weights, view).to(device)
+        if first:
+            self.ensemble.networks[0].load_state_dict(first)
         self.taught = None
         if saved:
             self.ensemble.load_state_dict(saved["ensemble"])  # with what the view has learned
@@ -95,7 +99,7 @@ class EnsembleTraining(Resumable):
         )
         members = list(range(config.members))
         self.rounds = [[member] for member in members] if config.schedule == "sequential" else [members]
-        self._begin(saved["number"] if saved else 0)
+        self._begin(saved["number"] if saved else int(bool(first)))
         self._layers = None
         if saved:
             super().restore(saved)

@@ -1,6 +1,7 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from math import isnan
 from pathlib import Path
@@ -17,6 +18,7 @@ TITLES = {
     "mean": "mean",
     "worst": "worst",
 }
+IDLE = "Unlabelled states in which features part help, or diversity_weight=auto, or fewer members."
 ELSEWHERE = "Take unlabelled states from a data file, or options or a meta-policy with save_visited; repeatable."
 
 
@@ -39,7 +41,7 @@ def train_ensemble(
     from hypogoal.core.processes import allowed, in_processes
     from hypogoal.data import open_dataset
     from hypogoal.domains.base import installed_domain
-    from hypogoal.hypotheses.sub_goals import checked, log_of, train_sub_goal
+    from hypogoal.hypotheses.sub_goals import Trained, checked, log_of, train_sub_goal
     from hypogoal.observations import type_text
     from hypogoal.options.visited import unlabelled_file
 
@@ -70,13 +72,21 @@ def train_ensemble(
                 quiet=call.quiet,
             )
             jobs.append(job)
-        accuracies: list[dict[str, float]] = [{} for _ in jobs]
+        trained: dict[int, Trained] = {}
         draft.checkpoint.mkdir(exist_ok=True)
-        in_processes(jobs, allowed(config.workers), accuracies.__setitem__)
+        in_processes(jobs, allowed(config.workers), trained.__setitem__)
+        by_goal = {sub_goal: trained[number] for number, sub_goal in enumerate(sub_goals)}
+        settings["chosen"] = {goal: {**asdict(each.choice), "idle": each.idle} for goal, each in by_goal.items()}
         texts = [log_of(draft, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
         (draft.files / LOG).write_text("".join(texts), encoding="utf-8")
     then = "" if installed_domain(dataset.domain) else "evaluate {run}"  # recorded states have no world to practise in
-    return Done(_outcome(accuracies), then=then)
+    lines = []
+    for sub_goal, each in by_goal.items():
+        lines += each.choice.lines(sub_goal)
+        lines += [f"{sub_goal}: {text}, so it is no hypothesis of its own" for text in each.idle]
+    if any(each.idle for each in by_goal.values()):
+        lines.append(IDLE)
+    return Done([*lines, *_outcome([each.accuracies for each in by_goal.values()])], then=then)
 
 
 def _outcome(accuracies: Sequence[dict[str, float]]) -> list[str]:

@@ -181,6 +181,11 @@ def arrays_of(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
             yield item.name, item
 
 
+# What the stage's settings were for data of one's own, and for rooms, until diversity_weight=auto.
+FIXED = {"diversity_weight": 1e-4, "schedule": "simultaneous", "restarts": 1, "share": "labels"}
+IN_ROOMS = FIXED | {"diversity_weight": 0.03, "threshold": "unlabelled-split"}
+
+
 def predictions(work: Path, data: Path, name: str, **changed: object) -> Table:
     """What members trained for 40 steps predict of 40 held-out states of each sub-goal."""
     out = work / f"predictions-{name}"
@@ -338,19 +343,19 @@ def add_predictions(name: str, data: Callable[[Path], Path], objective: str, *, 
 
 
 for objective in OBJECTIVES:
-    add_predictions("vector", vector_data, objective, slow=False)
+    add_predictions("vector", vector_data, objective, slow=False, **FIXED)
 add_predictions("doorkey", doorkey_data, "dbat", slow=False, batch_size=32)
 add_predictions("montezuma", montezuma_data, "dbat", slow=True, batch_size=16, members=2)
 
 
 @part("predictions-rooms-simultaneous")
 def rooms_at_once(work: Path) -> Table:
-    return predictions(work, rooms_data(work), "rooms-simultaneous", schedule="simultaneous")
+    return predictions(work, rooms_data(work), "rooms-simultaneous", **IN_ROOMS)
 
 
 @part("predictions-rooms-sequential")
 def rooms_one_by_one(work: Path) -> Table:
-    return predictions(work, rooms_data(work), "rooms-sequential", schedule="sequential")
+    return predictions(work, rooms_data(work), "rooms-sequential", **IN_ROOMS | {"schedule": "sequential"})
 
 
 # Options and the choice among them.
@@ -463,7 +468,7 @@ def evaluation_rooms(work: Path) -> Table:
     for seed in range(970, 978):
         data = made(run / f"data/seed-{seed}.h5", "collect", "rooms", seed=seed)
         for method, chosen in methods.items():
-            words = [*chosen, *settings(steps=100, schedule="simultaneous", workers=1)]
+            words = [*chosen, *settings(steps=100, workers=1, **IN_ROOMS)]
             out = run / f"ensemble/method-{method}-seed-{seed}"
             ensemble = made(out, "train-ensemble", str(data), *words, seed=seed)
             words = settings(layout_seed=seed, world="truth=shape", steps=2_000)

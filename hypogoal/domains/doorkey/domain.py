@@ -5,13 +5,14 @@ See also ``env`` (the Gymnasium environment and the sub-goals) and ``engine`` (m
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from hypogoal.core.config import Config, setting
 from hypogoal.data import Collected, States, joined, leave_out, require_classes
-from hypogoal.domains.base import Domain
+from hypogoal.domains.base import EQUATION_1, Domain
 from hypogoal.domains.doorkey import env
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 
@@ -84,6 +85,8 @@ class DoorKeyDomain(Domain):
     engine_settings = ("door_label", "wrong_key")
     env_id = "hypogoal.envs:hypogoal/DoorKey-8x8-v0"
     many_layouts = True
+    sources = MappingProxyType({"train-ensemble": "paper, Table 3, Eq. (1)"})
+    defaults = MappingProxyType({"train-ensemble": {"diversity_weight": 1e-4, **EQUATION_1}})
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """Spec B3: labelled, unlabelled and held-out states, each with its origin.

@@ -19,7 +19,7 @@ from hypogoal.core.arrays import Bytes, Ints
 from hypogoal.core.config import Config, setting
 from hypogoal.core.processes import allowed, in_processes
 from hypogoal.data import Collected, States, joined
-from hypogoal.domains.base import Domain
+from hypogoal.domains.base import EQUATION_1, Domain
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MAX_STEPS
@@ -154,7 +154,7 @@ class MontezumaDomain(Domain):
     sources = MappingProxyType({"train-ensemble": "paper, appendix (Table 1)"})
     defaults = MappingProxyType(
         {
-            "train-ensemble": TABLE_1,
+            "train-ensemble": {**TABLE_1, **EQUATION_1},
             "train-options": ALONE,
             "train-meta": LEARNING,
             "audit": {name: value for name, value in ALONE.items() if name != "steps"},

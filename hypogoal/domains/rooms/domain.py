@@ -20,11 +20,8 @@ HELDOUT = 20  # layouts of held-out states
 DEFAULTS = {
     "train-ensemble": {
         "network": "tiles",
-        "schedule": "sequential",
-        "diversity_weight": 0.03,
         "steps": 600,
         "batch_size": 32,
-        "threshold": "unlabelled-split",
     },
     "train-meta": {"network": "planned", "steps": 10_000},
 }
