@@ -11,7 +11,7 @@ from hypogoal.check.verdict import Verdict, verdicts
 from hypogoal.core.processes import allowed, prepare
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, doubts_of, open_dataset
-from hypogoal.hypotheses.auto import WEIGHTS, AutoTraining
+from hypogoal.hypotheses.auto import AutoTraining
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.sub_goals import checked
@@ -65,7 +65,7 @@ class _Data:
         for sub_goal in self.sub_goals:
             self.seconds[sub_goal] = self.timed(sub_goal)
             few = self.config.model_copy(update=PAIR)
-            per_step = self.training(sub_goal, few).cost(USUAL) / few.steps * self.seconds[sub_goal]
+            per_step = self.training(sub_goal, few).cost(1, USUAL) / few.steps * self.seconds[sub_goal]
             steps = min(few.steps, int(SECONDS / len(self.sub_goals) / per_step))
             if steps < FEWEST:
                 texts.append(f"{sub_goal} not looked at: {FEWEST} steps would take {FEWEST * per_step:.0f} s")
@@ -85,8 +85,8 @@ class _Data:
         usual = most = 0.0
         for sub_goal in self.sub_goals:
             training = self.training(sub_goal, self.config)
-            usual += training.cost(USUAL) * self.seconds[sub_goal]
-            most += training.cost(len(WEIGHTS)) * self.seconds[sub_goal]
+            usual += training.cost(len(training.folds), USUAL) * self.seconds[sub_goal]
+            most += training.most * self.seconds[sub_goal]
         workers = min(allowed(self.config.workers), len(self.sub_goals))
         return f"train-ensemble takes some {_minutes(usual / workers)}, at most {_minutes(most / workers)}"
 

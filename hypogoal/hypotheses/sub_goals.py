@@ -18,10 +18,9 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
-from hypogoal.hypotheses.auto import AutoTraining, Choice
+from hypogoal.hypotheses.auto import AutoTraining
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.hypotheses.training import CHECKED_EVERY
 from hypogoal.observations import spread_rows
 
 LOOKED_AT = 1_000  # held-out or unlabelled states, cheap beside training
@@ -33,13 +32,12 @@ class Trained:
 
     Attributes:
         accuracies: see :func:`heldout_accuracy`.
-        choice: what was chosen where settings are ``auto``.
-        idle: see :func:`scores.idle_members`.
+        chosen: what was chosen where settings are ``auto``, and the members that are ``idle``
+            (:func:`scores.idle_members`).
     """
 
     accuracies: dict[str, float]
-    choice: Choice
-    idle: list[str]
+    chosen: dict[str, Any]
 
 
 def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
@@ -103,21 +101,19 @@ def train_sub_goal(
     with contextlib.closing(log), Progress(f"train-ensemble {sub_goal}", training.most, quiet) as progress:
         progress.resume(training.step)
         for losses in training.steps():
-            last = training.last
-            if last and last.due:
-                log.write(sub_goal=sub_goal, step=last.step, **losses.numbers())
-            if training.step % CHECKED_EVERY == 0:
+            now = training.now
+            if now and now.due:
                 progress.total = training.most
                 progress.update(training.step)
+                if training.is_last:
+                    log.write(sub_goal=sub_goal, step=now.step, **losses.numbers())
             checkpoints.offer(state)
-        progress.total = training.step
-        progress.update(training.step)
     checkpoints.save(state())
     write_ensemble(draft.files, sub_goal, training.ensemble)
     some = unlabelled.where(spread_rows(len(unlabelled.observations), LOOKED_AT))
     predictions = training.ensemble.predictions(some.observations)
     idle = scores.idle_members(predictions, some.origins.get("layout_seed")) if len(predictions) else []
-    return Trained(heldout_accuracy(training.ensemble, dataset, sub_goal), training.choice, idle)
+    return Trained(heldout_accuracy(training.ensemble, dataset, sub_goal), {**training.summary(), "idle": idle})
 
 
 def log_of(draft: Draft, sub_goal: str) -> Path:

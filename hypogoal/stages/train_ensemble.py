@@ -1,12 +1,12 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from math import isnan
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -18,7 +18,7 @@ TITLES = {
     "mean": "mean",
     "worst": "worst",
 }
-IDLE = "Unlabelled states in which features part help, or diversity_weight=auto, or fewer members."
+IDLE = "Give unlabelled states in which features part, or fewer members."
 ELSEWHERE = "Take unlabelled states from a data file, or options or a meta-policy with save_visited; repeatable."
 
 
@@ -75,18 +75,29 @@ def train_ensemble(
         trained: dict[int, Trained] = {}
         draft.checkpoint.mkdir(exist_ok=True)
         in_processes(jobs, allowed(config.workers), trained.__setitem__)
-        by_goal = {sub_goal: trained[number] for number, sub_goal in enumerate(sub_goals)}
-        settings["chosen"] = {goal: {**asdict(each.choice), "idle": each.idle} for goal, each in by_goal.items()}
+        chosen = {sub_goal: trained[number].chosen for number, sub_goal in enumerate(sub_goals)}
+        settings["chosen"] = chosen
         texts = [log_of(draft, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
         (draft.files / LOG).write_text("".join(texts), encoding="utf-8")
     then = "" if installed_domain(dataset.domain) else "evaluate {run}"  # recorded states have no world to practise in
-    lines = []
-    for sub_goal, each in by_goal.items():
-        lines += each.choice.lines(sub_goal)
-        lines += [f"{sub_goal}: {text}, so it is no hypothesis of its own" for text in each.idle]
-    if any(each.idle for each in by_goal.values()):
-        lines.append(IDLE)
-    return Done([*lines, *_outcome([each.accuracies for each in by_goal.values()])], then=then)
+    lines = [*chain.from_iterable(_choice(*each) for each in chosen.items())]
+    return Done([*lines, *_outcome([each.accuracies for each in trained.values()])], then=then)
+
+
+def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
+    """What was chosen for a sub-goal, and which of its members are no hypotheses."""
+    if chosen["tried"]:
+        held_out = f"{chosen['positives']} positives, {chosen['negatives']} negatives held out"
+        yield f"{sub_goal}: diversity_weight={chosen['diversity_weight']:g}, by {held_out}"
+        yield f"  weight  accuracy there (at least {chosen['lowest']:.3f})  disagreement on unlabelled states"
+    for tried in chosen["tried"]:
+        differs = "-" if tried["disagreement"] is None else f"{tried['disagreement']:.2f}"
+        remark = "  chosen" if tried["kept"] else "  a member is constant" if tried["constant"] else ""
+        yield f"  {tried['weight']:<6g}  {tried['accuracy']:<32.3f}  {differs}{remark}"
+    if chosen["remark"]:
+        yield f"{sub_goal}: {chosen['remark']}"
+    for text in chosen["idle"]:
+        yield f"{sub_goal}: {text}, so it is no hypothesis of its own. {IDLE}"
 
 
 def _outcome(accuracies: Sequence[dict[str, float]]) -> list[str]:
