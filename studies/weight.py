@@ -4,7 +4,7 @@
     python -m studies.weight docs/results/weight.csv --tables
 
 A cell is a method and a seed: data, an ensemble, and for each of both features an agent over planned options that is
-rewarded for it (PPO, 5,000 steps), which then plays 8,000 steps. ``owned``: of the best member, the balanced accuracy by
+rewarded for it (PPO, 5,000 steps), which then plays 8,000 steps. ``owned``: the best member's balanced accuracy by
 that feature on 320 states in which the two cross. All but the named settings are what anybody's data get.
 """
 
@@ -24,7 +24,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.rooms.states import crossed_states
 from hypogoal.evaluation.choosing import play_agent
 from hypogoal.hypotheses.scores import member_scores
-from studies.cells import Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "auto": {},
@@ -102,7 +102,7 @@ def main() -> None:
     if printed(arguments, tables):
         return
     cells = product(METHODS, arguments.seeds)
-    jobs = {(method, str(seed)): partial(run_cell, method, seed) for method, seed in cells}
+    jobs: Jobs = {(method, str(seed)): partial(run_cell, method, seed) for method, seed in cells}
     run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda _: [0], arguments.workers)
 
 

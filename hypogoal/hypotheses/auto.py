@@ -15,7 +15,8 @@ hypothesis, so its weight is passed over, unless members without diversity do so
 
 The first member of a sequential ensemble is trained on the labels alone, once for all weights. If it mixes features,
 later members can only mix what is left. So ``restarts`` of them begin, and after ``EARLY`` of its steps the one stays
-that is most certain of unlabelled states, by the mean of abs(2 p - 1): a mixture is in doubt where its features part.
+whose predictions tell most about unlabelled states, by the mutual information of state and prediction, H(mean p) -
+mean H(p) (Bridle et al. 1991): a mixture is in doubt where its features part, or says no to most states.
 """
 
 from collections.abc import Generator, Iterator
@@ -26,7 +27,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from hypogoal.core.arrays import Bools, Doubles, Ints
+from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import State
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.diversity import load_objective
@@ -42,6 +43,7 @@ WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
 FOLDS = 4  # one state in so many is held out
 FEWEST = 8  # held-out states of a class: with fewer, each fold is held out in turn; with fewer in all, nothing is tried
 EARLY = 1 / 3  # of a first member's steps
+SMALL = 1e-9  # probabilities below have no entropy
 GROUP = "group"  # the origin of states that are held out together
 FEW = "{} labels of a class are too few to choose the diversity weight by, so it is {}"
 SINGLE = "too few groups have both classes, so single states are held out: near copies make them easy"
@@ -102,6 +104,16 @@ def lowest_kept(right: Bools, labels: Bools) -> float:
         share = (right[inside, worst].sum() + 1) / (count + 2)
         variance += share * (1 - share) / count
     return float(accuracies[worst] - sqrt(variance) / 2)
+
+
+def information_of(probabilities: Floats) -> float:
+    """The mutual information of state and prediction, in nats, from a member's probabilities (M,)."""
+
+    def entropy(positive: Any) -> Any:
+        both = np.clip(np.stack([positive, 1 - positive]), SMALL, 1)
+        return -(both * np.log(both)).sum(axis=0)
+
+    return float(entropy(probabilities.mean()) - entropy(probabilities).mean())
 
 
 class AutoTraining:
@@ -232,7 +244,7 @@ class AutoTraining:
         return weight
 
     def _begin(self, rows: Bools, held: Bools | None = None) -> Outcome:
-        """Train the first member on the labels of ``rows``: of those that begin the most certain one."""
+        """Train the first member on the labels of ``rows``: of those that begin the one that tells most."""
         restarts = self.config.restarts
         candidates: list[State] = []
         for restart in range(restarts if restarts > 1 else 0):
@@ -241,7 +253,7 @@ class AutoTraining:
             candidates.append((yield from self._train(rows, seed, members=1, until=until)))
         best: State = {"seed": self.seed, "training": None}
         if candidates:
-            best = max(candidates, key=lambda candidate: candidate["certainty"])
+            best = max(candidates, key=lambda candidate: candidate["information"])
         for candidate in candidates:
             if candidate is not best:
                 candidate["training"] = None  # it may be large
@@ -300,7 +312,7 @@ class AutoTraining:
         predictions = probabilities > THRESHOLD
         positive = predictions.mean(axis=0)
         return {
-            "certainty": float(np.abs(2 * probabilities - 1).mean()),
+            "information": information_of(probabilities[:, 0]),
             "training": self.now.snapshot() if is_candidate else None,
             "first": self.ensemble.networks[0].state_dict() if len(self.ensemble) == 1 else None,
             "positive": float((predictions[:, 0].sum() + 1) / (len(predictions) + 2)),  # neither 0 nor 1

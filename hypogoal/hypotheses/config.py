@@ -114,7 +114,7 @@ class TrainEnsembleConfig(MembersConfig):
     )
     restarts: int = setting(
         4,
-        "first members of a sequential ensemble that begin; the one that is most certain of unlabelled states stays",
+        "first members of a sequential ensemble that begin; the one stays that tells most about unlabelled states",
         source=f"{BEYOND}: docs/results/hypotheses.md",
         low=1,
         high=64,
