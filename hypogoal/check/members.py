@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import load
 from torch import Tensor
 
 from hypogoal.check.domains import SEEDED, collected
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.seeding import rng_for, torch_generator
+from hypogoal.core.tensors import stored
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.hypotheses.config import FULL, EnsembleConfig
@@ -110,7 +112,7 @@ def check_network(
 ) -> Iterator[Verdict]:
     """Whether a member network, by its ``--set network`` name, can be trained, stored, used and explained."""
     values = rng_for(0, "check").integers(256, size=(FEW, *observation_shape))
-    laws = [_Network.logits, _Network.members, _Network.gradients, _Network.answers]
+    laws = [_Network.logits, _Network.members, _Network.gradients, _Network.answers, _Network.is_kept]
     return verdicts(laws, _Network(name, values.astype(observation_dtype)))
 
 
@@ -119,10 +121,10 @@ class _Network:
     name: str
     states: Any  # observations (N, *obs)
 
-    def ensemble(self) -> Ensemble:
+    def ensemble(self, seed: int = 0) -> Ensemble:
         view = view_of(FULL, (), self.states.shape[1:], self.states.dtype)
         view.fit(self.states, self.states, StateOrigins(), 0)
-        return Ensemble(self.name, view.shape, 2, torch_generator(0, "check"), view)
+        return Ensemble(self.name, view.shape, 2, torch_generator(seed, "check"), view)
 
     def inputs(self, ensemble: Ensemble) -> Tensor:
         return inputs_of(ensemble.see(self.states))
@@ -166,3 +168,11 @@ class _Network:
         promise(np.isfinite(worst), "probabilities are not finite", "Look for NaN or Inf among its features.")
         fault = f"probabilities alone and among others differ by {worst:.2g}"
         promise(worst < CLOSE, fault, "Use layers that act on each state alone, and neither count nor draw.")
+
+    def is_kept(self) -> None:
+        """Stored, and loaded into fresh members, they say the same."""
+        ensemble, fresh = self.ensemble(), self.ensemble(seed=1)
+        kept = stored(ensemble.state_dict(), self.name)
+        fresh.load_state_dict(load(kept))
+        is_same = np.array_equal(fresh.predict(self.states), ensemble.predict(self.states))
+        promise(is_same, "loaded members say something else", "Keep all that they are in parameters or buffers.")

@@ -94,7 +94,10 @@ def _without_array(arrays: dict[str, NDArray[Any]], value: Any) -> Any:
         return value.item()
     kind, array = ARRAY, value
     if hasattr(value, "detach"):
-        kind, array = TENSOR, value.detach().cpu().numpy()
+        kind, tensor = TENSOR, value.detach().cpu()
+        if str(tensor.dtype) == "torch.bfloat16":  # which NumPy lacks; float32 has all of its values
+            tensor = tensor.float()
+        array = tensor.numpy()
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise FloatingPointError
     number = str(len(arrays))

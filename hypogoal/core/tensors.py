@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     M = TypeVar("M", bound=nn.Module)
 
 
-def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
-    """Write tensors or arrays by name. NaN or Inf is a ``NumericalError`` and nothing is written (Spec G3)."""
+def stored(tensors: Mapping[str, Any], what: str) -> bytes:
+    """Tensors or arrays by name as a file has them. NaN or Inf is a ``NumericalError`` (Spec G3)."""
     import torch
     from safetensors.torch import save
 
@@ -25,9 +25,15 @@ def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
     for name, values in tensors.items():
         tensor = torch.as_tensor(values)
         if not tensor.isfinite().all():
-            raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
-        weights[name] = tensor.detach().cpu().contiguous()
-    path.write_bytes(save(weights))
+            raise NumericalError(f"the weight {name} of {what} is NaN or Inf; a mask of these needs persistent=False")
+        # a copy: where two layers share a weight, safetensors would refuse it
+        weights[name] = tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
+    return save(weights)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
+    """Write what is :func:`stored` of tensors or arrays by name; nothing where they cannot be."""
+    path.write_bytes(stored(tensors, path.stem))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

@@ -16,6 +16,7 @@ from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Bools
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.tensors import stored
 from hypogoal.hypotheses import views
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -82,6 +83,7 @@ class EnsembleTraining(Resumable):
             views.learn_from(view, observations, unlabelled, origins, seed)
         weights = seeding.torch_generator(seed, "weights")
         self.ensemble = Ensemble(config.network, shape, config.members, weights, view).to(device)
+        stored(self.ensemble.state_dict(), "the network")  # what cannot be is not worth training
         if first:
             self.ensemble.networks[0].load_state_dict(first)
         self.taught = None

@@ -118,7 +118,7 @@ def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
     from hypogoal.hypotheses.load import ByKey
 
     rows: list[tuple[str, dict[str, Any]]] = []
-    for layer in network.children():
+    for layer in network:  # also one that is there twice
         kind = type(layer)
         if isinstance(layer, ByKey):
             encoders = [_layers(encoder, source) for encoder in layer.encoders]

@@ -39,6 +39,15 @@ def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
     assert np.isnan(found["nan"][0]) and np.isnan(found["nan"][1][0]) and found["empty"] == {}
 
 
+def test_weights_of_half_precision_come_back(tmp_path: Path) -> None:
+    """Spec G1: bfloat16, which NumPy does not have, to the last bit."""
+    checkpoints = Checkpoints(tmp_path / "stage.safetensors")
+    layer, other = (torch.nn.Linear(3, 2).bfloat16() for _ in range(2))
+    checkpoints.save({"layer": snapshot_of(layer)})
+    restored(other, (checkpoints.load() or {})["layer"])
+    assert other.weight.dtype == torch.bfloat16 and torch.equal(other.weight, layer.weight)
+
+
 @pytest.mark.parametrize("kind", [Adam, partial(torch.optim.Adam, fused=True)], ids=["ours", "torch's"])
 def test_an_optimiser_goes_on_as_if_it_had_not_stopped(kind: Any) -> None:
     """Spec G1: moments and step counts, with steps of the same size before and after."""

@@ -10,16 +10,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import INTEGRATED, attributed, mean_state, method_of
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
+from hypogoal.hypotheses.load import built
 from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.training import train
 from hypogoal.options.termination import learned_terminations
+from hypogoal.tools.export import _layers
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FEW = EnsembleConfig(members=2, steps=3, batch_size=4, diversity_weight=0.1, learning_rate=1e-3)
@@ -129,6 +131,64 @@ def test_a_frozen_backbone_stays_as_it_is(diversity: str) -> None:
     expected = backbone(images)
     ensemble.train()
     torch.testing.assert_close(backbone(images), expected, rtol=0, atol=0)
+
+
+class Looped(nn.Module):
+    """It uses a layer twice, and ties the weights of two others."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.first, self.shared = nn.Conv2d(channels, 4, 4, 4), nn.Conv2d(4, 4, 1)
+        self.twice = nn.ModuleList([self.shared, self.shared])
+        self.tied = nn.Conv2d(4, 4, 1)
+        self.tied.weight = self.shared.weight
+
+    def forward(self, images: Tensor) -> Tensor:
+        values = self.first(images)
+        for layer in (*self.twice, self.tied):
+            values = layer(values).relu()
+        return values.flatten(1)
+
+
+def repeated(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    relu, same = nn.ReLU(), nn.Conv2d(4, 4, 1)
+    return [nn.Conv2d(channels, 4, 4, 4), relu, same, relu, same, relu], (6,)
+
+
+@pytest.mark.parametrize("network", ["test_encoders:Looped", "test_encoders:repeated"])
+def test_layers_that_share_weights_are_stored_and_exported(network: str, tmp_path: Path) -> None:
+    """Spec A8, G2: each name has its copy in the file, and what is loaded predicts the same."""
+    ensemble = trained(network)
+    write_ensemble(tmp_path, "goal", ensemble)
+    about = {**FEW.model_dump(), "network": network, "observation_shape": [16, 16, 3], "sub_goals": ["goal"]}
+    back = read_ensemble(tmp_path, about | {"observation_dtype": "uint8"}, "goal")
+    images, _ = states(5)
+    np.testing.assert_array_equal(back.predict(images), ensemble.predict(images))
+    if network.endswith("repeated"):
+        member = ensemble.members[0]
+        rebuilt = built(_layers(member, tmp_path)).eval()
+        rebuilt.load_state_dict(member.state_dict())
+        inputs = as_input(torch.from_numpy(images))
+        torch.testing.assert_close(rebuilt(inputs), member(inputs))
+
+
+class Masked(nn.Module):
+    def __init__(self, value: Tensor):
+        super().__init__()
+        self.register_buffer("mask", value)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images.flatten(1)
+
+
+def endless(channels: int) -> nn.Module:
+    return Masked(torch.tensor([0.0, -torch.inf]))
+
+
+def test_what_cannot_be_stored_is_refused_before_training() -> None:
+    """Spec G2, G3: not when all is trained."""
+    with pytest.raises(NumericalError, match=r"members.0.0.mask of the network .* persistent=False"):
+        trained("test_encoders:endless")
 
 
 def broken(observation_shape: tuple[int, ...]) -> nn.Module:
