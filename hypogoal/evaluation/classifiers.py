@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from hypogoal.core.arrays import Doubles
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
@@ -17,6 +19,8 @@ from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.observations import Observations
 
 CHUNK = 256  # observations that own code is given at once
+ASKED_AGAIN = 2_000  # observations, before it is believed that each has one probability
+CLOSE = 0.01  # between probabilities that are the same up to rounding, also in half precision
 
 
 class OwnClassifier:
@@ -26,6 +30,7 @@ class OwnClassifier:
 
     def __init__(self, name: str):
         self.name = name
+        self.asked = 0
         self.function = load(name, "classifier", "hypogoal.classifiers", {})
         if not callable(self.function):
             do = "Give one from observations (N, *obs) to probabilities (N,)."
@@ -35,12 +40,31 @@ class OwnClassifier:
         """Probabilities (n, 1) of observations (n, *obs)."""
         parts = []
         for some in np.split(observations, range(CHUNK, len(observations), CHUNK)):
-            probabilities = np.asarray(self.function(some), dtype=np.float64)
-            if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():
-                fault = f"the classifier gave {probabilities.shape} {probabilities.ravel()[:3]}"
-                raise UserError(fault, self.name, f"Give probabilities, 0 to 1, float ({len(some)},).")
+            probabilities = self._ask(some)
             parts.append(probabilities)
+            if self.asked < ASKED_AGAIN:
+                highest = np.argsort(-probabilities)[: 2 + len(some) // 4]
+                apart = np.abs(self._ask(some[highest]) - probabilities[highest]).max(initial=0)
+                if apart > CLOSE:
+                    fault = f"the classifier gives one state probabilities that differ by {apart:.2g}"
+                    do = "Have it look at each state alone and draw nothing: call eval() of a torch module."
+                    raise UserError(fault, self.name, do)
         return np.concatenate(parts)[:, None]
+
+    def _ask(self, some: Observations) -> Doubles:
+        """What it says of copies of observations, which it may change."""
+        self.asked += len(some)
+        answer = self.function(some.copy())
+        if isinstance(answer, torch.Tensor):
+            answer = answer.detach().cpu().double()
+        try:
+            probabilities = np.asarray(answer, dtype=np.float64)
+        except (TypeError, ValueError, RuntimeError):
+            probabilities = np.array(np.nan)  # words, for example
+        if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():
+            fault = f"the classifier gave {type(answer).__name__} {probabilities.shape} {probabilities.ravel()[:3]}"
+            raise UserError(fault, self.name, f"Give probabilities, 0 to 1, float ({len(some)},).")
+        return probabilities
 
     def log_odds(self, observations: Observations) -> Any:
         """Log-odds (n, 1) of observations (n, *obs)."""

@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 import PIL.Image
 import pytest
+import torch
 from command_line import refuses, run, settings
 from numpy.typing import NDArray
+from torch import nn
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
+from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
+from hypogoal.evaluation.classifiers import OwnClassifier
 from hypogoal.evaluation.pictures import picture_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
@@ -61,6 +65,61 @@ def test_a_function_is_audited_on_labels_by_hand(mixed_run: Path, tmp_path: Path
             "out": str(out), "false_positives": {"failures": pytest.approx(share)}, "fail_above": limit,
             "failed": code == 3,
         }  # fmt: skip
+
+
+torch.manual_seed(0)
+NET = nn.Sequential(nn.BatchNorm1d(4, momentum=None), nn.Dropout(0.5), nn.Linear(4, 1), nn.Sigmoid())
+
+
+def scores(observations: Any) -> Any:
+    """In whichever mode it is."""
+    return NET(torch.from_numpy(observations))[:, 0]
+
+
+def drawn(observations: Any) -> Any:
+    with torch.no_grad():
+        return torch.dropout(torch.from_numpy(observations), 0.5, True)[:, 0].sigmoid().numpy()
+
+
+def grouped(observations: Any) -> Any:
+    """Numbers in deviations from their mean in the batch."""
+    return (observations[:, 0] > observations[:, 0].mean()).astype(float)
+
+
+def centred(observations: Any) -> Any:
+    observations -= 1
+    return torch.from_numpy(observations[:, 0]).sigmoid().bfloat16()
+
+
+def words(observations: Any) -> Any:
+    return ["yes"] * len(observations)
+
+
+@pytest.mark.parametrize("name", ["scores", "drawn", "grouped"])
+def test_a_classifier_of_one_state_at_a_time(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """BatchNorm and Dropout in training mode would give numbers by chance; in play as on recorded data."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+    states = np.random.default_rng(0).normal(size=(40, 4)).astype(np.float32)
+    NET.train()
+    with pytest.raises(UserError, match=r"probabilities that differ by .* call eval"):
+        OwnClassifier(f"{__name__}:{name}").predict(states)
+    few = OwnClassifier(f"{__name__}:{name}")
+    with pytest.raises(UserError, match="probabilities that differ by"):
+        [few.predict(states[start : start + 4]) for start in range(0, 40, 4)]
+
+
+def test_a_classifier_may_answer_in_any_precision_and_change_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is given copies; what requires a gradient, or is bfloat16, is a number; words are one line."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "1")
+    states = np.random.default_rng(0).normal(size=(40, 4)).astype(np.float32)
+    before = states.copy()
+    NET.eval()
+    assert OwnClassifier(f"{__name__}:scores").predict(states).shape == (40, 1)
+    found = OwnClassifier(f"{__name__}:centred").predict(states)[:, 0]
+    np.testing.assert_allclose(found, 1 / (1 + np.exp(1 - before[:, 0])), atol=0.01)
+    np.testing.assert_array_equal(states, before)
+    with pytest.raises(UserError, match="the classifier gave list"):
+        OwnClassifier(f"{__name__}:words").predict(states)
 
 
 def test_what_is_labelled_next_becomes_data(mixed_run: Path, tmp_path: Path) -> None:
