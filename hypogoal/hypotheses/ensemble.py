@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -26,6 +27,9 @@ IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 1
 PATCH_CHUNK = 4096  # images with few distinct patches
 FOLD_FROM = 32  # images from which folding BatchNorm into the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
+
+if os.name == "posix":  # a forked process has none of its parent's threads, for which torch would wait for ever
+    os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 @contextmanager

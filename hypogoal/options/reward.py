@@ -129,6 +129,8 @@ class SubgoalReward:
             away: how many steps in a row the prediction has to be negative before what is ``unpaid`` pays. More than 1
                 is for a prediction that flickers: positive, negative, positive, while nothing has happened.
 
+        In a forked process, as :class:`gymnasium.vector.AsyncVectorEnv` has them, torch uses one thread.
+
         ``info["subgoal"]`` is ``{"predicted": bool, "paid": float}``, of ``reset`` and of every step.
 
         Raises:

@@ -2,6 +2,8 @@
 
 import pickle
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,28 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         quick = settings("option_batch=32", "epsilon_steps=500", "max_episode_steps=30")
         run("train-options", made / "ensemble", "--out", made / "options", "-q", *play, *quick)
     return made
+
+
+FORKED = """
+import multiprocessing, sys, numpy, torch
+from hypogoal.hypotheses.ensemble import Ensemble
+torch.set_num_threads(2)
+ensemble = Ensemble("doorkey", (48, 48, 3), 2, torch.Generator()).eval()
+states = numpy.random.default_rng(0).integers(256, size=(200, 48, 48, 3), dtype=numpy.uint8)
+ensemble.predict(states)
+child = multiprocessing.get_context("fork").Process(target=ensemble.predict, args=[states])
+child.start()
+child.join(30)
+alive = child.is_alive()
+child.kill()
+sys.exit(alive or child.exitcode)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere processes are spawned")
+def test_a_forked_process_predicts() -> None:
+    """Spec I6: as those of an AsyncVectorEnv do; torch's threads are not copied."""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED], check=True)
 
 
 @pytest.fixture(scope="module")
