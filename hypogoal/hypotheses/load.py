@@ -56,7 +56,10 @@ def built(layers: list[Any]) -> torch.nn.Sequential:
 
 
 def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
-    """A function from observations (N, ...), or such arrays by key, to members' probabilities, float32 (N, K)."""
+    """A function from observations (N, ...), or such arrays by key, to members' probabilities, float32 (N, K).
+
+    They are of the type and shape of training: pictures are bytes. Others are a ``ValueError``.
+    """
     text = (HERE / "config.json").read_text(encoding="utf-8")
     config = json.loads(text)
     state = load_file(HERE / f"{sub_goal}.safetensors")
@@ -67,14 +70,22 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
             weights[name.removeprefix("members.")] = tensor
     members = torch.nn.ModuleList(built(config["layers"]) for _ in range(config["members"]))
     members.load_state_dict(weights)
-    members.eval()
+    members.eval().to("cpu", torch.float32)  # whatever torch's defaults are
 
     def predict(observations: Any) -> torch.Tensor:
         rows, place = [], 0
         for key, (kind, shape) in config["observations"].items():
-            values = torch.as_tensor(observations[key] if key else observations).float()
+            values = observations[key] if key else observations
+            if not isinstance(values, torch.Tensor):
+                import numpy  # without which torch takes no arrays
+
+                values = torch.from_numpy(numpy.array(values, order="C"))
+            values = values.cpu() if kind == "uint8" else values.cpu().float()
+            given, wanted = (values.dtype, *values.shape[1:]), (getattr(torch, kind), *shape)
+            if given != wanted:
+                raise ValueError(f"{key or 'a state'} is {given}. Give (N, ...) as in training, each {wanted}.")
             if kind == "uint8":
-                values = values / 255
+                values = values.float() / 255
             else:
                 size = torch.Size(shape).numel()
                 mean, deviation = (part[place : place + size].view(shape) for part in standard)
@@ -84,7 +95,7 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
                 values = values.permute(0, 3, 1, 2)
             rows.append(values.flatten(1) if key else values)
         inputs = torch.cat(rows, dim=1)
-        with torch.no_grad():
+        with torch.no_grad(), torch.autocast("cpu", enabled=False):
             logits = torch.stack([member(inputs) for member in members], dim=1)
         return logits.softmax(-1)[..., 1]
 

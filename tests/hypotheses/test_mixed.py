@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -147,6 +148,73 @@ def test_a_type_that_no_file_has_is_refused(text: str) -> None:
     """Spec G2, H8: what a file says of its types is checked."""
     with pytest.raises(ValueError, match=r"."):
         type_of(text)
+
+
+def exported(folder: Path) -> Any:
+    """The function ``load`` of an exported folder, from its own file."""
+    path = folder / "load.py"
+    found: dict[str, Any] = {"__name__": "load", "__file__": str(path)}
+    exec(compile(path.read_text(), path, "exec"), found)
+    return found["load"]
+
+
+@pytest.fixture(scope="module")
+def pictures_hub(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Members of pictures alone, exported: in ``hub``, from ``ensemble``."""
+    folder = tmp_path_factory.mktemp("pictures")
+    seen, labels = states(24)
+    pictures = seen["wrist"]
+    pictures[labels, :20] = 255
+    np.savez(folder / "s.npz", observations=pictures, labels=labels, unlabelled=255 - pictures)
+    run("import", folder / "s.npz", "--out", folder / "d.h5", "--sub-goal", GOAL, "-q")
+    few = settings("steps=4", "members=2", "workers=1", "diversity=none", "network=tiles")
+    run("train-ensemble", folder / "d.h5", "--out", folder / "ensemble", "-q", *few)
+    run("export", folder / "ensemble", "--out", folder / "hub")
+    return folder
+
+
+AS_THEY_ARE: list[Any] = [
+    lambda some: list(some),
+    lambda some: some[:, ::-1].copy()[:, ::-1],
+    lambda some: torch.from_numpy(some),
+]
+OTHERS: list[Any] = [
+    lambda some: some / 255,
+    lambda some: some.astype(np.float32),
+    lambda some: torch.from_numpy(some) / 255,
+    lambda some: some[0],
+    lambda some: some.transpose(0, 3, 1, 2),
+    lambda some: some[:, :40],
+]
+
+
+def test_an_exported_folder_takes_what_members_take(pictures_hub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec I6: the same of flipped views, lists, tensors, whatever torch's defaults; anything else is one line."""
+    ensemble = hypogoal.load_ensemble(pictures_hub / "ensemble", GOAL)
+    pictures = states(6, 7)[0]["wrist"]
+    wanted = ensemble.predict(pictures)
+    load = exported(pictures_hub / "hub")
+    torch.set_default_dtype(torch.float64)
+    try:
+        predict = load(GOAL)
+        np.testing.assert_allclose(predict(pictures).numpy(), wanted, atol=1e-5)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        for given in AS_THEY_ARE:
+            np.testing.assert_allclose(predict(given(pictures)).numpy(), wanted, atol=1e-5)
+    for change in OTHERS:
+        with pytest.raises(ValueError, match=r"each \(torch.uint8, 44, 44, 3\)"):
+            predict(change(pictures))
+
+
+def test_an_exported_folder_of_several_keys_names_the_wrong_one(mixed_run: Path, tmp_path: Path) -> None:
+    """Spec I6: pictures that are divided already."""
+    run("export", mixed_run / "ensemble", "--out", tmp_path / "hub")
+    predict = exported(tmp_path / "hub")(GOAL)
+    seen, _ = states(4)
+    with pytest.raises(ValueError, match=r"front is \(torch.float64, 48, 64, 3\)"):
+        predict({**seen, "front": seen["front"] / 255})
 
 
 LOADER = """
