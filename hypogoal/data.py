@@ -182,7 +182,7 @@ def write_dataset(
 ) -> None:
     """Write collected states; a file of that name is replaced once the new one is complete.
 
-    Raises ``UserError`` if a name cannot be a file name or labels are not truth values.
+    Raises ``UserError`` if a name cannot be a file name, labels are not truth values or numbers not finite.
     """
     require_names(collected.sub_goals)
     attributes: dict[str, Any] = {
@@ -227,6 +227,10 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
 
 
 def _write_states(group: Any, states: States) -> None:
+    finite = np.isfinite(numbers_of(states.observations)).all(axis=1)
+    if not finite.all():
+        fault = "the domain's observations have numbers that are not finite"
+        raise UserError(fault, f"{group.name}, state {finite.argmin()}", "Clip or replace them.")
     _store(group, "observations", states.observations)
     for name, values in states.origins.items():
         _store(group, f"origin/{name}", values)

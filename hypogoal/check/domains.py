@@ -13,17 +13,19 @@ from gymnasium.utils.env_checker import check_env
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import place_of
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, Unmet, require_classes, write_dataset
 from hypogoal.domains.base import Domain, Engine
+from hypogoal.domains.gymnasium.play import PASS_SEEDS
 from hypogoal.hypotheses.networks import AUTO
-from hypogoal.observations import PICTURE
+from hypogoal.observations import PICTURE, numbers_of
 from hypogoal.options.networks import embedding_for
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
 STEP_KINDS = {"next_ids": "iu", "rewards": "iuf", "terminated": "b", "truncated": "b", "succeeded": "b"}
-SEEDED = "All randomness must come from the seed: for a Gymnasium environment from self.np_random. Labels keep nothing."
+SEEDED = "All randomness must come from the seed, also from 0: Gymnasium's from self.np_random. Labels keep nothing."
 
 
 def check_domain(domain: Domain, config: Any = None, *, seed: int = 0) -> Iterator[Verdict]:
@@ -61,7 +63,14 @@ class _Played:
     def gymnasium(self) -> None:
         """Gymnasium's checker finds nothing, but for rendering, and closing, which makes the environment again."""
         warnings.filterwarnings("ignore", ".*is different from the unwrapped version")  # wrappers are the point
-        check_env(self.domain.make_env(), skip_render_check=True, skip_close_check=True)
+        try:
+            check_env(self.domain.make_env(), skip_render_check=True, skip_close_check=True)
+        except AssertionError as error:
+            if place_of(error):
+                raise
+            fault = str(error).rstrip(".")
+            do = PASS_SEEDS if "seed" in fault else ""
+            raise UserError("Gymnasium's checker refuses the environment", fault, do) from None
 
     def steps(self) -> str:
         """Observations, labels and ends of episodes are as the domain says."""
@@ -138,6 +147,8 @@ class _Played:
         """Refuse anything but so many of the domain's observations."""
         domain = self.domain
         _require_array(name, observations, domain.observation_dtype, count, *domain.observation_shape)
+        are_finite = np.isfinite(numbers_of(observations)).all()
+        promise(are_finite, f"{name} have numbers that are not finite", "Clip or replace them.")
 
     def make_engine(self) -> Engine:
         arguments: dict[str, Any] = {}

@@ -12,8 +12,9 @@ import pytest
 import torch
 from command_line import fails, refuses, run, settings
 from corridor import Corridor
-from corridor_env import NEVER, SUB_GOALS, CorridorEnv, swift
+from corridor_env import NEVER, SUB_GOALS, CorridorEnv, Sensed, swift
 from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation, NormalizeObservation
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -87,10 +88,22 @@ def moody(self: Any, ids: np.ndarray) -> np.ndarray:
     return Corridor.labels(self, ids) | [False, next(COUNT) % 2 == 0]
 
 
+class Dark(CorridorDomain):
+    """Its observations are numbers that nobody measured."""
+
+    observation_dtype = np.dtype(np.float32)
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Any:
+        images = np.full((count, *self.observation_shape), np.nan, np.float32)
+        engine = type("Dark", (TallCorridor,), {"images": lambda self, ids: images})
+        return engine(count, max_steps)
+
+
 BROKEN = [
     (having(sub_goals=("a/b", "c")), "collect", "a/b"),
     (domain_of(images=lambda self, ids: np.zeros((3, 64, 64, 3), np.float32)), "steps", "float32"),
     (domain_of(images=lambda self, ids: 1 // 0), "steps", "ZeroDivisionError"),
+    (Dark(), "steps", "images have numbers that are not finite"),
     (stepping(rewards=lambda values: values[:2]), "steps", "the engine's step gave rewards"),
     (stepping(rewards=lambda values: values * np.nan), "steps", "finite"),
     (domain_of(step=never_ending), "steps", "went on after max_steps"),
@@ -173,6 +186,47 @@ def test_gymnasiums_own_checker_is_asked(method: Any) -> None:
     assert method is not _raises or f"test_check.py, line {_raises.__code__.co_firstlineno + 1}" in fault.text
 
 
+class Deaf(CorridorEnv):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset()
+
+
+class Falsy(CorridorEnv):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=seed or None)
+
+
+class Once(gymnasium.Wrapper[Any, Any, Any, Any]):
+    seeded = False
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        seed, self.seeded = (None if self.seeded else seed), True
+        return self.env.reset(seed=seed)
+
+
+class Outside(CorridorEnv):
+    def image(self) -> np.ndarray:
+        return super().image()[:10]
+
+
+OF_THE_CHECKER = "Gymnasium's checker refuses the environment: "
+PASS = "super().reset(seed=seed). No wrapper may show what came before"
+SEEDINGS: list[tuple[Any, str]] = [
+    (Deaf, PASS),
+    (Falsy, "also from 0"),
+    (lambda: Once(CorridorEnv()), PASS),
+    (lambda: NormalizeObservation(FlattenObservation(Sensed())), PASS),
+    (Outside, OF_THE_CHECKER),
+]
+
+
+@pytest.mark.parametrize(("make", "fault"), SEEDINGS)
+def test_seeds_that_are_lost_are_one_line(make: Any, fault: str) -> None:
+    """Spec B6, G2: what Gymnasium's checker asserts is no error of ours."""
+    found = first_fault(check_domain(GymnasiumDomain(make, SUB_GOALS), SMALL))
+    assert fault in found.text and "internal error" not in found.text
+
+
 @pytest.mark.parametrize("name", [name for name in OURS if name != "none"])
 def test_our_objectives_keep_the_laws(name: str) -> None:
     """Spec C2."""
@@ -227,6 +281,17 @@ class Lost(nn.Module):
         return features * torch.nan
 
 
+class Unkept(nn.Module):
+    """It scales by a number that is no buffer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.rand(1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return features * self.scale
+
+
 def convolution(*others: nn.Module, kind: type[nn.Conv2d] = nn.Conv2d) -> nn.Module:
     """An encoder with fresh weights."""
     return nn.Sequential(kind(3, 4, 8, 8), *others, nn.Flatten())
@@ -248,6 +313,7 @@ NETWORK_FAULTS = [
     (lambda channels: convolution(kind=Detached), "gradients", "0.0.weight gets no gradient"),
     (lambda channels: convolution(nn.Softmax(0)), "answers", "among others differ"),
     (lambda channels: convolution(Lost()), "answers", "probabilities are not finite"),
+    (lambda channels: convolution(Unkept()), "is kept", "loaded members say something else"),
     (lambda channels: convolution().double(), "logits", "observation shape (64, 64, 3): Input type"),
 ]
 
@@ -268,10 +334,28 @@ def squeezed(channels: int) -> nn.Module:
     return convolution(nn.Sigmoid(), nn.Conv2d(4, 4, 1).requires_grad_(False))
 
 
+class Looped(nn.Module):
+    """An encoder that uses a layer twice, and ties the weights of two others."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.first, self.shared = nn.Conv2d(channels, 4, 8, 8), nn.Conv2d(4, 4, 1)
+        self.twice = nn.ModuleList([self.shared, self.shared])
+        self.tied = nn.Conv2d(4, 4, 1)
+        self.tied.weight = self.shared.weight
+
+    def forward(self, images: Tensor) -> Tensor:
+        values = self.first(images)
+        for layer in (*self.twice, self.tied):
+            values = layer(values).relu()
+        return values.flatten(1)
+
+
 BOTH = mixed_type({"front": (np.dtype(np.uint8), (64, 64, 3)), "joints": (np.dtype(np.float32), (7,))})
 KEPT = [((name,), "DeepLift") for name in NETWORKS]
 KEPT += [
     (("test_check:squeezed",), "integrated"),
+    (("test_check:Looped",), "integrated"),
     (("mlp", (11,), np.dtype(np.float32)), ""),
     (("front=tiles", (), BOTH), ""),
 ]
@@ -295,7 +379,7 @@ def test_the_command_prints_a_line_for_each_law(monkeypatch: pytest.MonkeyPatch)
     told = fails("check", "corridor_env:RESTLESS", *small).out.splitlines()
     assert told[-1].startswith("FAIL two engines") and "np_random" in told[-1]
     told = run("check", "corridor_env:SENSED", *small, "--network", "mlp").out.splitlines()
-    assert len(told) == 9 and not any(line.startswith("FAIL") for line in told)
+    assert len(told) == 10 and not any(line.startswith("FAIL") for line in told)
     monkeypatch.chdir(TESTS.parent / "examples")
     run("check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide")
     refuses("nothing to check", "check")

@@ -73,6 +73,19 @@ def test_what_cannot_be_collected_is_one_line(name: str, message: str) -> None:
         collected(getattr(corridor_env, name))
 
 
+class Deaf(CorridorEnv):
+    """Its first reset alone heeds the seed."""
+
+    def reset(self, **arguments: Any) -> Any:
+        return super().reset(seed=None if self._np_random else arguments["seed"])
+
+
+def test_an_environment_that_loses_its_seed_is_not_collected() -> None:
+    """Spec B7: its states would be of other layouts than the file says."""
+    with pytest.raises(UserError, match="reset shows something else in a later episode: seed=0"):
+        collected(GymnasiumDomain(Deaf, SUB_GOALS))
+
+
 def test_the_engine_is_the_environment() -> None:
     """Spec B6: images, rewards, ends and labels are those of the environment stepped alone."""
     engine, env, rng = engine_of(1), CorridorEnv(), np.random.default_rng(1)

@@ -5,17 +5,19 @@ from typing import Any
 
 import corridor_env
 import gymnasium
+import h5py
 import numpy as np
 import pytest
 from command_line import run, settings, trusting
 from corridor_env import SENSED
 from gymnasium import spaces
 
+from hypogoal.check import check_domain
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.data import open_dataset, write_dataset
-from hypogoal.domains.gymnasium.domain import GymnasiumConfig
+from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.learners.baselines.engine_env import EngineEnv
@@ -80,6 +82,68 @@ def test_what_is_no_such_number_is_one_line(observation: Any) -> None:
         read(UNIT, observation)
 
 
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf, 1e300])
+def test_a_number_that_is_not_finite_is_named(lost: float) -> None:
+    """Spec G2, G3: where it is read, in a row and beside a picture."""
+    wide = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    with pytest.raises(UserError, match="not finite in float32: x1, such as"):
+        read(wide, np.array([0.5, lost]))
+    both = spaces.Dict(front=spaces.Box(0, 255, (20, 20, 3), np.uint8), state=wide)
+    with pytest.raises(UserError, match=r"not finite in float32: state\[1\], such as"):
+        read(both, {"front": np.zeros((20, 20, 3), np.uint8), "state": np.array([0.5, lost])})
+
+
+NORTHINGS = [
+    (spaces.Box(0, 1e7, (2,), np.float64), lambda place: np.array([4_250_000 + 0.2 * place, 1.0])),
+    (spaces.Box(0, 2**62, (2,), np.int64), lambda place: np.array([17 * 10**17 + place, 1])),
+    (spaces.Dict(at=spaces.Box(0, 180, (1,), np.float64)), lambda place: {"at": np.array([48.1 + 2e-6 * place])}),
+]
+
+
+@pytest.mark.parametrize(("space", "observation"), NORTHINGS)
+def test_numbers_that_float32_makes_equal_are_refused(space: Any, observation: Any) -> None:
+    """Spec G2: map coordinates, a clock in nanoseconds, degrees; as an import refuses them."""
+    look = reader_of(space)
+    for step in range(15):
+        look.read(observation(step % 8))
+    with pytest.raises(UserError, match=r"float32 makes equal: (x0|at), such as .* Subtract an offset"):
+        look.read(observation(7))
+
+
+def test_numbers_that_float32_tells_apart_are_read() -> None:
+    """Also where something at rest trembles by less than anybody notices."""
+    look = reader_of(spaces.Box(-np.inf, np.inf, (3,), np.float64))
+    rng = np.random.default_rng(0)
+    for _ in range(70):
+        look.read(np.array([rng.normal(), 0.42 + 1e-10 * rng.normal(), 1e-30 * rng.normal()]))
+
+
+class Sensor(corridor_env.CorridorEnv):
+    """Its reading at the last cell but one is lost."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)  # type: ignore[assignment]
+    far = 0.0
+
+    def image(self) -> Any:
+        return np.array([np.nan if self.cell == 4 and not self.far else self.cell / 5 + self.far, self.layout])
+
+
+class Surveyed(Sensor):
+    """In metres of a map."""
+
+    far = 4_250_000.0
+
+
+def test_what_cannot_be_read_is_refused_by_check_and_collect() -> None:
+    """Spec G2: with its place; nothing is said of seeds."""
+    for env, fault in ((Sensor, "not finite in float32: x0"), (Surveyed, "float32 makes equal: x0")):
+        domain = GymnasiumDomain(env, corridor_env.SUB_GOALS)
+        with pytest.raises(UserError, match=rf"{fault}.* at layout_seed, episode, step \(0, \d+, \d+\)"):
+            domain.collect(SMALL, 0, Progress("collect", 1, quiet=True))
+        *_, last = check_domain(domain, SMALL)
+        assert not last.ok and fault in last.text
+
+
 def test_a_picture_alone_in_a_dictionary_is_that_picture() -> None:
     """Spec B6."""
     framed, plain = (domain.make_engine(0, 2, 30) for domain in (corridor_env.FRAMED, corridor_env.DOMAIN))
@@ -98,10 +162,13 @@ def test_collected_numbers_are_kept_with_their_names(tmp_path: Any) -> None:
     np.testing.assert_array_equal(data.unlabelled(), found.unlabelled.observations)
     place = data.labelled("left-end").observations[:, 9]
     np.testing.assert_array_equal(data.labelled("left-end").labels, place == 0)
-    found.unlabelled.observations[0, 0] = np.nan
-    write_dataset(path, found, domain="own", config={}, seed=0)
+    with h5py.File(path, "r+") as file:
+        file["unlabelled/observations"][0, 0] = np.nan
     with pytest.raises(UserError, match="not finite"):
         open_dataset(path).unlabelled()
+    found.unlabelled.observations[2, 0] = np.inf
+    with pytest.raises(UserError, match="not finite: /unlabelled, state 2"):
+        write_dataset(path, found, domain="own", config={}, seed=0)
 
 
 def test_numbers_are_standardised_and_cut() -> None:

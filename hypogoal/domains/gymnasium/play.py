@@ -11,6 +11,7 @@ import numpy as np
 from numpy.random import Generator
 
 from hypogoal.core.arrays import Bools
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
 from hypogoal.domains.gymnasium.engine import labels_of
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 Policy = Callable[[gymnasium.Env, Any, Generator], int]
 """How to play when collecting states: (environment, observation, random numbers) -> action."""
 SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
+PASS_SEEDS = (
+    "Pass every seed on, also 0: super().reset(seed=seed). No wrapper may show what came before (NormalizeObservation)."
+)
 ORIGINS = ("layout_seed", "episode", "step")
 
 
@@ -78,9 +82,19 @@ def sampled(
     """
     kept: dict[bytes, list[Met]] = {}  # by labels
     offered: Counter[bytes] = Counter()
+    begun = b""
     for observation, origin in played(domain.policies, env, layout_seed, config, rng):
-        values = domain.reader.read(observation)
+        try:
+            values = domain.reader.read(observation)
+        except UserError as error:
+            where = f"{error.where}, at {', '.join(ORIGINS)} {origin}"
+            raise UserError(error.what, where, error.do) from None
         look = digest(values)
+        *_, step = origin
+        if not step:
+            begun = begun or look
+            if look != begun:
+                raise UserError("reset shows something else in a later episode", f"seed={layout_seed}", PASS_SEEDS)
         if look in seen:
             continue
         seen.add(look)

@@ -18,6 +18,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.observations import CLEARLY, reading_of
 from hypogoal.observations import NUMBERS, PICTURE, DType, Shape, mixed_type
 
+COMPARED = (16, 64, 256)  # after so many observations it is asked which of their numbers float32 makes equal:
+KEPT = 0.9  # it must keep this share of the distinct values,
+NOTICED = 1e-6  # or change none by more than this
+
 
 @dataclass(frozen=True)
 class Reader:
@@ -27,6 +31,7 @@ class Reader:
         features: the names of numbers, those of a ``Dict`` by its keys.
         key: of a ``Dict`` that holds nothing but a picture, the picture's.
         parts: by key, the readers of a ``Dict`` of pictures and numbers.
+        met: the first observations, where float32 does not hold all their numbers.
     """
 
     space: spaces.Space[Any]
@@ -35,9 +40,10 @@ class Reader:
     features: tuple[str, ...] = ()
     key: str = ""
     parts: Mapping[str, Reader] = field(default_factory=dict)
+    met: list[Any] = field(default_factory=list)
 
     def read(self, observation: Any) -> Any:
-        """A copy (*shape) of an observation; ``UserError`` if it does not fit its space."""
+        """A copy (*shape) of an observation; ``UserError`` if it does not fit its space, or its numbers not float32."""
         if self.parts:
             mixed = np.empty((), self.dtype)
             for key, part in self.parts.items():
@@ -47,10 +53,11 @@ class Reader:
             observation = observation[self.key]
         elif not isinstance(self.space, spaces.Box):
             observation = spaces.flatten(self.space, observation)
-        values = np.array(observation, order="C")
+        values = given = np.array(observation, order="C")
         received = f"{values.dtype} {values.shape}"
         if self.dtype == NUMBERS and values.dtype.kind in "iufb":
-            values = values.astype(NUMBERS)
+            with np.errstate(over="ignore", under="ignore"):
+                values = values.astype(NUMBERS)
         shapes = (self.shape, self.space.shape)
         if values.dtype != self.dtype or values.shape not in shapes:
             raise UserError(
@@ -58,7 +65,29 @@ class Reader:
                 received,
                 f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}.",
             )
+        if self.dtype == NUMBERS:
+            self._require_kept(given.ravel(), values.ravel())
         return values.reshape(self.shape)
+
+    def _require_kept(self, given: Any, cast: Any) -> None:
+        """Refuse (``UserError``) numbers (D,) that are not finite, or that float32 makes equal."""
+        fault, do = "an observation has numbers that are not finite in float32", "Clip or replace them in a wrapper."
+        lost = ~np.isfinite(cast)
+        if not lost.any() and not np.can_cast(given.dtype, NUMBERS) and len(self.met) < COMPARED[-1]:
+            self.met.append(given)
+            if len(self.met) in COMPARED:
+                from pandas import DataFrame  # takes long to import
+
+                fault = "observations have numbers that differ, and that float32 makes equal"
+                do = "Subtract an offset, change the unit, or leave them out, in a wrapper."
+                before = np.stack(self.met)
+                after = before.astype(NUMBERS)
+                few = DataFrame(after).nunique() < KEPT * DataFrame(before).nunique()
+                changes = np.abs(before - after).max(axis=0)
+                lost = few.to_numpy() & (changes > NOTICED)
+        if lost.any():
+            place = lost.argmax()
+            raise UserError(fault, f"{self.features[place]}, such as {given[place]}", do)
 
 
 def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
@@ -72,14 +101,14 @@ def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
     if isinstance(space, spaces.Dict) and any(map(_is_picture, space.values())):
         return _by_key(space)
     if not isinstance(space, spaces.Box):
-        return _numbers(space)
+        return _numbers(space, key)
     reading = reading_of(space.shape, space.dtype)
     if reading.fault:
         where = f"{key} {space.dtype} {space.shape}".strip()
         raise UserError(f"observations {reading.fault}", where, CLEARLY)
     if reading.dtype == PICTURE:
         return Reader(space, reading.shape, PICTURE)
-    return _numbers(space)
+    return _numbers(space, key)
 
 
 def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
@@ -119,10 +148,10 @@ def _by_key(space: spaces.Dict) -> Reader:
     return Reader(space, (), dtype, parts=parts)
 
 
-def _numbers(space: spaces.Space[Any]) -> Reader:
+def _numbers(space: spaces.Space[Any], key: str) -> Reader:
     """A reader of a space without pictures, which Gymnasium flattens."""
     features = []
-    for name, part in _leaves(space):
+    for name, part in _leaves(space, key):
         if _is_picture(part):
             raise UserError(
                 "observations mix pictures with other values",
@@ -136,7 +165,7 @@ def _numbers(space: spaces.Space[Any]) -> Reader:
     return Reader(space, shape, NUMBERS, tuple(features))
 
 
-def _leaves(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(space: Any, name: str) -> Iterator[tuple[str, Any]]:
     """By name, the spaces in a ``Dict`` or ``Tuple`` in the order of flattening; any other space itself."""
     if not isinstance(space, spaces.Dict | spaces.Tuple):
         yield name, space
