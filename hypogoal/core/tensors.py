@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     M = TypeVar("M", bound=nn.Module)
 
 
-def stored(tensors: Mapping[str, Any], what: str) -> bytes:
+def stored(tensors: Mapping[str, Any], owner: str) -> bytes:
     """Tensors or arrays by name as a file has them. NaN or Inf is a ``NumericalError`` (Spec G3)."""
     import torch
     from safetensors.torch import save
@@ -25,7 +25,7 @@ def stored(tensors: Mapping[str, Any], what: str) -> bytes:
     for name, values in tensors.items():
         tensor = torch.as_tensor(values)
         if not tensor.isfinite().all():
-            raise NumericalError(f"the weight {name} of {what} is NaN or Inf; a mask of these needs persistent=False")
+            raise NumericalError(f"the weight {name} of {owner} is NaN or Inf; a mask of these needs persistent=False")
         # a copy: where two layers share a weight, safetensors would refuse it
         weights[name] = tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
     return save(weights)

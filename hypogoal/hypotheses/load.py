@@ -81,9 +81,9 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
 
                 values = torch.from_numpy(numpy.array(values, order="C"))
             values = values.cpu() if kind == "uint8" else values.cpu().float()
-            given, wanted = (values.dtype, *values.shape[1:]), (getattr(torch, kind), *shape)
-            if given != wanted:
-                raise ValueError(f"{key or 'a state'} is {given}. Give (N, ...) as in training, each {wanted}.")
+            form, usual = (values.dtype, *values.shape[1:]), (getattr(torch, kind), *shape)
+            if form != usual:
+                raise ValueError(f"{key or 'a state'} is {form}. Give (N, ...) as in training, each {usual}.")
             if kind == "uint8":
                 values = values.float() / 255
             else:

@@ -53,7 +53,7 @@ class Reader:
             observation = observation[self.key]
         elif not isinstance(self.space, spaces.Box):
             observation = spaces.flatten(self.space, observation)
-        values = given = np.array(observation, order="C")
+        values = exact = np.array(observation, order="C")
         received = f"{values.dtype} {values.shape}"
         if self.dtype == NUMBERS and values.dtype.kind in "iufb":
             with np.errstate(over="ignore", under="ignore"):
@@ -66,15 +66,15 @@ class Reader:
                 f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}.",
             )
         if self.dtype == NUMBERS:
-            self._require_kept(given.ravel(), values.ravel())
+            self._require_kept(exact.ravel(), values.ravel())
         return values.reshape(self.shape)
 
-    def _require_kept(self, given: Any, cast: Any) -> None:
+    def _require_kept(self, exact: Any, cast: Any) -> None:
         """Refuse (``UserError``) numbers (D,) that are not finite, or that float32 makes equal."""
         fault, do = "an observation has numbers that are not finite in float32", "Clip or replace them in a wrapper."
         lost = ~np.isfinite(cast)
-        if not lost.any() and not np.can_cast(given.dtype, NUMBERS) and len(self.met) < COMPARED[-1]:
-            self.met.append(given)
+        if not lost.any() and not np.can_cast(exact.dtype, NUMBERS) and len(self.met) < COMPARED[-1]:
+            self.met.append(exact)
             if len(self.met) in COMPARED:
                 from pandas import DataFrame  # takes long to import
 
@@ -87,7 +87,7 @@ class Reader:
                 lost = few.to_numpy() & (changes > NOTICED)
         if lost.any():
             place = lost.argmax()
-            raise UserError(fault, f"{self.features[place]}, such as {given[place]}", do)
+            raise UserError(fault, f"{self.features[place]}, such as {exact[place]}", do)
 
 
 def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
