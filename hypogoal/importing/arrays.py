@@ -9,7 +9,7 @@ import numpy as np
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
-from hypogoal.importing.states import HELDOUT, LABELLED, UNLABELLED, Array, Episode
+from hypogoal.importing.states import HELDOUT, LABELLED, UNLABELLED, Array, Episode, files_of
 
 # Of each set of states: what the names of its observations begin with, and those of its other arrays.
 SETS = {
@@ -23,16 +23,19 @@ LABELS = "Give (N,), or (N, sub-goals) and --sub-goal NAME for each column: 1 wh
 Arrays: TypeAlias = dict[str, Array]
 
 
-def read_arrays(path: Path) -> Arrays:
-    """The arrays of a file or a folder by name; observations of several keys are ``observations/front`` and so on."""
+def read_arrays(path: Path, left: Counter[str]) -> Arrays:
+    """The arrays of a file or a folder by name; observations of several keys are ``observations/front`` and so on.
+
+    ``left`` counts other files of the folder.
+    """
     arrays: Arrays = {"sub_goals": np.array(["sub-goal"]), "features": np.array([])}
-    with reading(path, DO):
-        for file in sorted(path.rglob("*.npy")):
-            inner = file.relative_to(path).with_suffix("")
+    for file in files_of(path, (".npy",), left):
+        inner = file.relative_to(path).with_suffix("")
+        with reading(file, DO):
             arrays[inner.as_posix()] = np.load(file)
-        if path.is_file():
-            with path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
-                arrays.update(stored)
+    if path.is_file():
+        with reading(path, DO), path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
+            arrays.update(stored)
     return arrays
 
 
@@ -56,7 +59,7 @@ def episodes_of(
         for full, values in arrays.items():
             base, _, key = full.partition("/")
             if base == name:
-                seen[key] = values
+                seen[key] = np.atleast_1d(values)
                 rest.remove(full)
         count = max(map(len, seen.values()), default=0)
         unlabelled = 0 if role != UNLABELLED else count

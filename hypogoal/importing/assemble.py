@@ -14,6 +14,7 @@ from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNLABELLED, Fram
 from hypogoal.observations import digest, packed
 
 ROW = "row"  # the origin of each state: its place in its set
+DOUBT = "{} times equal states have both labels of {}: no member can be right about {}"
 SPLIT = np.array([0.4, 0.4, 0.2])  # shares of episodes that are labelled, unlabelled and held out
 MORE = "Give more, at least three episodes that are labelled; rows and pictures have their sets by name."
 REMARK = "no held-out states were given: {} of the labelled ones are held out, which says nothing about other contexts"
@@ -41,12 +42,13 @@ def assemble(
     for key, states in frames.seen.items():
         parts[key] = together(states, table["name"].tolist(), key or "the observations")
     with reading(source, "Give keys that can be file names."):
-        observations = parts[""] if "" in parts else packed(parts)
+        observations = packed(parts) if len(parts) > 1 else parts[""]
     count = observations[0].size
     if features and len(features) != count:
         raise UserError(f"{len(features)} names of features do not fit", f"{count} numbers", "Give one for each.")
     table["look"] = [digest(state).hex() for state in observations]
     table = with_roles(table, seed)
+    doubts = contradictions(table, labels, goals)
     table, remarks = apart(table, labels, share, seed)
     sets = []
     for role in ROLES:
@@ -68,7 +70,26 @@ def assemble(
         tuple(features),
         frames.channels,
     )
-    return collected, remarks + doubts_of(labelled.labels, heldout.labels, goals)
+    return collected, doubts + remarks + doubts_of(labelled.labels, heldout.labels, goals)
+
+
+def contradictions(table: pd.DataFrame, labels: Labels, goals: Sequence[str]) -> list[str]:
+    """A line for each sub-goal of which equal states have both labels; a ``UserError`` if a class has no others."""
+    lines = []
+    judged = table[table["role"] != UNLABELLED]
+    for goal, column in zip(goals, labels.T, strict=True):
+        marks = pd.Series(column[judged.index], judged.index)
+        has_both = marks.groupby(judged["look"]).transform("nunique") > 1
+        looks = judged["look"][has_both]
+        if looks.empty:
+            continue
+        alike = judged["name"][judged["look"] == looks.iloc[0]]
+        example = " and ".join(alike.groupby(marks).first())
+        clear = marks[~has_both & (judged["role"] == LABELLED)].to_numpy()
+        where = f"without those that have both labels, such as {example}"
+        require_classes(clear[:, None], [goal], where, "Remove the copies whose label is wrong.")
+        lines.append(DOUBT.format(looks.nunique(), goal, example))
+    return lines
 
 
 def with_roles(table: pd.DataFrame, seed: int) -> pd.DataFrame:

@@ -8,6 +8,7 @@ Films are read by PyAV (``hypogoal[lerobot]``): the first moving stream, turned 
 """
 
 import io
+import re
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -19,9 +20,11 @@ from typing import Any
 import numpy as np
 import PIL.Image
 import PIL.ImageOps
+from PIL.TiffImagePlugin import TiffImageFile
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import AGAIN, reading
+from hypogoal.core.files import reading
+from hypogoal.core.progress import say
 from hypogoal.data import Integers
 from hypogoal.importing.states import HELDOUT, LABELLED, UNLABELLED, Array, Episode, files_of
 
@@ -39,32 +42,46 @@ PLACES = {
     "heldout/negative": HELDOUT,
 }
 FILMS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi")
-SCALE = "Scale the values to 0..255 and write it with 8 bits, on a background."
+# A TIFF's tags; some of what they say Pillow reads otherwise: 12 bits, 0 as white, each colour for itself, signs.
+BITS, WHITE, PLANES, SIGNS = 258, 262, 284, 339
+DEEP = re.compile("[^R];16|65535")  # in the arguments of Pillow's decoders, whose mode says 8 bits of most such files
+SHOWN = "Write or download it again; 'ffmpeg -i FILM -crf 0 NEW.mkv' keeps what can be shown of a film."
+SHORT = "hypogoal: {} ends earlier than it says, as if it was cut off: what is left is taken"
+LACKING, MICROSECONDS = 0.5, 1_000_000  # what may be missing, in seconds
+SCALE = "Write it as PNG of 8 bits, its values scaled to 0..255, on a background."
 
 
 def picture_of(data: bytes, where: Path) -> Array:
     """The picture in a file of any of ``FORMATS``, uint8 (H, W, 3), or (H, W, 1) if it is grey; ``where`` it is from.
 
     It is turned as viewers turn it; of several pictures in one file it is the first; of 16 bits a channel the upper 8
-    are taken. A ``UserError``: transparent pixels, 16 bits whose upper ones are unused, 32 bits, no picture.
+    are taken. A ``UserError``: transparent pixels, 16 bits whose upper ones are unused, other depths, no picture.
     """
     quiet = warnings.catch_warnings(action="ignore")
     with reading(where, SCALE), quiet, PIL.Image.open(io.BytesIO(data), formats=FORMATS) as opened:
-        deep = any(";16" in str(tile.args) for tile in opened.tile)  # Pillow's mode says 8 bits of most such files
+        is_deep = any(DEEP.search(str(tile.args)) for tile in opened.tile)
+        if isinstance(opened, TiffImageFile):
+            tags = opened.tag_v2
+            bits = {*tags.get(BITS, (1,))}
+            is_white = tags.get(WHITE, 0) == 0
+            is_apart = tags.get(PLANES) == 2 and (is_white or bits != {8})
+            if is_apart or (is_white and 16 in bits) or 12 in bits or 2 in tags.get(SIGNS, ()):
+                raise ValueError("it is a TIFF of 12 bits, with signs, with 0 as white in 16, or of planes")
         opened.load()  # in a PNG the orientation may follow the pixels
         image = PIL.ImageOps.exif_transpose(opened)
         alpha = image.convert("RGBA").getchannel("A")
         is_clear = np.asarray(alpha) < 255
         if image.has_transparency_data and is_clear.any():
             raise ValueError("it is transparent in places")
-        if image.mode in ("I", "F"):
-            raise ValueError("it has 32 bits a channel")
-        if image.mode.startswith("I;16"):
+        is_pgm = image.mode == "I" and opened.format == "PPM"
+        if image.mode.startswith("I;16") or is_pgm:
             values = (np.asarray(image) >> 8).astype(np.uint8)
+        elif image.mode in ("I", "F"):
+            raise ValueError("it has 32 bits a channel")
         else:
             kind = "L" if image.mode in ("1", "L") else "RGB"
             values = np.asarray(image.convert(kind))
-        if deep and 0 < values.max() < 128:
+        if is_deep and values.max() < 128:
             raise ValueError("of its 16 bits a channel the upper ones are unused")
     return values.reshape(*values.shape[:2], -1)
 
@@ -96,7 +113,7 @@ def _state(file: Path, _: Integers) -> list[Array]:
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A film and its first moving stream; pictures of a cover do not move."""
-    with reading(path):
+    with reading(path, SHOWN):
         import av
 
         cover = av.stream.Disposition.attached_pic
@@ -108,9 +125,21 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def count_frames(path: Path) -> int:
-    """How many frames a film shows, from its index: nothing is decoded."""
+    """How many frames a film shows, from its index: nothing is decoded. It is told if the film was to go on."""
+    shown = listed = 0
+    end = 0.0
     with _opened(path) as (container, stream):
-        return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
+        for packet in container.demux():
+            if packet.dts is None and not packet.size:  # behind the last
+                continue
+            end = max(end, packet.time_base * ((packet.pts or packet.dts or 0) + packet.duration))
+            if packet.stream == stream:
+                listed += 1
+                shown += packet.size > 0 and not packet.is_discard
+        length = (container.duration or 0) / MICROSECONDS
+        if stream.frames > listed or length > end + LACKING:
+            say(SHORT.format(path), err=True)
+    return shown
 
 
 def frames_in(
@@ -136,7 +165,7 @@ def frames_in(
             if not missing:
                 return
     fault = f"the film lacks {len(missing)} of {len(rows)} frames that are listed"
-    raise UserError(fault, path, AGAIN)
+    raise UserError(fault, path, SHOWN)
 
 
 def _upright(frame: Any, path: Path) -> Array:
@@ -145,6 +174,10 @@ def _upright(frame: Any, path: Path) -> Array:
     if first.bits > 8 and not others:
         fault = f"the film is grey, of {first.bits} bits, of which 8 would be left"
         raise UserError(fault, path, SCALE)
+    if frame.is_corrupt:
+        raise UserError("the film is damaged", path, SHOWN)
+    if others and others[-1].is_alpha and frame.to_ndarray(format="rgba")[..., 3].min() < 255:
+        raise UserError("the film is transparent in places", path, SCALE)
     picture = frame.to_ndarray(format="rgb24")
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":

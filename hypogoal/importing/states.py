@@ -3,10 +3,10 @@
 What is taken for what: the table in docs/own-domain.md.
 """
 
+import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from glob import iglob
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -24,6 +24,9 @@ ROLES = LABELLED, UNLABELLED, HELDOUT = "labelled", "unlabelled", "heldout"
 STACKED = "Give pictures as uint8 (H, W, C); 'import --stack' puts stacked frames among the channels."
 MOST_COMPARED = 2_000  # rows of numbers that are compared before and after the cast to float32, spread evenly
 LEFT = 0.9  # the share of a column's distinct values that float32 must keep
+ASIDE = {"__macosx", "thumbnails", "thumbs", "#recycle", "#snapshot", "$recycle.bin"}  # folders; and those with @
+HERE = "Here are {}: pictures belong as PNG or JPEG into positive/, negative/ and unlabelled/, numbers into arrays."
+RENAME = "Rename one or take it out; films of one name may differ in their suffix."
 NAMED = 4  # columns that a message names
 IN_FLOAT32 = "have values that float32 makes infinite, 0 or equal, or that are not finite"
 
@@ -51,20 +54,30 @@ class Episode:
 
 
 def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> list[Path]:
-    """The visible files with these suffixes in a folder and those below it, sorted, links followed.
+    """The visible files with these suffixes in a folder and those below it, sorted, links followed, each folder once.
 
-    ``left`` counts the others by suffix.
+    ``left`` counts the others by suffix, and folders that a system keeps for itself or a link leads back to.
     """
     taken = []
-    for name in iglob("**/*", root_dir=folder, recursive=True):
-        file = folder / name
-        suffix = file.suffix.lower()
-        if file.is_dir():
+    known = {*folder.resolve().parents}
+    for place, folders, names in os.walk(folder, followlinks=True):
+        here, real = Path(place), Path(place).resolve()
+        inner = here.relative_to(folder).name
+        if inner.startswith("@") or inner.lower() in ASIDE or real in known:
+            left[f"folders {inner!r}"] += 1
+            folders.clear()
             continue
-        if suffix in suffixes:
-            taken.append(file)
-        else:
-            left[suffix or file.name] += 1
+        known.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in names:
+            file = here / name
+            suffix = file.suffix.lower()
+            if name.startswith("."):
+                continue
+            if suffix in suffixes:
+                taken.append(file)
+            else:
+                left[suffix or name] += 1
     return sorted(taken)
 
 
@@ -104,6 +117,7 @@ def frames_of(
         stack: axes of frames and colours become channels.
     """
     tables, columns = [], []
+    known = set()
     seen: dict[str, list[Array]] = {}
     channels: dict[str, tuple[int, int]] = {}
     with reading(source):
@@ -113,6 +127,9 @@ def frames_of(
                 left["episodes without frames"] += 1
                 continue
             frames = range(length)
+            if episode.name in known:
+                raise UserError("two episodes have one name", episode.name, RENAME)
+            known.add(episode.name)
             names = [f"{episode.name}[{frame}]" for frame in frames]
             kept = slice((length - 1) % every, length, every)
             table = pd.DataFrame({"name": names, "episode": episode.name, "group": episode.group, "role": episode.role})
@@ -130,7 +147,8 @@ def frames_of(
                     if stacked:
                         channels[key] = stacked
     if not seen:
-        raise UserError("there are no pictures or numbers", source, AGAIN)
+        do = HERE.format(", ".join(left)) if left else AGAIN
+        raise UserError("there are no pictures or numbers", source, do)
     table = pd.concat(tables, ignore_index=True)
     return Frames(table, pd.concat(columns, ignore_index=True), seen, channels)
 
@@ -143,22 +161,30 @@ def _parts(
 ) -> dict[str, Iterable[Any]]:
     """What is seen in the frames that are kept, by key, of all pictures and numbers if no keys are given.
 
-    An unknown key is a ``UserError``. In the names of several keys / becomes a dot, since they are names of fields.
+    An unknown key, one of another length, and none that can be read are a ``UserError``. In the names of several keys
+    / becomes a dot, since they are names of fields.
     """
     parts: dict[str, Iterable[Any]] = {}
     for key in sorted({*keys} or episode.observations):
         values: Any = episode.observations.get(key)
         dtype = getattr(values, "dtype", np.dtype(object))
         name = key.replace("/", ".")
+        if name in parts:
+            raise UserError("two keys have one name, since / becomes a dot", key, "Rename one of them.")
         if callable(values):
             parts[name] = values(np.arange(episode.length)[kept])
         elif dtype.kind in "iufb":
+            if len(values) != episode.length:
+                fault = f"{len(values)} states of {key!r}, {episode.length} of others"
+                raise UserError(fault, episode.name, "Give as many of each.")
             parts[name] = values[kept]
         elif keys:
             names = ", ".join(episode.observations)
             raise UserError(f"no pictures or numbers {key!r}", episode.name, f"Its keys are {names}.")
         else:
             left[f"times {key!r}, neither pictures nor numbers"] += 1
+    if not parts:
+        raise UserError("these are neither pictures nor numbers", episode.name, CLEARLY)
     if len(parts) > 1:
         return parts
     return dict(zip([""], parts.values(), strict=False))

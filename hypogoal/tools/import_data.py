@@ -92,7 +92,7 @@ def import_data(
                 goals = sub_goal or [source.resolve().name]
                 episodes = read_pictures(source, goals[0], left)
             else:
-                arrays = read_arrays(source)
+                arrays = read_arrays(source, left)
                 goals = sub_goal or arrays["sub_goals"].tolist()
                 features = arrays["features"].tolist()
                 episodes = episodes_of(arrays, goals, group, left)

@@ -49,7 +49,7 @@ def assembled(given: dict[str, Any], group: str = "") -> tuple[Collected, list[s
         path = Path(folder, "own.npz")
         np.savez(path, **given)
         left: Counter[str] = Counter()
-        frames = frames_of(path, episodes_of(read_arrays(path), ["goal"], group, left), left)
+        frames = frames_of(path, episodes_of(read_arrays(path, left), ["goal"], group, left), left)
         labels = labels_of(frames, {"goal": "goal"})
         collected, said = assemble(path, frames, labels, ["goal"], [*given.get("features", ())])
         return collected, [*said, *left]
