@@ -6,12 +6,14 @@ ROOMS ?= runs/rooms
 ONLY ?= doorkey training options loop limits
 
 VENV := .venv
+# The versions to install; empty for the newest.
+LIMITS := constraints.txt
 BIN := $(VENV)/bin
 USER := $(VENV)/.installed
 STAMP := $(VENV)/.installed-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test kernels versions slurm check bench docs clean
+.PHONY: help setup demo test kernels versions floors newest slurm check bench docs clean
 
 help: ## what one can make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -25,14 +27,14 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) || \
 		{ rm -rf $(VENV); echo "python could not make a virtual environment: install python3-venv" >&2; exit 1; }
 
-$(USER): pyproject.toml constraints.txt | $(BIN)/python
+$(USER): pyproject.toml $(LIMITS) | $(BIN)/python
 	@echo "installing hypogoal and its dependencies into $(VENV) (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	@$(BIN)/python -m pip install --quiet $(addprefix --constraint ,$(LIMITS)) --editable .
 	@touch $@
 
-$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+$(STAMP): pyproject.toml $(LIMITS) | $(BIN)/python
 	@echo "installing hypogoal, its dependencies and the developers' tools into $(VENV) (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -m pip install --quiet $(addprefix --constraint ,$(LIMITS)) --editable '.[dev]'
 	@touch $(USER) $@
 
 # An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(ROOMS) and $(DEMO).
@@ -57,13 +59,23 @@ kernels: $(STAMP) ## the tests of what is computed, as on other processors (befo
 	$(OLDEST) $(BIN)/python -m pytest $(PARALLEL) -p tests.uneven $(NUMERIC)
 
 OTHERS := 3.12 3.13
-versions: ## the quick tests on the other versions of Python, where they are at hand
+versions: ## the tests on the other versions of Python, where they are at hand
 	@for version in $(OTHERS); do \
 		if python$$version -c "" 2>/dev/null; then \
-			$(MAKE) test PYTHON=python$$version VENV=.venv-$$version \
-				TESTS="tests/core tests/hypotheses tests/library tests/test_cli.py tests/test_data.py" || exit 1; \
+			$(MAKE) test PYTHON=python$$version VENV=.venv-$$version || exit 1; \
 		else echo "no Python $$version here"; fi; \
 	done
+
+FLOORS := build/floors.txt
+$(FLOORS): pyproject.toml
+	@mkdir -p $(@D)
+	@sed -n '/^dependencies/,/^\[project.scripts/p' $< | grep -oE '"[a-z0-9-]+>=[0-9.]+' | tr -d '"' | sed 's/>=/==/' | sort -u >$@
+
+floors: $(FLOORS) ## the tests on the lowest versions that pyproject.toml allows, in .venv-floors
+	$(MAKE) test VENV=.venv-floors LIMITS=$(FLOORS)
+
+newest: ## the tests on the newest versions that pip finds, in .venv-newest
+	$(MAKE) test VENV=.venv-newest LIMITS=
 
 slurm: $(STAMP) ## the test of sweeps on a real Slurm, where there is one (some minutes)
 	$(BIN)/python -m pytest -m slurm tests/experiments/test_slurm.py

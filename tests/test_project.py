@@ -185,6 +185,20 @@ def test_set_up_is_done_once_and_again_when_the_versions_change(tmp_path: Path) 
     assert "pip install" in make(clone, "-n", "test").stdout
 
 
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_floors_are_the_lowest_versions_declared(tmp_path: Path) -> None:
+    """``make floors`` installs those, the extras' too; each dependency has one."""
+    for name in ("Makefile", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    make(tmp_path, "build/floors.txt")
+    floors = (tmp_path / "build/floors.txt").read_text("utf-8").splitlines()
+    lowest: set[str] = set()
+    for need in requirements():
+        lowest |= {f"{need.name}=={limit.version}" for limit in need.specifier if limit.operator == ">="}
+    assert {*floors} == lowest
+    assert len(floors) == len({need.name for need in requirements()})
+
+
 def test_formats_are_readable_without_hypogoal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

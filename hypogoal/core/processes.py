@@ -149,7 +149,8 @@ def own_settings() -> Iterator[None]:
     import torch
 
     with _turn:
-        threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
+        # torch 2.8 cannot be asked for its default device again once that was set back to None.
+        threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.empty(0).device
         torch.set_default_dtype(torch.float32)
         torch.set_default_device(None)
         try:
