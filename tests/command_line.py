@@ -34,14 +34,14 @@ def settings(*pairs: str) -> list[str]:
 
 def run(*words: object) -> Printed:
     """What a command prints that must succeed."""
-    code, printed = _called(words)
+    code, printed = called(words)
     assert code == 0, (words, printed.err)
     return printed
 
 
 def fails(*words: object) -> Printed:
     """What a command prints that must end with exit code 2, since something of the user's is wrong."""
-    code, printed = _called(words)
+    code, printed = called(words)
     assert code == 2, (words, code, printed)
     return printed
 
@@ -50,7 +50,7 @@ def refuses(wanted: str, *words: object) -> str:
     """The one line in which a command refuses: exit code 2, ``wanted`` in it, and nothing else printed or written."""
     out = _output_of(words)
     before = _names_beside(out)
-    code, printed = _called(words)
+    code, printed = called(words)
     lines = printed.err.strip().splitlines()
     assert (code, len(lines), printed.out) == (2, 1, ""), (words, code, printed)
     assert lines[0].startswith("hypogoal: ") and lines[0].isprintable(), lines
@@ -68,7 +68,7 @@ def trusting() -> Iterator[None]:
     own_code._allowed.clear()
 
 
-def _called(words: tuple[object, ...]) -> tuple[int, Printed]:
+def called(words: tuple[object, ...]) -> tuple[int, Printed]:
     """The exit code and what was printed, as in a process of its own: nothing was typed before."""
     own_code._allowed.clear()
     out, err = io.StringIO(), io.StringIO()

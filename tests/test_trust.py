@@ -1,15 +1,19 @@
 """Spec B6, G2, H8: code that a file names is loaded only with ``--trust``, in every process; what one typed is."""
 
+import json
 import os
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
-from command_line import fails, refuses, run
+from command_line import called, fails, refuses, run
 from toy_data import write
 
+import hypogoal
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
+from hypogoal.core.processes import surroundings
 from hypogoal.domains.base import load_domain
 
 ROOT = Path(__file__).parents[1]
@@ -54,6 +58,63 @@ def test_a_file_cannot_have_code_loaded(folder: Path, named: str, words: str) ->
         assert (folder / "ran").exists()
 
 
+IN_MANIFESTS = [
+    *(("ensemble", name, "ensemble") for name in ("network", "view")),
+    *(("ensemble", "domain", command) for command in ("train-options {run}/ensemble", "train-meta {run}/ensemble")),
+    *(("meta", name, "options") for name in ("network", "chooser", "termination")),
+    *(("meta", "domain", command) for command in ("evaluate {run}", "export {run}/meta --episodes 1")),
+    ("ensemble", "network", "audit {run}/ensemble --domain doorkey --sub-goal open-red-door"),
+    ("ensemble", "network", "export {run}/ensemble"),
+    ("options", "chooser", "train-meta {run}/ensemble --options {run}/options"),
+    ("options", "domain", "train-options {run}/ensemble --options {run}/options"),
+]
+
+
+@pytest.mark.parametrize(("part", "key", "way"), IN_MANIFESTS)
+def test_a_manifest_cannot_have_code_loaded(folder: Path, tiny_run: Path, part: str, key: str, way: str) -> None:
+    """Whoever reads it: a stage, a tool, Python; of an agent's ensemble, too."""
+    theirs = folder / "run"
+    shutil.copytree(tiny_run, theirs)
+    file = theirs / part / "manifest.json"
+    manifest = json.loads(file.read_text())
+    manifest["config"][key] = "evilmod:obj"
+    file.write_text(json.dumps(manifest))
+    if " " in way:
+        printed = fails(*way.format(run=theirs).split(), "--out", folder / "out").err
+        assert "Traceback" not in printed
+    else:
+        load = {"ensemble": hypogoal.load_ensemble, "options": hypogoal.load_options}[way]
+        arguments = (theirs / part, "open-red-door") if way == "ensemble" else (theirs / part,)
+        with pytest.raises(UserError, match="a file names code of its own"):
+            load(*arguments)
+    assert not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize("words", ["show theirs.h5", "verify .", "status .", "check theirs.h5", "show run"])
+def test_a_look_loads_nothing(folder: Path, words: str) -> None:
+    (folder / "run").mkdir()
+    shutil.copy(folder / "theirs.h5", folder / "run")
+    called(tuple(words.split()))
+    assert not (folder / "ran").exists()
+
+
+def test_children_know_what_was_typed_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In every process that one starts: spawned, forked, a cell's, a job's of Slurm, which inherits the environment."""
+    monkeypatch.setattr(own_code, "_allowed", set())
+    assert own_code.environment() == {}
+    own_code.allow(["--network", "mine:net"])
+    assert own_code.environment() == {own_code.TYPED: "mine:net"}
+    with surroundings():
+        own_code._allowed.clear()  # as in the child
+        own_code.require_trust("mine:net", "network")
+        with pytest.raises(UserError, match="a file names code of its own"):
+            own_code.require_trust("other:net", "network")
+    own_code.allow(["--trust"])
+    with surroundings():
+        own_code._allowed.clear()
+        own_code.require_trust("other:net", "network")
+
+
 def test_what_one_typed_is_loaded(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the command line or in a call; an old value of the variable says nothing."""
     monkeypatch.setenv(own_code.VARIABLE, "evilmod:obj")
@@ -78,3 +139,13 @@ def test_cells_have_what_one_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "own.toml").write_text(EXPERIMENT.format(own="dbat", command=command))
     run("run", "own.toml", "--out", "out", "-q", "--set", "own=margin:pair_loss")
     assert len([*tmp_path.glob("out/c/*/manifest.json")]) == 1
+
+
+def test_cells_have_no_more_than_what_one_typed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code of one's own in a run does not open the door to what other files name."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(folder)]))
+    (folder / "margin.py").write_text((ROOT / "examples" / "margin.py").read_text())
+    command = "train-ensemble theirs.h5 --diversity {own} --set steps=2"
+    (folder / "own.toml").write_text(EXPERIMENT.format(own="dbat", command=command))
+    fails(*["run", "own.toml", "--out", "out", "-q", "--set", "own=margin:pair_loss"])
+    assert not (folder / "ran").exists()

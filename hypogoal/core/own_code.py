@@ -23,6 +23,7 @@ from hypogoal.core.errors import NumericalError, UserError
 
 TRUST = "--trust"
 VARIABLE = "HYPOGOAL_TRUST"
+TYPED = "HYPOGOAL_TYPED"  # in the environment: names that were typed in the process that started this one
 NAMES = re.compile(r"--trust|[\w.]+:[^\W\d][\w.]*")
 CALLED = re.compile(r"([\w.<>]+)\(\) (?:takes|missing|got)")  # an error of a call with other arguments
 MOST_QUOTED = 200  # characters of an error
@@ -49,8 +50,8 @@ def allow(texts: Iterable[object]) -> None:
 
 
 def environment() -> dict[str, str]:
-    """For processes that this one starts: they may load what files name if the user gave code here."""
-    return {VARIABLE: "1"} if _allowed else {}
+    """For processes that this one starts: they may load what the user typed here, no more."""
+    return {TYPED: " ".join(sorted(_allowed))} if _allowed else {}
 
 
 def command(*words: object) -> str:
@@ -61,7 +62,8 @@ def command(*words: object) -> str:
 
 def require_trust(name: str, role: str) -> None:
     """Refuse (``UserError``) a ``module:object`` that the user neither typed nor trusts; other names pass."""
-    trusted = name in _allowed or TRUST in _allowed or os.environ.get(VARIABLE) == "1"
+    typed = _allowed.union(os.environ.get(TYPED, "").split())
+    trusted = name in typed or TRUST in typed or os.environ.get(VARIABLE) == "1"
     if ":" in name and not trusted:
         do = f"Do you trust it? Give {TRUST}, or in a program of your own {VARIABLE}=1 in the environment."
         raise UserError(f"a file names code of its own as its {role}", name, do)

@@ -185,7 +185,8 @@ def context(results):
 def chosen_in(results) -> dict[str, Any]:
     """For the template: the weights that ``diversity_weight=auto`` tried, a row each, and members that are idle."""
     rows, idle = [], []
-    for artefact in results.facts["provenance"]["artefacts"]:
+    recorded = results.facts.get("provenance", {"artefacts": []})  # not where several runs are compared
+    for artefact in recorded["artefacts"]:
         for sub_goal, chosen in artefact["config"].get("chosen", {}).items():
             place = f"{artefact['path']}, {sub_goal}"
             idle += [f"{place}: {text}" for text in chosen["idle"]]

@@ -80,6 +80,17 @@ def frames_kept(config: PracticeConfig | TrainMetaConfig, options: int) -> int:
     return max(reach, (config.decisions + config.environments) * config.option_timeout + STACK * config.environments)
 
 
+def require_memory(engine: Engine, config: PracticeConfig | TrainMetaConfig, options: int) -> None:
+    """Refuse (``UserError``) an engine that forgets states which replays or the meta-policy's decisions still need."""
+    needed = frames_kept(config, options)
+    if engine.memory is not None and needed > engine.memory:
+        raise UserError(
+            f"training looks back over {needed} states, the engine remembers {engine.memory}",
+            f"option_timeout={config.option_timeout}",
+            "Give a smaller option_timeout, decisions or replay, or the domain a larger memory.",
+        )
+
+
 def of_ensemble(setup: Setup, engine: Engine) -> ends.Terminations:
     """Terminations of an ensemble's members, or of its sub-goals where they truly hold (``termination=oracle``).
 

@@ -33,7 +33,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Engine, Layouts
 from hypogoal.meta.config import GAMMA, TrainMetaConfig
-from hypogoal.meta.setup import Setup, make_engine, of_ensemble
+from hypogoal.meta.setup import Setup, make_engine, of_ensemble, require_memory
 from hypogoal.options.choosers import load_chooser
 from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
@@ -58,6 +58,7 @@ def assemble(
     load_chooser(config.chooser).refuse(config, engine)
     terminations = terminations_of(setup, engine)
     learner = load_learner(config.network)(engine, terminations, config, seed, device)
+    require_memory(engine, config, terminations.options)
     chooser = load_chooser(config.chooser).create(engine, terminations.options, config, seed, device)
     recorder = Recorder(terminations.options, engine)
     gamma = GAMMA if isinstance(config, TrainMetaConfig) else 1.0
