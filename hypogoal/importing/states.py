@@ -117,7 +117,7 @@ def frames_of(
         stack: axes of frames and colours become channels.
     """
     tables, columns = [], []
-    known = set()
+    episode_names = set()
     seen: dict[str, list[Array]] = {}
     channels: dict[str, tuple[int, int]] = {}
     with reading(source):
@@ -127,9 +127,9 @@ def frames_of(
                 left["episodes without frames"] += 1
                 continue
             frames = range(length)
-            if episode.name in known:
+            if episode.name in episode_names:
                 raise UserError("two episodes have one name", episode.name, RENAME)
-            known.add(episode.name)
+            episode_names.add(episode.name)
             names = [f"{episode.name}[{frame}]" for frame in frames]
             kept = slice((length - 1) % every, length, every)
             table = pd.DataFrame({"name": names, "episode": episode.name, "group": episode.group, "role": episode.role})

@@ -129,6 +129,20 @@ def test_held_out_states_that_are_known_are_left_out() -> None:
         assembled(mixed | {"heldout_observations": images, "heldout_labels": arrays()["labels"]})
 
 
+def test_equal_states_with_both_labels_are_told() -> None:
+    """Spec B6: labelled or held out, two named; a class that has no state of its own is refused."""
+    (images, labels), (held, known) = pictures(40), pictures(16, 2)
+    line = "1 times equal states have both labels of goal: no member can be right about observations[{}] and {}[{}]"
+    twice = {"observations": np.concatenate([images, images[8:9]]), "labels": np.append(labels, True)}
+    assert assembled(arrays(**twice))[1][0] == line.format(8, "observations", 40)
+    late = {"heldout_observations": np.concatenate([held, images[8:9]]), "heldout_labels": np.append(known, True)}
+    assert assembled(arrays(**late))[1][0] == line.format(8, "heldout_observations", 16)
+    for kind, chosen in (("positives", labels), ("negatives", ~labels)):
+        every = np.concatenate([images, images[chosen]]), np.append(labels, ~labels[chosen])
+        with pytest.raises(UserError, match=f"goal has no {kind} .* without those .* both labels.* Remove the cop"):
+            assembled(arrays(observations=every[0], labels=every[1]))
+
+
 def test_what_looks_alike_is_held_out_together() -> None:
     """Spec B3: from the unlabelled states too."""
     (images, labels), (others, _) = pictures(20), pictures(10, 1)
@@ -143,10 +157,16 @@ def test_what_looks_alike_is_held_out_together() -> None:
         assembled(given | {"unlabelled": collected.heldout.observations})
 
 
+COUNTS = {"observations": 40, "unlabelled": 20, "heldout_observations": 16}  # what arrays() has
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unlabelled": None}, "no unlabelled states"),
     ({"labels": None}, "labels of 40 labelled states and 1 sub-goals are not 0 or 1 for each"),
-    ({"observations/state": np.zeros((39, 4), np.float32)}, "cannot be read"),
+    ({"observations/state": np.zeros((39, 4), np.float32)}, "39 states of 'state', 40 of others: observations"),
+    ({"observations/a.b": np.zeros((40, 2)), "observations/a/b": np.ones((40, 2))}, "two keys have one name"),
+    ({f"{name}/x": np.zeros((count, 2)) for name, count in COUNTS.items()}, "can be file names"),
+    ({"observations": np.zeros((40, 5), complex)}, "these are neither pictures nor numbers: observations"),
+    ({"unlabelled": np.zeros((20, 5), "M8[s]")}, "these are neither pictures nor numbers: unlabelled"),
+    ({"observations": np.array(5)}, "labels of 1 labelled states"),
     ({"unlabelled/arm": np.zeros((20, 4), np.float32)}, "episodes have different observations"),
     (
         {"observations/state": np.full((40, 4), np.nan)},
@@ -170,7 +190,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("changes", "message"), WRONG)
 def test_what_is_wrong_with_arrays_is_one_line(changes: dict[str, Any], message: str) -> None:
     """Spec G2: names, shapes, types, label values; arrays by key are checked as one is."""
-    given = mixed_arrays() | changes if any("s/" in name or "d/" in name for name in changes) else arrays(**changes)
+    by_key = any("/" in name and not name.endswith("/x") for name in changes)
+    given = mixed_arrays() | changes if by_key else arrays(**changes)
     with pytest.raises(UserError, match=message):
         assembled(given)
 
@@ -189,6 +210,15 @@ def test_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
     whole[2000:4000] = bytes(2000)
     pickle = tmp_path / "pickle.npz"
     np.savez(pickle, labels=np.array([None] * 40))
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name, values in arrays().items():
+        np.save(folder / f"{name}.npy", values)
+        (folder / f"._{name}.npy").write_bytes(b"Mac OS X")
+    (folder / "notes.txt").write_text("x")
+    assert "not read: 1 .txt" in run("import", folder, "--out", tmp_path / "folder.h5", "-q").err
+    (folder / "labels.npy").write_bytes(b"no array")
+    refuses("labels.npy", "import", folder, "--out", out)
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\n"
     for data, said in (
         (b"PK" + b"x" * 100, "this cannot be read"),

@@ -10,6 +10,7 @@ from PIL import Image
 
 from hypogoal.data import open_dataset
 from hypogoal.importing.pictures import picture_of, read_pictures
+from tests.importing.robot_data import write_film
 from tests.importing.states import SIDE, pictures, save_pictures
 from tests.importing.test_odd import stored
 
@@ -83,6 +84,53 @@ def test_what_is_not_read_is_counted_and_folders_are_groups(tmp_path: Path) -> N
     assert len(held) == 1 and held | learned == {f"day{number}" for number in range(4)} and not held & learned
     others = {day.get(state.tobytes()) for state in found.unlabelled()}
     assert not others & held
+
+
+def test_each_picture_is_read_once_and_none_that_a_system_keeps(tmp_path: Path) -> None:
+    """Spec B6: links in a circle, thumbnails; a picture with both labels is told."""
+    folder = save_pictures(tmp_path / "goal")
+    words = ["import", folder, "--resize", "24", "-q", "--out"]
+    run(*words, tmp_path / "plain.h5")
+    for kind in ("positive", "negative", "unlabelled"):
+        (folder / kind / "again").symlink_to(".")
+        (folder / kind / "up").symlink_to("..")
+        (folder / kind / "elsewhere" / "deep").mkdir(parents=True)
+        (folder / kind / "elsewhere" / "deep" / "back").symlink_to(folder / kind / "elsewhere")
+        for name in ("@eaDir", "Thumbnails"):
+            (folder / kind / name).mkdir()
+            for file in (folder / kind).glob("*.png"):
+                Image.open(file).resize((30, 30)).save(folder / kind / name / file.name)
+    said = run(*words, tmp_path / "odd.h5").err
+    assert (
+        "not read: 3 folders '@eaDir', 3 folders 'Thumbnails', 3 folders 'again', 3 folders 'back', 3 folders 'up'"
+        in said
+    )
+    counts = open_dataset(tmp_path / "odd.h5").counts()
+    assert counts == open_dataset(tmp_path / "plain.h5").counts()
+    (folder / "negative" / "copy.png").write_bytes((folder / "positive" / "01.png").read_bytes())
+    said = run(*words, tmp_path / "both.h5").err
+    assert "no member can be right about negative/copy.png[0] and positive/01.png[0]" in said
+
+
+def test_what_is_there_instead_of_pictures_is_named(tmp_path: Path) -> None:
+    folder = save_pictures(tmp_path / "goal")
+    for file in [*folder.rglob("*.png")]:
+        file.rename(file.with_suffix(".HEIC"))
+    refuses("Here are .heic: pictures belong as PNG", "import", folder, "--out", tmp_path / "x.h5")
+    for file in [*folder.rglob("*.HEIC")]:
+        file.rename(file.with_suffix(".png"))
+    (folder / "positive").rename(folder / "yes")
+    refuses(
+        "Here are .png: pictures belong as PNG or JPEG into positive/", "import", folder, "--out", tmp_path / "x.h5"
+    )
+
+
+def test_films_of_one_name_are_told_apart_by_no_label(tmp_path: Path) -> None:
+    """Spec I6: x.mkv beside x.mp4 would be one episode, of both."""
+    for name in ("a.mp4", "a.mkv", "b.mp4"):
+        write_film(tmp_path / "takes" / name, [*pictures(4)[0]])
+    words = ["import", tmp_path / "takes", "--label", "on=last:1", "--out", tmp_path / "x.h5"]
+    refuses("two episodes have one name: a. Rename one", *words)
 
 
 def test_large_pictures_are_made_smaller(tmp_path: Path) -> None:

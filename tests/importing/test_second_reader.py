@@ -81,8 +81,8 @@ def tiff(draw: Random) -> Drawn:
                 whole = part.astype(f"{order}u2").tobytes()
                 parts.append(whole if depth == 16 else np.packbits(row_bits, axis=1).tobytes())
     tags: dict[int, Any] = {
-        256: [width], 257: [height], 258: [depth] * channels, 259: [1], 262: [0 if white else 1 if channels == 1 else 2],
-        277: [channels], 284: [planar], 339: [2 if signed else 1] * channels,
+        256: [width], 257: [height], 258: [depth] * channels, 259: [1],
+        262: [0 if white else 1 if channels == 1 else 2], 277: [channels], 284: [planar], 339: [2 if signed else 1] * channels,
     }  # fmt: skip
     sizes = [len(part) for part in parts]
     tags |= {322: [tile], 323: [tile], 324: sizes, 325: sizes} if tile else {273: sizes, 278: [height], 279: sizes}
@@ -150,7 +150,7 @@ def by_ffmpeg(data: bytes) -> np.ndarray:
         return next(container.decode(video=0)).to_ndarray(format="rgb24")
 
 
-@pytest.mark.parametrize("count", SOME)
+@pytest.mark.parametrize("count", [100, SOME[1]])
 @pytest.mark.parametrize("draw_file", [png, tiff, netpbm, saved, lossy])
 def test_pictures_are_as_drawn_or_refused(draw_file: Callable[[Random], Drawn], count: int) -> None:
     near = 10 if draw_file is lossy else 1  # of one rounding, or of two decoders' colours
@@ -170,8 +170,8 @@ def test_pictures_are_as_drawn_or_refused(draw_file: Callable[[Random], Drawn], 
 
 FILMS = [
     ("mp4", "mp4", "libx264", "yuv420p"), ("mkv", "matroska", "libx264", "yuv444p"), ("mov", "mov", "mpeg4", "yuv420p"),
-    ("avi", "avi", "mjpeg", "yuvj420p"), ("webm", "webm", "libvpx-vp9", "yuv420p"), ("mkv", "matroska", "ffv1", "yuv420p"),
-    ("avi", "avi", "mpeg4", "yuv420p"), ("mkv", "matroska", "ffv1", "bgr0"), ("mkv", "matroska", "ffv1", "bgra"),
+    ("avi", "avi", "mjpeg", "yuvj420p"), ("webm", "webm", "libvpx-vp9", "yuv420p"),
+    ("mkv", "matroska", "ffv1", "yuv420p"), ("avi", "avi", "mpeg4", "yuv420p"), ("mkv", "matroska", "ffv1", "bgr0"), ("mkv", "matroska", "ffv1", "bgra"),
 ]  # fmt: skip
 
 
@@ -264,9 +264,6 @@ def test_arrays_are_as_written_or_refused(count: int) -> None:
         try:
             collected, said = assembled(given)
         except UserError:
-            continue
-        except ValueError as error:
-            assert "Object arrays" in str(error) or dtype.kind == "O", seed
             continue
         stored = collected.labelled.observations
         if key and not said:
