@@ -38,6 +38,7 @@ from hypogoal.observations import (
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 RECOLLECT = "Collect it again."
+ANEW = "Bring all files that it is made of, or write it again, whole."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
@@ -162,6 +163,40 @@ def create_hdf5(path: Path) -> Iterator[Any]:
         image = file.id.get_file_image()
     with replacing(path) as fresh:
         fresh.write_bytes(image)
+
+
+def whole(data: Any) -> Any:
+    """An HDF5 dataset all of whose values are stored, else a ``UserError``: HDF5 reads others for those that are not.
+
+    Chunks and arrays may never have been written, raw files and parts of a virtual dataset may be gone.
+    """
+    is_whole = data.id.get_storage_size() > 0 or not data.size
+    if data.chunks:
+        counts = np.ceil(np.divide(data.shape, data.chunks))
+        is_whole = data.id.get_num_chunks() == counts.prod()
+    for name, offset, size in data.external or ():
+        is_whole &= Path(name).stat().st_size >= offset + min(size, data.nbytes)
+    if data.is_virtual:
+        is_whole = _is_covered(data)
+    if not is_whole:
+        raise UserError(f"{data.name} lacks values, for which HDF5 would give others", data.file.filename, ANEW)
+    return data
+
+
+def _is_covered(data: Any) -> bool:
+    """Whether the parts of a virtual dataset, which must be whole, leave no gap in it."""
+    import h5py
+
+    own = Path(data.file.filename)
+    with h5py.File("covered", "w", driver="core", backing_store=False) as scratch:
+        covered = scratch.create_dataset("covered", data.shape, np.bool_)
+        for target, file, name, source in data.virtual_sources():
+            path = own if file == "." else own.parent / file
+            with opened(path, ANEW, "a part of the recording") as part:
+                given = np.ones(whole(part[name]).shape, np.bool_)
+                source.set_extent_simple(given.shape)
+                covered.id.write(source, target, given)
+        return bool(np.all(covered))
 
 
 def fixed(text: str) -> NDArray[np.bytes_]:
@@ -326,7 +361,7 @@ class Dataset:
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {goals}.")
         with opened(self.path) as file:
             group = file[f"{split}/{sub_goal}"]
-            data = group["observations"]
+            data = whole(group["observations"])
             has_shape = data.shape[1:] == self.observation_shape
             if not has_shape or data.dtype != self.observation_dtype:
                 raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
@@ -353,7 +388,7 @@ def _plain(attribute: Any) -> Any:
 
 def _column(group: Any, name: str) -> NDArray[Any]:
     """One value for each state of a group."""
-    values, states = group[name][()], len(group["observations"])
+    values, states = whole(group[name])[()], len(group["observations"])
     if values.shape != (states,):
         raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
     return values

@@ -39,6 +39,9 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
             do = "It is open in another program: close it there first."
         elif "signature not found" in fault:
             fault = f"{subject} is no HDF5 file"
+        elif "synchronously" in fault and "plugin" in fault:
+            fault = f"{subject} is compressed by a filter of HDF5 that is not installed"
+            do = "pip install hdf5plugin, and give HDF5_PLUGIN_PATH its hdf5plugin.PLUGIN_PATH."
         elif path.is_file() and path.read_bytes().startswith(POINTER):
             fault, do = "this is a pointer of Git LFS, not the file itself", "git lfs pull"
         raise UserError(fault, path, do) from None

@@ -46,16 +46,18 @@ def _marks(frames: Frames, rule: str) -> Any:
         is_last = behind < int(count)
         for name in SUCCESS:
             if name in columns:
-                succeeds = columns[name] > 0
-                return is_last & succeeds.groupby(episode).transform("any")
+                numbers = pd.to_numeric(columns[name], errors="coerce").astype(np.float64)
+                return is_last * numbers.groupby(episode).transform("max")  # NaN where it has none
         return is_last
     if ":" in rule and rule not in columns:
         return _by_function(frames, rule)
-    values = columns.get(rule, pd.Series(["none"]))
+    values = columns.get(rule, episode)
     are_numbers = values.dtype.kind in "biuf"
     if not are_numbers or not np.isfinite(values).all():
         names = ", ".join([*columns]) or "none"
-        raise UserError("no column with a number for each frame", rule, f"There are {names}.")
+        gaps = frames.table["name"][values.isna()]
+        where = ", not in ".join([rule, *gaps[:1]])
+        raise UserError("no column with a number for each frame", where, f"There are {names}.")
     return values
 
 

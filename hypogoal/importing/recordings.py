@@ -15,16 +15,19 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from hypogoal.core.files import reading
-from hypogoal.data import Integers, opened
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import AGAIN, reading
+from hypogoal.data import Integers, opened, whole
 from hypogoal.importing.pictures import FILMS, count_frames, frames_in, picture_of
-from hypogoal.importing.states import HELDOUT, Array, Episode, files_of
+from hypogoal.importing.states import HELDOUT, NAMED, Array, Episode, files_of
 
 MINARI = Path("data") / "metadata.json"  # in a dataset's folder
 INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
 OWNER = "episode_index"  # a column of every table
 HDF5 = (".h5", ".hdf5")
 DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it; arrays as .npz."
+KEYS = "Choose those that have one by --key."
+MASK = "Give names of data/*, or take the mask out: del file['mask/valid']."
 TABLE = ".csv"  # labels of films, beside them
 
 # From a source, the keys to read, and what counts by suffix the files that are not read.
@@ -51,13 +54,31 @@ def read_minari(
     """The episodes of a dataset in any of Minari's formats; T is one more than the steps."""
     import minari
 
+    from hypogoal.domains.gymnasium.reader import recorded
+
     dataset = minari.MinariDataset(source / MINARI.parent)
-    for recorded in dataset.iterate_episodes():
+    written = dataset.storage.read_raw_metadata(source / MINARI.parent).get("observation_space")
+    space = json.loads(written, object_hook=_space_of) if written else dataset.observation_space
+    for episode in dataset.iterate_episodes():
         columns = {
-            "rewards": np.append(0, recorded.rewards),
-            "terminations": np.append(0, recorded.terminations),
+            "rewards": np.append(0, episode.rewards),
+            "terminations": np.append(0, episode.terminations),
         }
-        yield _episode(f"episode_{recorded.id}", recorded.observations, columns)
+        seen = recorded(space, episode.observations, keys)
+        yield _episode(f"episode_{episode.id}", seen, columns, keys)
+
+
+def _space_of(part: dict[str, Any]) -> Any:
+    """A space as Minari wrote it, its parts being spaces already, in their order: Minari itself sorts them."""
+    from gymnasium import spaces
+    from minari.serialization import deserialize_space
+
+    kind = part.get("type")
+    if kind == "Dict":
+        return spaces.Dict([*part["subspaces"].items()])
+    if kind == "Tuple":
+        return spaces.Tuple(part["subspaces"])
+    return deserialize_space(part) if isinstance(kind, str) else part
 
 
 def read_robomimic(
@@ -68,13 +89,28 @@ def read_robomimic(
     """The demonstrations ``data/*/obs/KEY``; those that ``mask/valid`` lists are held out."""
     with opened(source, DEMOS, "the recording") as file:
         demos = file["data"]
-        valid = np.array(file.get("mask/valid", ()))
+        masks = file.get("mask", {})
+        valid: set[str] = set()
+        if "valid" in [*masks]:
+            listed = np.ravel(masks["valid"]).astype("S")
+            valid = {name.decode().strip() for name in listed}
+            strangers = sorted(valid.difference(demos))
+            if strangers or not valid:
+                raise UserError("mask/valid names no demonstrations", f"{source}: {strangers[:NAMED]}", MASK)
         by_number = sorted(demos, key=len)  # HDF5 lists names in order: demo_10 before demo_2
         for name in by_number:
             demo = demos[name]
-            columns = {key: part[()] for key, part in demo.items() if getattr(part, "ndim", 0) == 1}
-            role = HELDOUT if name.encode() in valid else ""
-            yield _episode(name, demo["obs"], columns, role)
+            columns = {}
+            for key, part in demo.items():
+                if getattr(part, "ndim", 0) == 1 and part.dtype.kind in "biuf":
+                    columns[key] = whole(part)[()]
+            role = HELDOUT if name in valid else ""
+            seen = _leaves(demo["obs"], "")
+            episode = _episode(name, seen, columns, keys, role)
+            for key in keys or seen:
+                if key in seen:
+                    whole(seen[key])
+            yield episode
 
 
 def read_films(
@@ -105,18 +141,23 @@ def read_lerobot(
         file = source / info["data_path"].format(**_facts(row, "data"))
         table = table_of(file)
         frames = table[table[OWNER] == row[OWNER]]
+        if "timestamp" in frames:
+            numbers = np.rint(frames["timestamp"].to_numpy(np.float64) * info["fps"])
+            if not np.array_equal(numbers, np.arange(row.get("length", len(frames)))):
+                fault = "rows are not the frames of their episode in order, by their timestamps"
+                raise UserError(fault, f"{file}, episode {row[OWNER]}", AGAIN)
         columns = {}
         seen: dict[str, Any] = {}
         for key, feature in info["features"].items():
             if feature["dtype"] == "video":
                 facts = _facts(row, f"videos/{key}")
                 film = source / info["video_path"].format(video_key=key, **facts)
-                values: Any = partial(
-                    frames_in,
-                    film,
-                    rate=info["fps"],
-                    begin=facts["from_timestamp"],
-                )
+                begin = facts["from_timestamp"]
+                shown = (row.get(f"videos/{key}/to_timestamp", np.inf) - begin) * info["fps"]
+                if not shown > len(frames) - 0.5:
+                    fault = f"the film has {shown:.0f} frames of an episode of {len(frames)}"
+                    raise UserError(fault, f"{film}, episode {row[OWNER]}", AGAIN)
+                values: Any = partial(frames_in, film, rate=info["fps"], begin=begin)
             elif feature["dtype"] == "image":
                 values = partial(_cells, file, frames[key])
             else:
@@ -156,17 +197,32 @@ def _cells(file: Path, column: Any, rows: Integers) -> Iterator[Array]:
         yield picture_of(cell["bytes"], file)
 
 
-def _episode(name: str, observations: Any, columns: Mapping[str, Array], role: str = "") -> Episode:
-    """An episode whose observations are arrays (T, ...) in nested dictionaries, HDF5 groups or tuples."""
-    leaves = _leaves(observations, "")
-    length = max(map(len, leaves.values()), default=0)
-    return Episode(name, length, leaves, columns, role)
+def _episode(
+    name: str,
+    seen: Mapping[str, Any],
+    columns: Mapping[str, Array],
+    keys: Sequence[str],
+    role: str = "",
+) -> Episode:
+    """An episode of arrays (T, ...) by key; those that are wanted have one T, or it is a ``UserError``.
+
+    A column that is shorter has no numbers for the last frames, and one that is longer has none at all.
+    """
+    shapes: dict[str, Any] = {key: getattr(seen[key], "shape", None) for key in keys or seen if key in seen}
+    lengths = {(shape or ())[:1] for shape in shapes.values()}
+    if len(lengths) > 1 or () in lengths:
+        raise UserError("not all of these have an entry for each frame", f"{name}: {shapes}", KEYS)
+    length = max(lengths)[0] if lengths else 1
+    by_frame = {}
+    for key, values in columns.items():
+        by_frame[key] = np.full(length, np.nan)
+        if len(values) <= length:
+            by_frame[key][: len(values)] = values
+    return Episode(name, length, seen, by_frame, role)
 
 
 def _leaves(values: Any, place: str) -> dict[str, Any]:
-    """The arrays by key: ``robot/position``; of an observation that is not nested by ""."""
-    if isinstance(values, tuple):
-        values = dict(enumerate(values))
+    """The datasets in a group by key: ``robot/position``."""
     if not hasattr(values, "items"):
         return {place: values}
     leaves = {}

@@ -181,7 +181,7 @@ def test_minari_is_read(tmp_path: Path) -> None:
     nested = save_minari(tmp_path / "nested-v0", nested=True)
     assert imported(nested, data, *right, "--key", "image").observation_shape == (SIDE, SIDE, 3)
     states = imported(nested, data, *right).labelled("right").observations
-    assert states.dtype.names == ("arm.speed", "image") and set(states["arm.speed"][:, 0]) == {0, 2, 4, 6, 8, 10}
+    assert states.dtype.names == ("arm", "image") and set(states["arm"][:, 0]) == {0, 2, 4, 6, 8, 10}
 
 
 def write_turned(path: Path, orientation: int) -> None:
@@ -312,7 +312,7 @@ def test_what_other_recordings_lack_is_one_line(datasets: Path, tmp_path: Path) 
         (datasets / "takes", "last:3", "top", "Its keys are video"),
         (datasets / "takes", "rewards", "video", "There are none"),
         (few, few / "right.csv", "image", "there are no heldout states"),
-        (some, some / "right.csv", "imag", "'imag': episode_0. Its keys are arm/speed, image, task"),
+        (some, some / "right.csv", "imag", "'imag': episode_0. Its keys are image, arm/speed, task"),
         (some, some / "right.csv", "task", "no pictures or numbers 'task'"),
     ):
         refuses(said, "import", source, "--out", tmp_path / "data.h5", "--label", f"a={rule}", "--key", key)

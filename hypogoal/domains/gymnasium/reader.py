@@ -7,7 +7,7 @@ a structured type, see ``hypogoal.observations``.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -191,3 +191,27 @@ def _names(name: str, space: spaces.Space[Any]) -> list[str]:
     if size == 1:
         return [name]
     return [f"{name}[{place}]" for place in range(size)]
+
+
+def recorded(space: spaces.Space[Any], values: Any, keys: Collection[str] = (), place: str = "") -> dict[str, Any]:
+    """Observations (T, ...) of a space by key, as those of an environment are read; pictures are not yet arranged.
+
+    Where there are no pictures, numbers are flattened into one array. Each of ``keys``, if any, is a space of its own.
+    """
+    is_wanted = not keys or place in keys
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        if is_wanted and not isinstance(space, spaces.Box | spaces.Text):
+            values = [spaces.flatten(space, value) for value in values]
+        return {place: np.asarray(values)}
+    found: dict[str, Any] = {}
+    parts = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
+    for key, part in parts:
+        inner = f"{place}/{key}".removeprefix("/")
+        found |= recorded(part, values[key], () if is_wanted else keys, inner)
+    has_pictures = any(_is_picture(part) for _, part in _leaves(space))
+    if has_pictures or not is_wanted:
+        return found
+    texts = {key: array for key, array in found.items() if array.dtype.kind == "U"}
+    order = sorted(found) if texts else found  # as in _without_text
+    rows = [found[key].reshape(len(found[key]), -1) for key in order if key not in texts]
+    return {place: np.concatenate(rows, axis=1), **texts}
