@@ -159,6 +159,8 @@ def frames_in(
             container.seek(int(first / stream.time_base), stream=stream)  # to the key frame before
         for count, frame in enumerate(container.decode(stream)):
             number = round((frame.time - begin) * rate) if rate else count
+            if number in rows and number not in missing:
+                raise ValueError(f"two frames are number {number} by their times")
             if number in missing:
                 missing.remove(number)
                 yield _upright(frame, path)

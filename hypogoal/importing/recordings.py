@@ -136,6 +136,8 @@ def read_lerobot(
     info = json.loads(text)
     table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
     listed = _listed(source)
+    for key in info["features"]:
+        _cut_ends(listed, f"videos/{key}")
     listed["episode_chunk"] = listed[OWNER] // info.get("chunks_size", 1000)
     for row in listed.to_dict("records"):
         file = source / info["data_path"].format(**_facts(row, "data"))
@@ -175,7 +177,18 @@ def _listed(source: Path) -> pd.DataFrame:
     if file.exists():
         return pd.read_json(file, lines=True, encoding="utf-8-sig")
     files = (source / EPISODES).glob("*/*.parquet")
-    return pd.concat(map(_table, sorted(files)))
+    return pd.concat(map(_table, sorted(files)), ignore_index=True)
+
+
+def _cut_ends(listed: pd.DataFrame, head: str) -> None:
+    """Add when each episode ends in its film: where the next one begins at the latest."""
+    begin, end = f"{head}/from_timestamp", f"{head}/to_timestamp"
+    if begin in listed:
+        in_order = listed.sort_values(begin)
+        films = in_order.groupby([f"{head}/chunk_index", f"{head}/file_index"])
+        following = films[begin].shift(-1).astype(np.float64)
+        ends = [following, listed.get(end, following)]
+        listed[end] = pd.concat(ends, axis=1).astype(np.float64).min(axis=1).fillna(np.inf)
 
 
 def _facts(row: Mapping[Any, Any], head: str) -> dict[Any, Any]:
@@ -209,7 +222,7 @@ def _episode(
     A column that is shorter has no numbers for the last frames, and one that is longer has none at all.
     """
     shapes: dict[str, Any] = {key: getattr(seen[key], "shape", None) for key in keys or seen if key in seen}
-    lengths = {(shape or ())[:1] for shape in shapes.values()}
+    lengths: set[tuple[int, ...]] = {(shape or ())[:1] for shape in shapes.values()}
     if len(lengths) > 1 or () in lengths:
         raise UserError("not all of these have an entry for each frame", f"{name}: {shapes}", KEYS)
     length = max(lengths)[0] if lengths else 1

@@ -113,13 +113,20 @@ def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
 
 def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """A space without the text among its entries, which a warning names."""
+    rest, texts = _split(space)
+    if texts:
+        warnings.warn(f"observations are read without their text: {', '.join(texts)}", stacklevel=2)
+    return rest
+
+
+def _split(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], list[str]]:
+    """A space without the text among its entries, and the keys of this; all of it if there is nothing else."""
     if not isinstance(space, spaces.Dict):
-        return space
+        return space, []
     texts = [key for key, part in space.items() if str(part.dtype).startswith("<U")]
     if not 0 < len(texts) < len(space):
-        return space
-    warnings.warn(f"observations are read without their text: {', '.join(texts)}", stacklevel=2)
-    return spaces.Dict({key: part for key, part in space.items() if key not in texts})
+        return space, []
+    return spaces.Dict({key: part for key, part in space.items() if key not in texts}), texts
 
 
 def _is_picture(space: spaces.Space[Any]) -> bool:
@@ -170,8 +177,7 @@ def _leaves(space: Any, name: str) -> Iterator[tuple[str, Any]]:
     if not isinstance(space, spaces.Dict | spaces.Tuple):
         yield name, space
         return
-    inner = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
-    for key, part in inner:
+    for key, part in _entries(space):
         inner_name = f"{name}.{key}" if name else str(key)
         yield from _leaves(part, inner_name)
 
@@ -199,19 +205,30 @@ def recorded(space: spaces.Space[Any], values: Any, keys: Collection[str] = (), 
     Where there are no pictures, numbers are flattened into one array. Each of ``keys``, if any, is a space of its own.
     """
     is_wanted = not keys or place in keys
-    if not isinstance(space, spaces.Dict | spaces.Tuple):
-        if is_wanted and not isinstance(space, spaces.Box | spaces.Text):
-            values = [spaces.flatten(space, value) for value in values]
-        return {place: np.asarray(values)}
+    has_pictures = any(_is_picture(part) for _, part in _leaves(space))
     found: dict[str, Any] = {}
-    parts = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
+    if is_wanted and not has_pictures and not isinstance(space, spaces.Box | spaces.Text):
+        numbers, texts = _split(space)
+        found[place] = _flattened(numbers, values)
+        parts = [(key, part) for key, part in _entries(space) if key in texts]
+    elif isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = _entries(space)
+    else:
+        return {place: np.asarray(values)}
     for key, part in parts:
         inner = f"{place}/{key}".removeprefix("/")
         found |= recorded(part, values[key], () if is_wanted else keys, inner)
-    has_pictures = any(_is_picture(part) for _, part in _leaves(space))
-    if has_pictures or not is_wanted:
-        return found
-    texts = {key: array for key, array in found.items() if array.dtype.kind == "U"}
-    order = sorted(found) if texts else found  # as in _without_text
-    rows = [found[key].reshape(len(found[key]), -1) for key in order if key not in texts]
-    return {place: np.concatenate(rows, axis=1), **texts}
+    return found
+
+
+def _flattened(space: spaces.Space[Any], values: Any) -> Any:
+    """Observations (T, ...) as Gymnasium flattens each, (T, D)."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        rows = [_flattened(part, values[key]) for key, part in _entries(space)]
+        return np.concatenate(rows, axis=1)
+    return np.array([spaces.flatten(space, value) for value in values])
+
+
+def _entries(space: Any) -> list[tuple[Any, Any]]:
+    """What a ``Dict`` or ``Tuple`` has, with keys."""
+    return [*(space.items() if isinstance(space, spaces.Dict) else enumerate(space))]
