@@ -227,7 +227,7 @@ def show(
     from hypogoal import look
 
     details = look.describe(path)
-    echo(details, as_json, [*look.outcome(details), *look.lines(details)])
+    echo(details, as_json, [*look.outcome(details), *look.lines(details)] or look.in_the_making(path))
     if pictures is not None:
         from hypogoal.evaluation.pictures import write_sheets
 

@@ -29,7 +29,7 @@ def parts_of(path: Path) -> list[Path]:
         return [path]
     artefacts = [manifest.parent for manifest in visible(path, MANIFEST)]
     data = [file for file in visible(path, "*.h5") if file.parent not in artefacts]
-    if artefacts or data or unfinished(path):
+    if artefacts or data or in_the_making(path):
         return [*data, *artefacts]
     fault = "no artefact and no data file here" if path.exists() else "no such file or folder"
     raise UserError(fault, path, "Give what a stage wrote.")

@@ -210,12 +210,20 @@ class Draft:
         At the end a draft is removed that has neither a checkpoint nor a finished output.
         """
         lock = FileLock(self.lock, timeout=PATIENCE_SECONDS)
+        is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire()
         except (Timeout, FileNotFoundError):  # not found: its owner has just removed the folder
             do = "Wait until it is done, or choose another --out."
             raise UserError("another process is writing this", self.out, do) from None
+        except OSError as error:
+            if error.filename:
+                raise
+            if is_new:
+                shutil.rmtree(self.folder)
+            do = "Choose an --out on another disk, or mount this one with locks (flock)."
+            raise UserError(f"no file can be locked here ({error.strerror})", self.out.parent, do) from None
         try:
             yield
         finally:

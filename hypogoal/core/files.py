@@ -22,7 +22,7 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
     """A block that reads a file by some library: whatever that raises becomes one line with the cause."""
     try:
         yield
-    except (UserError, MemoryError):
+    except (UserError, MemoryError, UnicodeEncodeError):
         raise
     except ImportError as error:
         do = "pip install 'hypogoal[lerobot,minari]'"

@@ -32,7 +32,9 @@ LIBRARIES = (*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), PACKAGE
 NO_MEMORY = "there is not enough memory. Choose a smaller batch_size, fewer environments or --set workers=1."
 REMEDIES = {
     errno.ENOSPC: "Free some disk space and run it again.",
+    errno.EDQUOT: "Free some disk space and run it again.",
     errno.EACCES: "Ask for permission, or choose another path.",
+    errno.EROFS: "Nothing can be written there: choose another path.",
 }
 Kind = TypeVar("Kind")
 _allowed: set[str] = set()  # what the user typed in this process
@@ -47,6 +49,11 @@ def allow(texts: Iterable[object]) -> None:
     """Note what the user typed: names in it may be loaded; with ``--trust`` any name."""
     for text in texts:
         _allowed.update(names_in(text))
+
+
+def is_in_program() -> bool:
+    """Whether the user named code of the program itself, ``__main__:object``."""
+    return any(name.startswith("__main__:") for name in _allowed)
 
 
 def environment() -> dict[str, str]:
@@ -139,6 +146,9 @@ def message(error: BaseException) -> tuple[str, int]:
         return NO_MEMORY, 2
     if user_error := of_user(error):
         return str(user_error), 2
+    if isinstance(error, UnicodeEncodeError):
+        do = "Give PYTHONUTF8=1 in the environment."
+        return str(UserError("the locale does not know these letters", error.object, do)), 2
     if isinstance(error, ModuleNotFoundError):
         return f"the package {error.name} is needed. Install it: pip install {error.name}", 2
     if isinstance(error, OSError) and error.errno:

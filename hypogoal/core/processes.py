@@ -8,8 +8,10 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from types import FrameType
+from contextlib import contextmanager, suppress
+from math import ceil, inf
+from pathlib import Path
+from types import FrameType, ModuleType
 from typing import TypeVar
 
 from hypogoal.core import own_code
@@ -21,6 +23,7 @@ DEVICES = ("auto", "cpu", "cuda")
 # Libraries use one thread per process, unless the user sets these.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
+GROUPS = (Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"))  # Linux's: those of this process, their limits
 
 _turn = threading.RLock()  # a stage may call another one
 
@@ -33,10 +36,33 @@ def stop(number: int, _frame: FrameType | None) -> None:
 
 
 def cores() -> int:
-    """How many cores this process may use: those the system allows, or fewer with ``HYPOGOAL_CORES``."""
+    """How many cores this process may use: those the system allows, or fewer with ``HYPOGOAL_CORES``.
+
+    A quota of its control groups counts in whole cores, rounded up.
+    """
     affinity = getattr(os, "sched_getaffinity", None)  # not on every system
     count = len(affinity(0)) if affinity else os.cpu_count()
-    return allowed(count or 1)
+    return allowed(ceil(min(count or 1, quota(*GROUPS))))
+
+
+def quota(groups: Path, limits: Path) -> float:
+    """How many cores' time the control groups of a process have, of either version; infinite without a limit."""
+    least = inf
+    if not groups.is_file():
+        return least
+    for line in groups.read_text().splitlines():
+        _, controllers, place = line.split(":", 2)
+        for within in (Path(place), *Path(place).parents):  # a container sees its own group as the root
+            folder = limits / controllers / within.relative_to("/")
+            with suppress(OSError, ValueError, ZeroDivisionError):  # no file: not limited here; "max"
+                if controllers:
+                    texts = [(folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period")]
+                else:
+                    texts = (folder / "cpu.max").read_text().split()
+                time, period = map(float, texts)
+                if time > 0:
+                    least = min(least, time / period)
+    return least
 
 
 def allowed(wanted: int) -> int:
@@ -57,7 +83,8 @@ def in_processes(
     other processes tasks and results must be picklable. If a task fails, or at Ctrl-C, running ones are ended.
 
     Processes are spawned, and import what they need, for some 3 s each: a fork copies the caller's locks, and CUDA does
-    not survive it. ``forked`` is for tasks that need neither; it holds on Linux only.
+    not survive it. ``forked`` is for tasks that need neither; it holds on Linux only. The program that called is not
+    run again in spawned ones: it may have no file, or no main guard.
     """
     if min(workers, len(tasks)) <= 1 or multiprocessing.current_process().daemon:
         for number, task in enumerate(tasks):
@@ -65,21 +92,37 @@ def in_processes(
         return
     others = set(multiprocessing.active_children())
     context = multiprocessing.get_context("fork" if forked and sys.platform == "linux" else "spawn")
-    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _begin, (own_code.environment(),))
     try:
-        futures = {pool.submit(_run, task): number for number, task in enumerate(tasks)}
+        pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _begin, (own_code.environment(),))
+    except (OSError, ImportError) as error:
+        do = f"Make /dev/shm writable, or give {CORES}=1 in the environment: one process."
+        raise UserError(f"processes cannot share memory ({error})", "/dev/shm", do) from None
+    try:
+        with _without_program():
+            futures = {pool.submit(_run, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
         fault = "a process was killed by the system, most likely for lack of memory, or could not start"
-        do = "Run fewer at once: --set workers=1. In a script call hypogoal below 'if __name__ == \"__main__\":'."
-        raise UserError(fault, None, do) from None
+        raise UserError(fault, None, "Run fewer at once: --set workers=1.") from None
     except BaseException:
         for process in set(multiprocessing.active_children()) - others:
             process.terminate()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _without_program() -> Iterator[None]:
+    """Processes that are spawned within it do not run the program, unless code of it is asked for."""
+    program = sys.modules["__main__"]
+    if not own_code.is_in_program():
+        sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = program
 
 
 def _begin(environment: Mapping[str, str]) -> None:

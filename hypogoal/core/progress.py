@@ -103,7 +103,11 @@ class MetricsLog:
 
 
 def say(*lines: object, err: bool = False) -> None:
-    """Print lines on standard output or error."""
+    """Print lines on standard output or error; letters that it cannot show as their numbers."""
     stream = sys.stderr if err else sys.stdout
     for line in lines:
-        print(line, file=stream, flush=True)
+        try:
+            print(line, file=stream, flush=True)
+        except UnicodeEncodeError:
+            shown = str(line).encode(stream.encoding, "backslashreplace").decode(stream.encoding)
+            print(shown, file=stream, flush=True)

@@ -6,6 +6,7 @@ queued again; when it is cancelled, it saves too.
 """
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -19,7 +20,10 @@ from hypogoal.core.files import replace_text
 from hypogoal.core.processes import surroundings
 from hypogoal.stages import LISTED
 
-JOBS = "slurm/jobs"  # the numbers of the jobs last submitted, the last of them first: scancel $(cat ...)
+JOBS = "slurm/jobs"  # the jobs last submitted, the last of them first, behind --clusters=NAME: scancel $(cat ...)
+COLOURS = re.compile(r"\x1b\[[\d;]*[A-Za-z]")
+# A line of sbatch's that is its answer; clusters have words of their own before and behind it.
+ANSWER = re.compile(r"^[ \t]*(?:Submitted batch job )?(\d+)(?:(?:;| on cluster )(\S+))?[ \t\r]*$", re.MULTILINE)
 
 # A line of the file of cells: a cell's log, its checkpoints, its command. It is stopped two minutes before its limit.
 SCRIPT = """#!/bin/sh
@@ -39,16 +43,22 @@ wait "$cell"; code=$?; echo "$code" >"$log.code"; exit "$code"
 
 
 def check_free(run: Path, *, is_wanted: bool) -> None:
-    """Refuse (``UserError``) a run whose jobs wait or run and, if Slurm ``is_wanted``, a machine without it."""
+    """Refuse (``UserError``) a run whose jobs wait or run, or may, and, if Slurm ``is_wanted``, a machine without it."""
     if is_wanted and shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     jobs = run / JOBS
     if not jobs.exists() or shutil.which("squeue") is None:
         return
-    numbers = ",".join(jobs.read_text().split())
-    alive = _asked("squeue", "--me", "--noheader", "--format=%A", f"--jobs={numbers}").stdout.split()
+    words = jobs.read_text().split()
+    cluster = [word for word in words if word.startswith("--")]
+    queue = _asked("squeue", "--me", "--noheader", "--format=%F", *cluster)
+    if queue.returncode or "error" in queue.stderr:
+        do = f"Try again when squeue answers. If none of them waits or runs, remove {jobs}."
+        raise UserError(f"squeue does not say whether this run's jobs are done ({queue.stderr})", run, do)
+    alive = [job for job in words if job in queue.stdout.split()]
     if alive:
-        raise UserError("this run is in Slurm's queue", run, f"Wait, or end it: scancel {' '.join({*alive})}")
+        do = f"Wait, or end it: {shlex.join(['scancel', *cluster, *alive])}"
+        raise UserError("this run is in Slurm's queue", run, do)
 
 
 def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], say: Callable[[str], None]) -> None:
@@ -79,13 +89,18 @@ def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], s
         if before:
             words.append(f"--dependency=afterany:{':'.join(sorted(before))}")
         done = _asked("sbatch", "--parsable", *words, *options, str(script))
-        last = done.stdout.splitlines()[-1:]  # a banner may come before
-        job = "".join(last).partition(";")[0]
+        answers = {*ANSWER.findall(done.stdout)}
         jobs = " ".join(dict.fromkeys(reversed(job_of.values())))
-        if done.returncode or not job.isdigit():
-            do = f"Queued are {jobs}: end them with scancel. Change the options and give --resume."
+        queued = f"Queued are {jobs}: end them with scancel. " if jobs else ""
+        if done.returncode:
+            do = f"{queued}Change the options and give --resume."
             raise UserError(f"Slurm refuses {name} ({done.stderr or done.stdout})", None, do)
-        replace_text(run / JOBS, f"{job} {jobs}\n")
+        if len(answers) != 1:
+            do = f"It is queued: find it with squeue --me, end it with scancel. {queued}Then give --resume."
+            raise UserError(f"sbatch does not say one number of a job for {name} ({done.stdout})", None, do)
+        [(job, cluster)] = answers
+        where = f"--clusters={cluster} " if cluster else ""
+        replace_text(run / JOBS, f"{where}{job} {jobs}\n")
         job_of |= dict.fromkeys([cell.place for cell in part], job)
         say(f"job {job}: {name}, {len(part)} cells")
 
@@ -99,4 +114,6 @@ def _line(cell: Cell) -> str:
 def _asked(*words: str) -> subprocess.CompletedProcess[str]:
     """What a command of Slurm's says; jobs inherit its environment."""
     with surroundings():
-        return subprocess.run(words, capture_output=True, text=True, check=False)
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+    done.stdout = COLOURS.sub("", done.stdout)
+    return done

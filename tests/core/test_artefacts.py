@@ -1,5 +1,6 @@
 """The store: an output is whole or absent, has one writer, and is continued only by what began it (Spec A8, G1, G2)."""
 
+import errno
 import json
 import os
 import shutil
@@ -259,6 +260,23 @@ def test_the_second_of_two_writers_is_refused(tmp_path: Path) -> None:
         other.send_signal(signal.SIGKILL)
     assert not Draft(out).is_locked and Draft(out).folder.exists()
     assert finish(out) == 0 and os.listdir(tmp_path) == ["meta"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EBADF, errno.EIO])
+def test_a_disk_without_locks_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    """Spec G2: one line; nothing is left there, but for an earlier draft."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    with pytest.raises(ValueError):
+        stop(tmp_path / "begun", ValueError())
+    before = contents(tmp_path)
+    monkeypatch.setattr("fcntl.flock", refuse)
+    for name in ("begun", "new"):
+        with pytest.raises(UserError, match=r"no file can be locked here \(.*--out on another disk"):
+            finish(tmp_path / name)
+    assert contents(tmp_path) == before
 
 
 def test_a_kill_between_two_renames_loses_nothing(tmp_path: Path) -> None:

@@ -6,12 +6,13 @@ import subprocess
 import sys
 import time
 from functools import partial
+from math import inf
 from pathlib import Path
 
 import pytest
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.processes import CORES, allowed, cores, in_processes, stop
+from hypogoal.core.processes import CORES, allowed, cores, in_processes, quota, stop
 
 
 def ignore(number: int, result: object) -> None:
@@ -24,6 +25,36 @@ def test_no_stage_uses_more_processes_than_it_was_allotted(monkeypatch: pytest.M
     assert allowed(4096) == 4096 and allowed(0) == cores()
     monkeypatch.setenv(CORES, "2")
     assert allowed(4096) == 2 and allowed(1) == 1 and allowed(0) == cores() <= 2
+
+
+@pytest.mark.parametrize(
+    ("groups", "limits", "wanted"),
+    [
+        ("0::/", {"cpu.max": "50000 100000\n"}, 0.5),
+        ("0::/", {"cpu.max": "max 100000\n"}, inf),
+        ("0::/user/me", {"user/cpu.max": "150000 100000", "user/me/cpu.max": "max 100000"}, 1.5),
+        ("0::/host/docker", {"cpu.max": "300000 100000"}, 3),
+        ("2:cpu,cpuacct:/a\n0::/", {f"cpu,cpuacct/a/cpu.cfs_{n}_us": "50000" for n in ("quota", "period")}, 1),
+        ("2:cpu:/", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, inf),
+        ("2:cpu:/", {}, inf),
+        (None, {}, inf),
+    ],
+)
+def test_quotas_of_control_groups_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: str | None, limits: dict[str, str], wanted: float
+) -> None:
+    """Of both versions, a group's own and those above it; half a core is one process."""
+    mine = tmp_path / "cgroup"
+    if groups:
+        mine.write_text(groups)
+    for name, text in limits.items():
+        (tmp_path / "sys" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "sys" / name).write_text(text)
+    assert quota(mine, tmp_path / "sys") == wanted
+    monkeypatch.delenv(CORES, raising=False)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(2))
+    monkeypatch.setattr("hypogoal.core.processes.GROUPS", (mine, tmp_path / "sys"))
+    assert cores() == (1 if wanted <= 1 else 2)
 
 
 def die() -> None:
@@ -61,17 +92,46 @@ def test_what_fails_ends_the_others(tmp_path: Path, forked: bool) -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-NO_GUARD = """
+PROGRAM = """
 from functools import partial
+import os, sys
+from hypogoal.core import own_code
 from hypogoal.core.processes import in_processes
-in_processes([partial(print, "a"), partial(print, "b")], 2, print)
+mine = "mine"
+{first}
+in_processes([partial({what}), partial({what})], 2, print)
 """
 
 
-def test_a_script_without_a_guard_is_told(tmp_path: Path) -> None:
-    """Processes are spawned, which import it again."""
-    (tmp_path / "script.py").write_text(NO_GUARD)
+@pytest.mark.parametrize("way", ["without a guard", "on standard input", "whose file is gone", "of which code is named"])
+def test_a_program_is_not_run_again(tmp_path: Path, way: str) -> None:
+    """Each task is done once, whatever the program is; unless a name of its own is to be loaded."""
+    script = tmp_path / "script.py"
+    first, what = {
+        "whose file is gone": ("os.remove(sys.argv[0])", "len, 'ab'"),
+        "of which code is named": (
+            "own_code.allow(['__main__:mine'])\nif __name__ != '__main__': in_processes = print",
+            "own_code.load, '__main__:mine', 'word', 'none', {}",
+        ),
+    }.get(way, ("", "len, 'ab'"))
+    script.write_text(PROGRAM.format(first=first, what=what))
+    command = [sys.executable, "-"] if way == "on standard input" else [sys.executable, script]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [sys.executable, tmp_path / "script.py"]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
-    assert "could not start. Run fewer at once: --set workers=1. In a script call hypogoal below 'if" in done.stderr
+    with script.open() as program:
+        done = subprocess.run(
+            command, capture_output=True, text=True, env=environment, timeout=120, check=False, stdin=program
+        )
+    result = "mine" if "named" in way else "2"
+    lines = [line for line in done.stdout.splitlines() if line.endswith(result)]
+    assert sorted(lines) == [f"0 {result}", f"1 {result}"], done.stderr
+
+
+def test_processes_without_shared_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G2: as where /dev/shm cannot be written; the line says what to do."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("multiprocessing.synchronize._multiprocessing.SemLock", refuse)
+    with pytest.raises(UserError, match=r"Read-only file system.*/dev/shm. Make .* give HYPOGOAL_CORES=1"):
+        in_processes([die, die], 2, ignore)

@@ -77,7 +77,7 @@ def test_any_number_of_processes_gives_the_same_evaluation(small_ladders, tmp_pa
     ensembles = [(each, each.input("data")) for each in find_artefacts(small_ladders, "ensemble")]
     assert judging.processes_for(ensembles) == 1
     monkeypatch.setattr(judging, "SPREAD_FROM", 0)
-    monkeypatch.setenv("HYPOGOAL_CORES", "2")
+    monkeypatch.setattr(judging, "cores", lambda: 2)
     assert judging.processes_for(ensembles) == 2
     evaluate(small_ladders, tmp_path / "again", **QUIET)
     for name in ("numbers.csv", "run.json", "tables/rooms.csv"):

@@ -26,7 +26,7 @@ $(wc -l < "$here/asked");nautilus"
 
 
 def test_scripts_and_what_is_asked_of_sbatch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G4: an array for each stage, after those that it reads; the number is the last line."""
+    """Spec G4: an array for each stage, after those that it reads; the number is a line of its own."""
     (tmp_path / "sbatch").write_text(COMMAND)
     (tmp_path / "sbatch").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
@@ -41,12 +41,76 @@ def test_scripts_and_what_is_asked_of_sbatch(tmp_path: Path, monkeypatch: pytest
     assert waits == ["", "1", "2", "", "1:2:3:4", "5"]
     for words_asked in ("--array=0-2%7", "--time=4:00:00 --mem=2G", "/50%%A run/slurm/%x-%A-%a.out"):
         assert words_asked in asked[3]
-    assert (out / "slurm" / "jobs").read_text().split() == ["6", "5", "4", "3", "2", "1"]
+    assert (out / "slurm" / "jobs").read_text().split() == ["--clusters=nautilus", "6", "5", "4", "3", "2", "1"]
     for script in (out / "slurm").glob("*.sh"):
         subprocess.run(["sh", "-n", str(script)], check=True)
     (tmp_path / "full").touch()
     line = fails(*words, tmp_path / "other").err.splitlines()[-1]
     assert "queue is full" in line and "Queued are 8 7: end them with scancel" in line
+
+
+@pytest.fixture
+def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Writes commands into PATH: each runs a line of the shell."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
+
+    def write(**lines: str) -> None:
+        for name, line in lines.items():
+            (folder / name).write_text(f"#!/bin/sh\n{line}\n")
+            (folder / name).chmod(0o755)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("answer", "jobs"),
+    [
+        (r"71\n\n", "71"),
+        (r"71\nThank you for using this cluster, 2 nodes are down.\n", "71"),
+        (r"\033[32m71\033[0m\n", "71"),
+        (r"Welcome\r\nSubmitted batch job 71\r\n", "71"),
+        (r"Submitted batch job 71 on cluster far\n", "--clusters=far 71"),
+        (r"71;far\nM\374nchen\n", "--clusters=far 71"),
+    ],
+)
+def test_what_sbatch_says_beside_the_number(
+    tmp_path: Path, commands: Callable[..., None], answer: str, jobs: str
+) -> None:
+    """Spec G4: the job is remembered, whatever a cluster says around it; and asked for where it waits."""
+    toy, out = write_toy(tmp_path / "toy.toml"), tmp_path / "out"
+    commands(sbatch=f"printf '{answer}'", squeue="case $* in *--clusters=far*) ;; *) exit;; esac; echo 71")
+    words = ["run", toy, "--out", out, "--engine", "slurm"]
+    assert run(*words).err.startswith("job 71: collect, 1 cells\n")
+    first, *others = (out / "slurm/jobs").read_text().split()
+    assert " ".join([first, *others]).startswith(jobs)
+    assert f"{out}: 0 of 5 cells done, 5 waiting" in run("status", out).out
+    if "far" in jobs:
+        assert "in Slurm's queue" in refuses("scancel --clusters=far 71", *words, "--resume")
+
+
+@pytest.mark.parametrize("answer", ["", "Thank you", "71\n72"])
+def test_a_job_without_a_number_is_told(tmp_path: Path, commands: Callable[..., None], answer: str) -> None:
+    """Spec G2: it is queued, so nobody is told that Slurm refuses it."""
+    commands(sbatch=f"printf '{answer}'")
+    words = ["run", write_toy(tmp_path / "toy.toml"), "--out", tmp_path / "out", "--engine", "slurm"]
+    line = fails(*words).err
+    assert "sbatch does not say one number" in line and "squeue --me, end it with scancel. Then" in line
+
+
+@pytest.mark.parametrize("down", ["exit 1", "echo 'slurm_load_jobs error: Unable to contact slurm controller' >&2"])
+@pytest.mark.parametrize("given", [["--resume"], ["--force"], ["--resume", "--engine", "local"]])
+def test_a_queue_that_does_not_answer_is_not_empty(
+    tmp_path: Path, commands: Callable[..., None], down: str, given: list[str]
+) -> None:
+    """Spec G4: nothing is submitted again, or made here, while the jobs may wait."""
+    words = ["run", write_toy(tmp_path / "toy.toml"), "--out", tmp_path / "out", "--engine", "slurm"]
+    commands(sbatch="echo 71", squeue=down)
+    run(*words)
+    commands(sbatch="echo 81", squeue=down)
+    refuses("squeue does not say whether this run's jobs are done", *words, *given)
+    assert {*(tmp_path / "out/slurm/jobs").read_text().split()} == {"71"}
 
 
 def test_without_slurm_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
