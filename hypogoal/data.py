@@ -193,9 +193,9 @@ def _is_covered(data: Any) -> bool:
         for target, file, name, source in data.virtual_sources():
             path = own if file == "." else own.parent / file
             with opened(path, ANEW, "a part of the recording") as part:
-                given = np.ones(whole(part[name]).shape, np.bool_)
-                source.set_extent_simple(given.shape)
-                covered.id.write(source, target, given)
+                ones = np.ones(whole(part[name]).shape, np.bool_)
+                source.set_extent_simple(ones.shape)
+                covered.id.write(source, target, ones)
         return bool(np.all(covered))
 
 

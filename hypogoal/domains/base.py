@@ -232,9 +232,11 @@ class TurnEngine(Engine):
         return every.reshape(-1, self.width)[ids]
 
     def images(self, ids: Ints) -> Observations:
-        """See ``Engine``; ``KeyError`` if a state is unknown or forgotten."""
+        """See ``Engine``; ``ValueError`` if a state is unknown or forgotten."""
         images = np.empty((len(ids), *self.observation_shape), self.observation_dtype)
         for row, state in enumerate(ids.tolist()):
+            if state not in self._seen:
+                raise ValueError(f"state {state} is unknown, or forgotten: the engine keeps the last {self.room}")
             images[row] = self._image(self._seen[state])
         return images
 

@@ -19,6 +19,8 @@ from hypogoal.stages import load_stage
 OUTPUT = re.compile("(|.*=)@(.+)")  # in a word an output: @data, --data=@data
 MEND = "An experiment yields (name, command) or (name, command, columns), see docs/formats.md."
 
+NEEDED = ("seeds", "layout_seeds", "layouts", "truths")  # without one there would be no agent
+
 
 def plan(
     name: str,
@@ -51,6 +53,9 @@ def plan(
         return settings_of(stage, domain or DOMAIN, preset, of_stage.get(stage, {}))
 
     values = {**config.model_dump(), STAGE: settings}
+    for name in NEEDED:
+        if values.get(name) == ():
+            raise UserError("a run needs at least one", name, f"Leave {name} out for the experiment's own.")
     commands = experiment.function(**{argument: values[argument] for argument in experiment.arguments})
     cells = [*_cells_of(commands, run, partial(_with_shared, preset, device, of_stage))]
     stages = dict.fromkeys(cell.stage for cell in cells)

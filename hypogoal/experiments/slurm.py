@@ -43,7 +43,7 @@ wait "$cell"; code=$?; echo "$code" >"$log.code"; exit "$code"
 
 
 def check_free(run: Path, *, is_wanted: bool) -> None:
-    """Refuse (``UserError``) a run whose jobs wait or run, or may, and, if Slurm ``is_wanted``, a machine without it."""
+    """Refuse (``UserError``) a run whose jobs wait or run, or may; if Slurm ``is_wanted``, also no Slurm."""
     if is_wanted and shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     jobs = run / JOBS

@@ -58,6 +58,12 @@ def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembl
     for sub_goal in sub_goals:
         if sub_goal not in dataset.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{dataset.path} has {', '.join(dataset.sub_goals)}.")
+    labelled = dataset.counts()["labelled"]
+    for sub_goal in sub_goals:
+        states, positives = labelled[sub_goal]["states"], labelled[sub_goal]["positives"]
+        if positives in (0, states):
+            fault = f"{sub_goal} has no {'negatives' if positives else 'positives'} among {states} labelled states"
+            raise UserError(fault, dataset.path, "Collect others, or leave it out: --set sub_goals=...")
     return config, sub_goals
 
 

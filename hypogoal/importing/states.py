@@ -59,15 +59,15 @@ def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> lis
     ``left`` counts the others by suffix, and folders that a system keeps for itself or a link leads back to.
     """
     taken = []
-    known = {*folder.resolve().parents}
+    passed = {*folder.resolve().parents}
     for place, folders, names in os.walk(folder, followlinks=True):
         here, real = Path(place), Path(place).resolve()
         inner = here.relative_to(folder).name
-        if inner.startswith("@") or inner.lower() in ASIDE or real in known:
+        if inner.startswith("@") or inner.lower() in ASIDE or real in passed:
             left[f"folders {inner!r}"] += 1
             folders.clear()
             continue
-        known.add(real)
+        passed.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in names:
             file = here / name

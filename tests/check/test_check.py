@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from hypogoal.check import Verdict, check_domain, check_network, check_objective, require
 from hypogoal.data import Collected
 from hypogoal.diversity import OBJECTIVES as OURS
-from hypogoal.diversity import Objective, dbat, load_objective, none
+from hypogoal.diversity import Context, Objective, dbat, load_objective, none
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.hypotheses.networks import NETWORKS
@@ -383,3 +383,13 @@ def test_the_command_prints_a_line_for_each_law(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(TESTS.parent / "examples")
     run("check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide")
     refuses("nothing to check", "check")
+
+
+def test_an_objective_of_frozen_members_is_one() -> None:
+    """Members that are trained now against those that were trained before, alone."""
+
+    def against_earlier(context: Context) -> Tensor:
+        pairs = [dbat.pair_loss(frozen, member) for frozen in context.frozen for member in context.unlabelled]
+        return torch.stack(pairs).sum() if pairs else context.unlabelled.sum() * 0
+
+    require(check_objective(Objective("earlier", ensemble_loss=against_earlier)))

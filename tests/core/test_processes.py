@@ -103,7 +103,9 @@ in_processes([partial({what}), partial({what})], 2, print)
 """
 
 
-@pytest.mark.parametrize("way", ["without a guard", "on standard input", "whose file is gone", "of which code is named"])
+@pytest.mark.parametrize(
+    "way", ["without a guard", "on standard input", "whose file is gone", "of which code is named"]
+)
 def test_a_program_is_not_run_again(tmp_path: Path, way: str) -> None:
     """Each task is done once, whatever the program is; unless a name of its own is to be loaded."""
     script = tmp_path / "script.py"

@@ -13,6 +13,8 @@ from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium.engine import GymnasiumEngine
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.setup import require_memory
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 
@@ -148,6 +150,14 @@ def test_an_environment_that_does_not_repeat_itself_is_not_gone_on_with() -> Non
         other.restore(engine.snapshot())
 
 
+def test_an_engine_that_forgets_too_soon_is_refused() -> None:
+    """Before training: 40 decisions of 60 steps look further back than 300 states."""
+    config = TrainMetaConfig.of(option_timeout=60, decisions=40, replay=100, environments=1)
+    with pytest.raises(UserError, match=r"looks back over \d+ states, the engine remembers 300: option_timeout=60"):
+        require_memory(engine_of(1, memory=300), config, 2)
+    require_memory(engine_of(1, memory=10_000), config, 2)
+
+
 def test_the_engine_forgets_but_not_what_a_replay_holds() -> None:
     """Spec D2: what was met within the last ``memory`` steps has its picture, whatever id it has."""
     engine, rng = engine_of(1, memory=3), np.random.default_rng(0)
@@ -158,7 +168,7 @@ def test_the_engine_forgets_but_not_what_a_replay_holds() -> None:
         for identity, picture in met[-3:]:
             assert engine.images(np.array([identity])).tobytes() == picture
     assert engine.oldest > 0
-    with pytest.raises(KeyError):
+    with pytest.raises(ValueError, match="forgotten"):
         engine.images(np.array([0]))
     restored = engine_of(1, memory=3)
     restored.restore(engine.snapshot())

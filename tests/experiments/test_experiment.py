@@ -5,7 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import refuses, run
 
 from hypogoal.cells import Cell
 from hypogoal.core import own_code
@@ -230,3 +230,8 @@ def test_the_papers_figures_are_experiments() -> None:
     assert places == {(7, 3), (8, 5)}
     with pytest.raises(UserError, match="10 layouts cannot be paired with 2 seeds"):
         cells_of("figure6", seeds="0,1")
+
+
+@pytest.mark.parametrize("words", ["doorkey --seed=", "rooms --set truths=", "choosing --set layouts="])
+def test_a_run_without_an_agent_is_refused(words: str, tmp_path: Path) -> None:
+    refuses("a run needs at least one", "run", *words.split(), "--out", tmp_path / "out")

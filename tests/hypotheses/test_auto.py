@@ -3,9 +3,10 @@
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
-from command_line import run
+from command_line import refuses, run
 from numpy.typing import NDArray
 from PIL import Image
 from test_training import assert_same, follows, toy, toy_states
@@ -160,6 +161,19 @@ def test_the_start_stays_that_tells_most() -> None:
     for probabilities, nats in ((sure, np.log(2)), (quarter, 0.5623), (np.ones(100), 0), (np.full(100, 0.5), 0)):
         assert information_of(probabilities) == pytest.approx(nats, abs=1e-4)
     assert information_of(0.6 * sure + 0.2) == pytest.approx(np.log(2) - 0.5004, abs=1e-4)
+
+
+def test_a_sub_goal_of_one_class_is_refused_before_any_is_trained(tmp_path: Path) -> None:
+    """By its name; no other sub-goal's checkpoint makes it advise --resume."""
+    observations, labels, unlabelled = toy()
+    arrays = {"observations": observations, "unlabelled": unlabelled, "sub_goals": np.array(["one", "two"])}
+    np.savez(tmp_path / "a.npz", labels=np.stack([labels, labels], axis=1), **arrays)
+    data = tmp_path / "data.h5"
+    run("import", tmp_path / "a.npz", "--out", data, "-q")
+    with h5py.File(data, "a") as file:
+        file["labelled/two/labels"][...] = True
+    said = refuses("two has no negatives among", "train-ensemble", data, "--out", tmp_path / "out")
+    assert "--resume" not in said
 
 
 @pytest.mark.slow

@@ -82,7 +82,8 @@ def tiff(draw: Random) -> Drawn:
                 parts.append(whole if depth == 16 else np.packbits(row_bits, axis=1).tobytes())
     tags: dict[int, Any] = {
         256: [width], 257: [height], 258: [depth] * channels, 259: [1],
-        262: [0 if white else 1 if channels == 1 else 2], 277: [channels], 284: [planar], 339: [2 if signed else 1] * channels,
+        262: [0 if white else 1 if channels == 1 else 2],
+        277: [channels], 284: [planar], 339: [2 if signed else 1] * channels,
     }  # fmt: skip
     sizes = [len(part) for part in parts]
     tags |= {322: [tile], 323: [tile], 324: sizes, 325: sizes} if tile else {273: sizes, 278: [height], 279: sizes}
@@ -169,10 +170,16 @@ def test_pictures_are_as_drawn_or_refused(draw_file: Callable[[Random], Drawn], 
 
 
 FILMS = [
-    ("mp4", "mp4", "libx264", "yuv420p"), ("mkv", "matroska", "libx264", "yuv444p"), ("mov", "mov", "mpeg4", "yuv420p"),
-    ("avi", "avi", "mjpeg", "yuvj420p"), ("webm", "webm", "libvpx-vp9", "yuv420p"),
-    ("mkv", "matroska", "ffv1", "yuv420p"), ("avi", "avi", "mpeg4", "yuv420p"), ("mkv", "matroska", "ffv1", "bgr0"), ("mkv", "matroska", "ffv1", "bgra"),
-]  # fmt: skip
+    ("mp4", "mp4", "libx264", "yuv420p"),
+    ("mkv", "matroska", "libx264", "yuv444p"),
+    ("mov", "mov", "mpeg4", "yuv420p"),
+    ("avi", "avi", "mjpeg", "yuvj420p"),
+    ("webm", "webm", "libvpx-vp9", "yuv420p"),
+    ("mkv", "matroska", "ffv1", "yuv420p"),
+    ("avi", "avi", "mpeg4", "yuv420p"),
+    ("mkv", "matroska", "ffv1", "bgr0"),
+    ("mkv", "matroska", "ffv1", "bgra"),
+]
 
 
 def write_blocks(path: Path, form: str, codec: str, pixels: str, draw: Random) -> None:

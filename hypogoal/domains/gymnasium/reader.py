@@ -205,11 +205,11 @@ def recorded(space: spaces.Space[Any], values: Any, keys: Collection[str] = (), 
     Where there are no pictures, numbers are flattened into one array. Each of ``keys``, if any, is a space of its own.
     """
     is_wanted = not keys or place in keys
-    has_pictures = any(_is_picture(part) for _, part in _leaves(space))
-    found: dict[str, Any] = {}
+    has_pictures = any(_is_picture(part) for _, part in _leaves(space, place))
+    arrays: dict[str, Any] = {}
     if is_wanted and not has_pictures and not isinstance(space, spaces.Box | spaces.Text):
         numbers, texts = _split(space)
-        found[place] = _flattened(numbers, values)
+        arrays[place] = _flattened(numbers, values)
         parts = [(key, part) for key, part in _entries(space) if key in texts]
     elif isinstance(space, spaces.Dict | spaces.Tuple):
         parts = _entries(space)
@@ -217,8 +217,8 @@ def recorded(space: spaces.Space[Any], values: Any, keys: Collection[str] = (), 
         return {place: np.asarray(values)}
     for key, part in parts:
         inner = f"{place}/{key}".removeprefix("/")
-        found |= recorded(part, values[key], () if is_wanted else keys, inner)
-    return found
+        arrays |= recorded(part, values[key], () if is_wanted else keys, inner)
+    return arrays
 
 
 def _flattened(space: spaces.Space[Any], values: Any) -> Any:

@@ -1,8 +1,8 @@
 """The sub-goals on Montezuma's Revenge (Spec I4): where each holds, by the console's memory, and rooms that label it.
 
 The paper has the first, ``CLIMB_DOWN``: the agent lives and is within ``REACH`` of a ladder's base, in x and in y. The
-others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``ALL``. Where
-enemies and lasers are is in ``measured.toml``; where the authors' code differs, in docs/deviations.md.
+others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``ALL``, and its
+rooms in ``measured.toml``, where enemies and lasers are, too. Where the authors' code differs is in docs/deviations.md.
 """
 
 from collections.abc import Collection, Iterable
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Bools, Ints
+from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma.emulator import DYING, OBJECT, ROOM, SKULL, Position, X, Y
 from hypogoal.domains.montezuma.ladders import BASES, FAR, MEASURED, TOPS
 
@@ -146,3 +147,5 @@ CLIMB_DOWN = _climb("climb-down-ladder", BASES, TOPS)
 CLIMB_UP = _climb("climb-up-ladder", TOPS, BASES)
 ALL = (CLIMB_DOWN, CLIMB_UP, _pass("left"), _pass("right"), _pass_lasers())
 SUB_GOALS = {sub_goal.name: sub_goal for sub_goal in ALL}
+for _without in SUB_GOALS.keys() - ROOMS.keys():
+    raise UserError("a sub-goal lacks its rooms", _without, f"Add [rooms.{_without}] to measured.toml.")
