@@ -187,11 +187,11 @@ def _is_covered(data: Any) -> bool:
     """Whether the parts of a virtual dataset, which must be whole, leave no gap in it."""
     import h5py
 
-    own = Path(data.file.filename)
+    whole_file = Path(data.file.filename)
     with h5py.File("covered", "w", driver="core", backing_store=False) as scratch:
         covered = scratch.create_dataset("covered", data.shape, np.bool_)
         for target, file, name, source in data.virtual_sources():
-            path = own if file == "." else own.parent / file
+            path = whole_file if file == "." else whole_file.parent / file
             with opened(path, ANEW, "a part of the recording") as part:
                 ones = np.ones(whole(part[name]).shape, np.bool_)
                 source.set_extent_simple(ones.shape)

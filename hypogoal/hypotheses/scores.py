@@ -163,11 +163,11 @@ def idle_members(predictions: Bools, layouts: Ints | None = None) -> list[str]:
     """
     lines = []
     kinds = [] if layouts is None else [layouts == layout for layout in np.unique(layouts)]
-    for member, own in enumerate(predictions.T):
-        alike = [other for other in range(member) if (predictions[:, other] == own).mean() >= SAME]
-        if own.all() or not own.any():
-            lines.append(f"member {member} predicts {'positive' if own.all() else 'negative'} everywhere")
-        elif len(kinds) > 1 and all(len(np.unique(own[inside])) == 1 for inside in kinds):
+    for member, positive in enumerate(predictions.T):
+        alike = [other for other in range(member) if (predictions[:, other] == positive).mean() >= SAME]
+        if positive.all() or not positive.any():
+            lines.append(f"member {member} predicts {'positive' if positive.all() else 'negative'} everywhere")
+        elif len(kinds) > 1 and all(len(np.unique(positive[inside])) == 1 for inside in kinds):
             lines.append(f"member {member} tells layouts apart, not states")
         elif alike:
             lines.append(f"member {member} predicts what member {alike[0]} does")

@@ -61,8 +61,8 @@ def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> lis
     taken = []
     passed = {*folder.resolve().parents}
     for place, folders, names in os.walk(folder, followlinks=True):
-        here, real = Path(place), Path(place).resolve()
-        inner = here.relative_to(folder).name
+        inside, real = Path(place), Path(place).resolve()
+        inner = inside.relative_to(folder).name
         if inner.startswith("@") or inner.lower() in ASIDE or real in passed:
             left[f"folders {inner!r}"] += 1
             folders.clear()
@@ -70,7 +70,7 @@ def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> lis
         passed.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in names:
-            file = here / name
+            file = inside / name
             suffix = file.suffix.lower()
             if name.startswith("."):
                 continue
