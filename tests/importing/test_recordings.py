@@ -5,7 +5,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -164,6 +164,86 @@ def test_robomimics_file_is_read(datasets: Path, tmp_path: Path) -> None:
     assert "not read: 1 episodes without frames, 6 times 'task', neither pictures nor numbers" in said
     held = open_dataset(tmp_path / "m.h5").heldout("reached").observations
     assert held.dtype.names == ("arm.speed", "robot0_eef_pos") and len(held) == LENGTHS[1] + LENGTHS[4]
+
+
+def small_robomimic(path: Path, change: Callable[[h5py.File], object]) -> Path:
+    """Six demonstrations of five frames, whose first number is theirs, rewarded in the last two; then changed."""
+    with h5py.File(path, "w") as file:
+        for demo in range(6):
+            file[f"data/demo_{demo}/obs/state"] = np.stack([np.full(5, demo), np.arange(5)], 1)
+            file[f"data/demo_{demo}/rewards"] = np.arange(5) > 2
+        change(file)
+    return path
+
+
+def filtered(file: h5py.File) -> None:
+    """Values behind a filter, blosc, that HDF5 does not have."""
+    kind = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    kind.set_chunk((5, 1))
+    kind.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)
+    space = h5py.h5s.create_simple((5, 1))
+    data = h5py.h5d.create(file["data/demo_0/obs"].id, b"far", h5py.h5t.NATIVE_DOUBLE, space, kind)
+    data.write_direct_chunk((0, 0), b"0" * 40)
+
+
+def put(name: str, values: Any) -> Callable[[h5py.File], object]:
+    def change(file: h5py.File) -> None:
+        if name in file:
+            del file[name]
+        file[name] = values
+
+    return change
+
+
+CHANGES: list[tuple[Callable[[h5py.File], object], str, str]] = [
+    (put("mask/valid", [b"demo_50", b"demo_1"]), "", "mask/valid names no demonstrations"),
+    (put("mask/valid", np.array([], "S3")), "", "mask/valid names no demonstrations"),
+    (put("mask/valid", h5py.SoftLink("/nowhere")), "", "the recording cannot be read (KeyError"),
+    (
+        put("data/demo_0/obs/fps", 20),
+        "state",
+        "not all of these have an entry for each frame: demo_0: {'fps': (), 'state",
+    ),
+    (put("data/demo_0/obs/lens", np.eye(3)), "state", "demo_0: {'lens': (3, 3), 'state': (5, 2)}"),
+    (put("data/demo_0/obs/link", h5py.SoftLink("/nowhere")), "state", "demo_0: {'link': None, 'state'"),
+    (put("data/demo_0/obs/index", np.arange(99)), "state", "demo_0: {'index': (99,), 'state'"),
+    (
+        put("data/demo_0/rewards", np.ones(4)),
+        "",
+        "a number for each frame: rewards, not in demo_0[4]. There are rewards",
+    ),
+    (put("data/demo_0/rewards", np.ones(9)), "", "a number for each frame: rewards, not in demo_0[0]"),
+    (put("data/demo_0/rewards", np.ones(1)), "", "a number for each frame: rewards, not in demo_0[1]"),
+    (filtered, "", "this is compressed by a filter of HDF5 that is not installed"),
+]
+
+
+@pytest.mark.parametrize(("change", "key", "said"), CHANGES)
+def test_what_a_demonstration_lacks_is_named(
+    tmp_path: Path, change: Callable[[h5py.File], object], key: str, said: str
+) -> None:
+    """Spec G2: masks of others, what has no entry for each frame, filters; another key can be read."""
+    source, label = small_robomimic(tmp_path / "x.hdf5", change), ["--label", "on=rewards"]
+    refuses(said, "import", source, "--out", tmp_path / "data.h5", *label)
+    if key:
+        assert len(frames_of(imported(source, tmp_path / "data.h5", *label, "--key", key), "on")) == 30
+
+
+def test_padded_names_are_held_out_and_unknown_success_is_unlabelled(tmp_path: Path) -> None:
+    """``last:2`` of an episode of which nothing says whether it succeeds are not negative."""
+
+    def change(file: h5py.File) -> None:
+        file["mask/valid"] = np.array([b"demo_0  ", b"demo_5\0"])
+        file["data/demo_1/success"] = np.ones(9)
+        for demo in (0, 2, 3, 4, 5):
+            file[f"data/demo_{demo}/success"] = np.array([demo % 2])
+
+    source = small_robomimic(tmp_path / "x.hdf5", change)
+    data = imported(source, tmp_path / "data.h5", "--label", "on=last:2")
+    assert {state[0] for state in data.heldout("on").observations} == {0, 5}
+    for state, label in frames_of(data, "on"):
+        assert label in (None, state[0] % 2 == 1 and state[1] > 2)
+        assert label is None or state[0] != 1
 
 
 def test_minari_is_read(tmp_path: Path) -> None:

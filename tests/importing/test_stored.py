@@ -4,6 +4,7 @@ The second reader knows what was drawn (HDF5), reads the marks in each frame (Le
 environment's reader does (Minari).
 """
 
+import json
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from fractions import Fraction
@@ -193,7 +194,10 @@ def write_lerobot(folder: Path, draw: Draw) -> None:
     lengths = draw.integers(5, 20, DEMOS)
     order = draw.permutation(DEMOS)
     begins: dict[int, tuple[int, float, float]] = {}
-    for file, episodes in enumerate(np.array_split(order, draw.integers(1, 3))):
+    version = ("v2.1", "v3.0", "v3.0")[draw.integers(3)]
+    facts = robot_data.facts(version, "video") | {"fps": rate}
+    groups = np.array_split(order, draw.integers(1, 3))
+    for file, episodes in enumerate(groups if version == "v3.0" else np.arange(DEMOS)[:, None]):
         frames: list[np.ndarray] = []
         speed = 2 if fault == "twice the rate" else 1
         for episode in episodes:
@@ -203,7 +207,9 @@ def write_lerobot(folder: Path, draw: Draw) -> None:
             end = begin + (lengths[episode] if harm == "short and unsaid" else count) / rate
             frames += [marked(int(episode), frame // speed) for frame in range(count * speed)]
             begins[int(episode)] = (file, begin - (3 / rate if harm == "begins early" else 0), end)
-        write_marked(folder / f"videos/observation.eye/chunk-000/file-{file:03d}.mp4", frames, exact * speed, draw)
+        numbers = {"chunk_index": 0, "file_index": file, "episode_chunk": 0, "episode_index": file}
+        film = facts["video_path"].format(video_key="observation.eye", **numbers)
+        write_marked(folder / film, frames, exact * speed, draw)
     tables, rows = [], []
     for episode, length in enumerate(lengths):
         frame = np.arange(length)
@@ -212,23 +218,31 @@ def write_lerobot(folder: Path, draw: Draw) -> None:
         if fault == "row lost" and episode == faulty:
             frame = np.delete(frame, 2)
         where = np.stack([np.full(len(frame), episode), frame], 1).astype(np.float32)
-        table = {
+        columns = {
             "episode_index": np.full(len(frame), episode), "timestamp": (frame / rate).astype(np.float32),
             "frame_index": frame, "next.success": frame > length - 3, "observation.tag": where.tolist(),
         }  # fmt: skip
-        tables.append(pa.table(table))
+        tables.append(pa.table(columns))
         file, begin, end = begins[episode]
-        row = {"episode_index": episode, "length": len(frame), "data/chunk_index": 0, "data/file_index": 0}
-        names = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-        row |= zip([f"videos/observation.eye/{name}" for name in names], (0, file, begin, end), strict=True)
+        row: dict[str, Any] = {"episode_index": episode, "length": len(frame)}
+        if version == "v3.0":
+            names = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+            row |= zip([f"videos/observation.eye/{name}" for name in names], (0, file, begin, end), strict=True)
+            row |= {"data/chunk_index": 0, "data/file_index": 0}
         rows.append(row)
-    for part, table in (("data", pa.concat_tables(tables)), ("meta/episodes", pa.Table.from_pylist(rows))):
-        (folder / part / "chunk-000").mkdir(parents=True)
-        pq.write_table(table, folder / part / "chunk-000/file-000.parquet")
-    facts = robot_data.facts("v3.0", "video") | {"fps": rate}
+    (folder / "meta/episodes/chunk-000").mkdir(parents=True)
+    (folder / "data/chunk-000").mkdir(parents=True)
+    if version == "v3.0":
+        pq.write_table(pa.Table.from_pylist(rows), folder / "meta/episodes/chunk-000/file-000.parquet")
+        pq.write_table(pa.concat_tables(tables), folder / "data/chunk-000/file-000.parquet")
+    else:
+        lines = [json.dumps(row) for row in rows]
+        (folder / "meta/episodes.jsonl").write_text("\n".join(lines))
+        for episode, table in enumerate(tables):
+            pq.write_table(table, folder / f"data/chunk-000/episode_{episode:06d}.parquet")
     kinds = {"observation.eye": "video", "observation.tag": "float32", "next.success": "bool"}
     facts["features"] = {key: {"dtype": kind} for key, kind in kinds.items()}
-    (folder / "meta/info.json").write_text(robot_data.json.dumps(facts))
+    (folder / "meta/info.json").write_text(json.dumps(facts))
 
 
 def check_lerobot(folder: Path, draw: Draw) -> str:
@@ -321,5 +335,4 @@ def test_each_is_stored_as_it_is_or_refused(tmp_path: Path, check: Callable[[Pat
         folder = tmp_path / str(seed)
         folder.mkdir()
         outcomes[check(folder, np.random.default_rng(seed))] += 1
-    print(dict(outcomes))
     assert outcomes["equal"] > count / 4, outcomes
