@@ -115,6 +115,29 @@ def test_damaged_files(tmp_path: Path, case: str) -> None:
     assert words in fails("verify", path).out
 
 
+def test_what_hdf5_would_fill_up_is_refused(tmp_path: Path) -> None:
+    """Spec G2: a chunk that was never written, a part that is gone; whole parts are read."""
+    path = write(tmp_path / "data.h5")
+    before = open_dataset(path).unlabelled()
+    for name, change in {"whole": None, "gone": "unlink", "unwritten": "chunk"}.items():
+        own, part = tmp_path / f"{name}.h5", tmp_path / f"{name}-part.h5"
+        own.write_bytes(path.read_bytes())
+        with h5py.File(own, "r+") as file, h5py.File(part, "w") as other:
+            stored = other.create_dataset("x", before.shape, before.dtype, chunks=(2, *before.shape[1:]))
+            stored[: 2 if change == "chunk" else None] = before[: 2 if change == "chunk" else None]
+            layout = h5py.VirtualLayout(before.shape, before.dtype)
+            layout[:] = h5py.VirtualSource(part.name, "x", before.shape)
+            del file["unlabelled/observations"]
+            file.create_virtual_dataset("unlabelled/observations", layout)
+        if change == "unlink":
+            part.unlink()
+        if change:
+            with pytest.raises(UserError, match="no such file" if change == "unlink" else "lacks values"):
+                open_dataset(own).unlabelled()
+        else:
+            np.testing.assert_array_equal(open_dataset(own).unlabelled(), before)
+
+
 def test_a_crashed_programs_file_names_h5clear(tmp_path: Path) -> None:
     """Its data are whole: the HDF5 tools take the mark away that it is open for writing."""
     path = tmp_path / "crashed.h5"

@@ -152,14 +152,15 @@ def frames_in(
 
     With a ``rate`` in frames a second, a frame's number is its time from ``begin`` on, in seconds, times the rate.
     """
-    missing = set(rows.tolist())
+    wanted = set(rows.tolist())
+    missing = wanted.copy()
     with _opened(path) as (container, stream):
         if rate:
             first = begin + rows[0] / rate
             container.seek(int(first / stream.time_base), stream=stream)  # to the key frame before
         for count, frame in enumerate(container.decode(stream)):
             number = round((frame.time - begin) * rate) if rate else count
-            if number in rows and number not in missing:
+            if number in wanted and number not in missing:
                 raise ValueError(f"two frames are number {number} by their times")
             if number in missing:
                 missing.remove(number)

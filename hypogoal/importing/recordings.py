@@ -181,14 +181,12 @@ def _listed(source: Path) -> pd.DataFrame:
 
 
 def _cut_ends(listed: pd.DataFrame, head: str) -> None:
-    """Add when each episode ends in its film: where the next one begins at the latest."""
+    """Have each episode end in its film where the next one begins, at the latest."""
     begin, end = f"{head}/from_timestamp", f"{head}/to_timestamp"
     if begin in listed:
-        in_order = listed.sort_values(begin)
-        films = in_order.groupby([f"{head}/chunk_index", f"{head}/file_index"])
-        following = films[begin].shift(-1).astype(np.float64)
-        ends = [following, listed.get(end, following)]
-        listed[end] = pd.concat(ends, axis=1).astype(np.float64).min(axis=1).fillna(np.inf)
+        films = listed.sort_values(begin).groupby([f"{head}/chunk_index", f"{head}/file_index"])
+        following = films[begin].shift(-1).astype(np.float64).fillna(np.inf)
+        listed[end] = np.minimum(following, listed.get(end, np.inf))
 
 
 def _facts(row: Mapping[Any, Any], head: str) -> dict[Any, Any]:
