@@ -26,7 +26,7 @@ INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
 OWNER = "episode_index"  # a column of every table
 HDF5 = (".h5", ".hdf5")
 DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it; arrays as .npz."
-KEYS = "Choose those that have one by --key."
+KEYS = "Choose those that have one by --key; () is a single value, None a broken link."
 MASK = "Give names of data/*, or take the mask out: del file['mask/valid']."
 TABLE = ".csv"  # labels of films, beside them
 
