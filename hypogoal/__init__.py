@@ -8,7 +8,7 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
-__version__ = "1.0.3"
+__version__ = "1.1.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import compare, load_ensemble, load_options

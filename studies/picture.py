@@ -17,6 +17,7 @@ from studies.cells import read_rows
 
 RESULTS = Path("docs/results")
 INK, PALE, GREY = "#0b5394", "#9fc5e8", "#8a8a8a"
+IN_ROOMS = {"auto": ("D-BAT", INK), "no diversity": ("no diversity", PALE), "one classifier": ("of one", PALE)}
 
 
 def solved(name: str, chooser: str = "agent", **wanted: str) -> list[float]:
@@ -45,19 +46,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("out", type=Path, help="a .png file")
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.5), sharey=True, layout="constrained")
-    settings = [f"rooms{which}.csv" for which in ("-first", "-second", "")]
-    rooms = {
-        method: [value for name in settings for value in solved(name, method=f"{method}-truth-shape")]
-        for method in ("dbat", "none", "one")
-    }
-    draw(
-        left,
-        [
-            ("ensemble,\nD-BAT", rooms["dbat"], INK),
-            ("ensemble,\nno diversity", rooms["none"], PALE),
-            ("one\nclassifier", rooms["one"], PALE),
-        ],
-    )
+    rows = read_rows(RESULTS / "weight.csv")
+    rooms = {name: [float(row["solved_shape"]) for row in rows if row["method"] == name] for name in IN_ROOMS}
+    draw(left, [(f"ensemble,\n{title}", rooms[name], colour) for name, (title, colour) in IN_ROOMS.items()])
     left.axhline(0.2, color=GREY, lw=1, ls="--")
     left.annotate("guessing", (-0.45, 0.215), fontsize=8, color="#5a5a5a")
     left.set_title(

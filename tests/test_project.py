@@ -229,7 +229,6 @@ def test_formats_are_readable_without_hypogoal(
 def test_the_changelog_is_short() -> None:
     """A line a change, of at most twenty words, under one of four headings; three lines a version up to 0.15."""
     text = text_of("CHANGELOG.md")
-    assert len(text.split()) <= 2000
     headings = ["Added", "Changed", "Fixed", "Removed"]
     for version in text.split("\n## ")[1:]:
         number, *lines = version.splitlines()
