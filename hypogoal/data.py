@@ -187,15 +187,15 @@ def _is_covered(data: Any) -> bool:
     """Whether the parts of a virtual dataset, which must be whole, leave no gap in it."""
     import h5py
 
-    main = Path(data.file.filename)
+    whole_file = Path(data.file.filename)
     with h5py.File("covered", "w", driver="core", backing_store=False) as scratch:
         covered = scratch.create_dataset("covered", data.shape, np.bool_)
         for target, file, name, source in data.virtual_sources():
-            path = main if file == "." else main.parent / file
+            path = whole_file if file == "." else whole_file.parent / file
             with opened(path, ANEW, "a part of the recording") as part:
-                everywhere = np.ones(whole(part[name]).shape, np.bool_)
-                source.set_extent_simple(everywhere.shape)
-                covered.id.write(source, target, everywhere)
+                ones = np.ones(whole(part[name]).shape, np.bool_)
+                source.set_extent_simple(ones.shape)
+                covered.id.write(source, target, ones)
         return bool(np.all(covered))
 
 
@@ -217,7 +217,7 @@ def write_dataset(
 ) -> None:
     """Write collected states; a file of that name is replaced once the new one is complete.
 
-    Raises ``UserError`` if a name cannot be a file name or labels are not truth values.
+    Raises ``UserError`` if a name cannot be a file name, labels are not truth values or numbers not finite.
     """
     require_names(collected.sub_goals)
     attributes: dict[str, Any] = {
@@ -262,6 +262,10 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
 
 
 def _write_states(group: Any, states: States) -> None:
+    finite = np.isfinite(numbers_of(states.observations)).all(axis=1)
+    if not finite.all():
+        fault = "the domain's observations have numbers that are not finite"
+        raise UserError(fault, f"{group.name}, state {finite.argmin()}", "Clip or replace them.")
     _store(group, "observations", states.observations)
     for name, values in states.origins.items():
         _store(group, f"origin/{name}", values)

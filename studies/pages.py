@@ -24,6 +24,7 @@ from studies import (
     ladder_stops,
     ladders,
     one_room,
+    weight,
 )
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -42,6 +43,7 @@ TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "options-that-hold": one_room.tables,
     "preference-doorkey": choosing.tables,
     "rooms": choosing.rooms,
+    "weight": weight.tables,
 }
 MARKED = re.compile(r"<!-- ([\w-]+) (\d+) -->\n(?:\|.*\n)*")
 

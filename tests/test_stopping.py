@@ -45,7 +45,14 @@ def last_checkpoint(out: Path) -> int:
 def test_ctrl_c_and_sigterm_say_how_to_continue(tmp_path: Path) -> None:
     """One line and 128 + the signal; then neither flag, or another seed, is refused in one line."""
     data, out = write(tmp_path / "data.h5"), tmp_path / "ensemble"
-    words = ["train-ensemble", str(data), "--out", str(out), "-q", *settings("steps=1000000", "workers=1")]
+    words = [
+        "train-ensemble",
+        str(data),
+        "--out",
+        str(out),
+        "-q",
+        *settings("steps=1000000", "workers=1", "sub_goals=one"),
+    ]
     for number, resume in ((signal.SIGINT, []), (signal.SIGTERM, ["--resume"])):
         before = last_checkpoint(out)
         command = [sys.executable, "-m", "hypogoal", *words, *resume]
@@ -63,14 +70,18 @@ def test_ctrl_c_and_sigterm_say_how_to_continue(tmp_path: Path) -> None:
     assert "begun with seed=0, not 1" in fails(*words, "--resume", "--seed", "1").err
 
 
-SLEEPERS = """
-import functools, os, pathlib, sys, time
-from hypogoal.core.processes import in_processes
+SLEEPING = """
+import os, time
 
 def sleep(folder, number):
     (folder / f"{number}.new").write_text(str(os.getpid()))
     (folder / f"{number}.new").rename(folder / f"{number}.pid")
     time.sleep(600)
+"""
+SLEEPERS = """
+import functools, pathlib, sys
+from sleeping import sleep
+from hypogoal.core.processes import in_processes
 
 if __name__ == "__main__":
     in_processes([functools.partial(sleep, pathlib.Path(sys.argv[1]), number) for number in range(2)], 2, print)
@@ -79,9 +90,11 @@ if __name__ == "__main__":
 
 def test_a_stage_dies_with_all_its_processes(tmp_path: Path) -> None:
     """No orphan writes beside its successor."""
+    (tmp_path / "sleeping.py").write_text(SLEEPING)
     (tmp_path / "script.py").write_text(SLEEPERS)
     command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path)]
-    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True) as parent:
+    path = os.pathsep.join([str(ROOT), str(tmp_path)])
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, text=True) as parent:
         wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2, parent)
         parent.kill()
     until = time.monotonic() + WAIT_SECONDS

@@ -61,7 +61,7 @@ def test_a_file_cannot_have_code_loaded(folder: Path, named: str, words: str) ->
 IN_MANIFESTS = [
     *(("ensemble", name, "ensemble") for name in ("network", "view")),
     *(("ensemble", "domain", command) for command in ("train-options {run}/ensemble", "train-meta {run}/ensemble")),
-    *(("meta", name, "options") for name in ("network", "chooser", "termination")),
+    *(("meta", name, "options") for name in ("network", "termination")),
     *(("meta", "domain", command) for command in ("evaluate {run}", "export {run}/meta --episodes 1")),
     ("ensemble", "network", "audit {run}/ensemble --domain doorkey --sub-goal open-red-door"),
     ("ensemble", "network", "export {run}/ensemble"),

@@ -43,7 +43,7 @@ def finite(objective: Objective) -> None:
 def gradients(objective: Objective) -> None:
     """Every member gets one, of the others or of members that were trained before."""
     least = 0.0
-    for frozen in (0, 2):
+    for frozen in (0, 2) if objective.ensemble_loss else (0,):
         _, gradient = _derived(objective, 3, 7, frozen, 1.0)
         least = max(least, gradient.abs().amax(dim=(1, 2)).min().item())
     fault = f"a member gets a gradient of {least:.1g}"

@@ -79,7 +79,7 @@ def test_a_stage_says_what_it_came_to_and_what_is_next(tiny_run: Path, tmp_path:
     folder = tmp_path / "run"
     train = ["train-ensemble", tiny_run / "data.h5", "--out", folder / "ensemble", "--steps", "2"]
     train += ["--set", "workers=1", "--set", "sub_goals=collect-blue-key"]
-    result, then, path = run(*train).out.splitlines()
+    *_, result, then, path = run(*train).out.splitlines()
     assert re.fullmatch(r"held-out balanced accuracy: best member [\d.]+, mean [\d.]+, worst [\d.]+", result)
     assert then == f"next: hypogoal train-options {folder}/ensemble --out {folder}/options"
     assert path == str(folder / "ensemble")

@@ -269,7 +269,7 @@ def test_a_disk_without_locks_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
     def refuse(*_: object) -> None:
         raise OSError(code, os.strerror(code))
 
-    with pytest.raises(ValueError, match=r"^$"):
+    with pytest.raises(ValueError, match="the last checkpoint is kept"):
         stop(tmp_path / "begun", ValueError())
     before = contents(tmp_path)
     monkeypatch.setattr("fcntl.flock", refuse)

@@ -104,10 +104,11 @@ def test_states_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
     data, other = toy_data.write(tmp_path / "data.h5"), tmp_path / "other.h5"
     toy_data.write(other, domain="another")
+    chosen = "sub_goals=one"  # the other has no negatives
     (tmp_path / "empty").mkdir()
     for wrong, words in (
         (other, "the domain is another"), (tmp_path / "empty", "no artefact here"), (tmp_path / "no.h5", "no such"),
     ):  # fmt: skip
         command = ["train-ensemble", str(data), "--unlabelled", str(wrong), "--out", str(tmp_path / "out"), "-q"]
-        refuses(words, *command)
+        refuses(words, *command, "--set", chosen)
     assert not (tmp_path / "out").exists()
