@@ -194,7 +194,7 @@ DOOR = "--domain doorkey --sub-goal go-to-goal"
         (f"{__name__}:nothing {DOOR}", "the classifier cannot be loaded"),
         (f"{__name__}:BLUE_FIRST {DOOR}", "this is not a function"),
         (f"left_end {DOOR}", "no such artefact"),
-        (f"{__name__}:of_no_shape {DOOR}", "gave ("),
+        (f"{__name__}:of_no_shape {DOOR}", "gave ndarray (1, 2)"),
         (f"{__name__}:no_probability {DOOR}", "Give probabilities, 0 to 1,"),
         (f"{__name__}:left_end {DOOR} --set mend=0.4", "mend must be above the threshold 0.5"),
         (f"{__name__}:left_end {DOOR} --set termination=oracle", "an audit takes one classifier only"),
