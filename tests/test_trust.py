@@ -65,8 +65,6 @@ IN_MANIFESTS = [
     *(("meta", "domain", command) for command in ("evaluate {run}", "export {run}/meta --episodes 1")),
     ("ensemble", "network", "audit {run}/ensemble --domain doorkey --sub-goal open-red-door"),
     ("ensemble", "network", "export {run}/ensemble"),
-    ("options", "chooser", "train-meta {run}/ensemble --options {run}/options"),
-    ("options", "domain", "train-options {run}/ensemble --options {run}/options"),
 ]
 
 
