@@ -58,7 +58,11 @@ def picture_of(data: bytes, where: Path) -> Array:
     are taken. A ``UserError``: transparent pixels, 16 bits whose upper ones are unused, other depths, no picture.
     """
     quiet = warnings.catch_warnings(action="ignore")
-    with reading(where, SCALE), quiet, PIL.Image.open(io.BytesIO(data), formats=FORMATS) as opened:
+    with reading(where, SCALE), quiet:
+        try:
+            opened = PIL.Image.open(io.BytesIO(data), formats=FORMATS)
+        except PIL.UnidentifiedImageError:
+            raise ValueError(f"it is none of {', '.join(FORMATS)}, or of a kind that Pillow does not read") from None
         is_deep = any(DEEP.search(str(tile.args)) for tile in opened.tile)
         if isinstance(opened, TiffImageFile):
             tags = opened.tag_v2

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import AGAIN, reading
+from hypogoal.core.files import reading
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.observations import NUMBERS, PICTURE, spread_rows
 
@@ -147,8 +147,7 @@ def frames_of(
                     if stacked:
                         channels[key] = stacked
     if not seen:
-        do = HERE.format(", ".join(left)) if left else AGAIN
-        raise UserError("there are no pictures or numbers", source, do)
+        raise UserError("there are no pictures or numbers", source, HERE.format(", ".join(left) or "no files"))
     table = pd.concat(tables, ignore_index=True)
     return Frames(table, pd.concat(columns, ignore_index=True), seen, channels)
 

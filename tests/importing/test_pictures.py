@@ -23,7 +23,7 @@ def test_what_is_no_picture_of_a_state_is_one_line(tmp_path: Path) -> None:
     Image.new("P", (SIDE, SIDE), 1).save(palette, "GIF", transparency=1)
     for data, said in (
         (stored(np.zeros((SIDE, 20, 3), np.uint8)), "states differ in size or type: positive/zz.png[0] is (48, 20, 3)"),
-        (b"no image", "this cannot be read"),
+        (b"no image", "it is none of PNG, JPEG,"),
         (stored(pictures(1)[0][0])[:200], "this cannot be read"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n", "this cannot be read"),
         (palette.getvalue(), "it is transparent in places"),
