@@ -41,8 +41,8 @@ class Context:
         labelled: float (K, B, 2), logits of labelled states.
         unlabelled: float (K, N, 2), logits of unlabelled states.
         frozen: float (F, N, 2), logits of members trained earlier (schedule=sequential), which get no gradient.
-        positives: the share of positives to expect among unlabelled states, strictly between 0 and 1; by default that
-            of all labelled states, not only this batch's.
+        positives: the share of positives to expect among unlabelled states, strictly between 0 and 1: the setting
+            ``share``, which may be that of all labelled states, not only this batch's.
     """
 
     labels: Tensor

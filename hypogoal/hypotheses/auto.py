@@ -35,7 +35,7 @@ from hypogoal.hypotheses.config import AUTO, LABELS, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.fit import Losses
 from hypogoal.hypotheses.scores import mean_disagreement, member_scores
-from hypogoal.hypotheses.training import EnsembleTraining
+from hypogoal.hypotheses.training import EnsembleTraining, require_unlabelled
 from hypogoal.hypotheses.views import StateOrigins
 from hypogoal.observations import Observations
 
@@ -156,6 +156,8 @@ class AutoTraining:
         self.now: EnsembleTraining | None = None
         self.is_last = False
         acts = load_objective(config.diversity).acts(config.members) and config.diversity_weight != 0
+        if acts:
+            require_unlabelled(unlabelled)
         self.searches = acts and config.diversity_weight == AUTO
         self.weight = config.diversity_weight if config.diversity_weight != AUTO else 0.0
         self.share = config.share if config.share != AUTO else LABELS
@@ -222,6 +224,7 @@ class AutoTraining:
         for fold in self.folds:
             begin = self._begin(~fold, fold) if self.begins_alone else self._train(~fold, self.seed, held=fold)
             without.append((yield from begin))
+            self._take_share(without[-1])
         if not without:
             return WEIGHTS[-1]
         labels = np.concatenate([self.labels[fold] for fold in self.folds])
@@ -258,9 +261,13 @@ class AutoTraining:
             if candidate is not best:
                 candidate["training"] = None  # it may be large
         outcome = yield from self._train(rows, best["seed"], members=1, held=held, begun=best["training"])
-        if self.config.share == AUTO:
-            self.share = outcome["positive"]
+        self._take_share(outcome)
         return outcome
+
+    def _take_share(self, without: State) -> None:
+        """Expect so many positives among unlabelled states as a member without diversity predicts."""
+        if self.config.share == AUTO:
+            self.share = without["positive"]
 
     def _train(
         self,

@@ -115,14 +115,14 @@ class TrainEnsembleConfig(MembersConfig):
     restarts: int = setting(
         4,
         "first members of a sequential ensemble that begin; the one stays that tells most about unlabelled states",
-        source=f"{BEYOND}: docs/results/hypotheses.md",
+        source=f"{BEYOND}: docs/results/rooms.md",
         low=1,
         high=64,
     )
     share: float | Literal["auto", "labels"] = setting(
         AUTO,
         "share of positives that divdis expects among unlabelled states; auto: what a member without diversity "
-        "predicts; labels: that of the labelled states",
+        "predicts, if the weight is auto or the schedule sequential; labels: that of the labelled states",
         source=f"labels: DivDis (arXiv:2202.03418); auto: {BEYOND}",
         low=0.0,
         high=1.0,

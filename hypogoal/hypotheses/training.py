@@ -29,6 +29,13 @@ from hypogoal.observations import Observations
 CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
 
 
+def require_unlabelled(unlabelled: Observations) -> None:
+    """Refuse (``UserError``) to make members differ where there are no unlabelled states."""
+    if not len(unlabelled):
+        do = "Give some, or set diversity=none, threshold=0.5 and no teacher."
+        raise UserError("unlabelled states are needed to make members differ", None, do)
+
+
 class EnsembleTraining(Resumable):
     """One sub-goal's members in training: all at once, or one after the other (``schedule=sequential``).
 
@@ -68,12 +75,8 @@ class EnsembleTraining(Resumable):
         first: Mapping[str, Any] | None = None,
         saved: Mapping[str, Any] | None = None,
     ):
-        if not len(unlabelled) and (objective_of(config) or config.teacher or config.threshold == SPLIT):
-            raise UserError(
-                "unlabelled states are needed to make members differ",
-                None,
-                "Give some, or set diversity=none, threshold=0.5 and no teacher.",
-            )
+        if objective_of(config) or config.teacher or config.threshold == SPLIT:
+            require_unlabelled(unlabelled)
         origins = origins or views.StateOrigins()
         self.config, self.seed = config, seed
         self.observations, self.labels, self.unlabelled = observations, labels, unlabelled

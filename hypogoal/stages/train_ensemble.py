@@ -94,6 +94,8 @@ def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
         differs = "-" if tried["disagreement"] is None else f"{tried['disagreement']:.2f}"
         remark = "  chosen" if tried["kept"] else "  a member is constant" if tried["constant"] else ""
         yield f"  {tried['weight']:<6g}  {tried['accuracy']:<32.3f}  {differs}{remark}"
+    if chosen["tried"] and not chosen["tried"][-1]["kept"]:
+        yield "  members keep the labels with none of these weights, so the smallest is taken"
     if chosen["remark"]:
         yield f"{sub_goal}: {chosen['remark']}"
     for text in chosen["idle"]:
