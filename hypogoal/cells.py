@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field, TypeAdapter
 
 from hypogoal.core.artefacts import Draft
+from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.files import reading
 
 PLAN = "sweep.json"
@@ -93,9 +94,10 @@ class Cell(BaseModel):
 
     @property
     def last_words(self) -> str:
-        """The last line of its log, or the signal that ended it; and where the log is."""
+        """The last line of its log, or the signal that ended it; and where the log is. Its advice is that of a run."""
         code = self.last_line("code")
         text = f"ended by signal {code[1:]}" if code.startswith("-") else self.last_line()
+        text = text.replace(ANEW, f"Give --from {self.stage} and no --resume to make that stage anew.")
         return f"{text.removeprefix('hypogoal: ')} ({self.log()})"
 
 

@@ -11,6 +11,9 @@ import pytest
 from hypogoal.cli import main
 from hypogoal.core import own_code
 
+# Settings with which nothing is chosen, so that training costs a fourth.
+FIXED = ("diversity_weight=1e-4", "restarts=1")
+
 
 class Printed(NamedTuple):
     """What a command printed."""

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run, settings
+from command_line import FIXED, run, settings
 from filelock import FileLock
 
 from tests import mixed
 
+FEW_STEPS = " ".join(settings("members=2", "steps=10", "workers=1", *FIXED))
 FEW = "--set members=2 --set workers=1 --set steps=20"
 GOALS = "--set sub_goals=collect-red-key,open-red-door"
 DOORKEY = "--set max_episode_steps=64 --set layout_seed=100"
@@ -36,7 +37,7 @@ DOORKEY_RUN = {
 }
 CORRIDOR_RUN = {
     "data.h5": "collect own_domain:DOMAIN --set copies=9",
-    "ensemble": "train-ensemble {run}/data.h5 --set members=2 --set steps=10 --set workers=1",
+    "ensemble": f"train-ensemble {{run}}/data.h5 {FEW_STEPS}",
     "options": f"train-options {{run}}/ensemble {SHORT}",
     "options-more": f"train-options {{run}}/ensemble {SHORT} {VISITED}",
     "meta": f"train-meta {{run}}/ensemble {SHORT}",
@@ -68,7 +69,7 @@ def make_mixed(folder: Path) -> None:
     """States that somebody recorded, in which a door is open or not, and what is made of them."""
     np.savez(folder / "states.npz", **mixed.arrays())
     run("import", folder / "states.npz", "--out", folder / "data.h5", "--sub-goal", mixed.GOAL, "-q")
-    few = settings("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3")
+    few = settings("steps=60", "members=2", "batch_size=12", "learning_rate=1e-3", *FIXED)
     run("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "-q", *few)
     run("audit", folder / "ensemble", "--out", folder / "audit")
 

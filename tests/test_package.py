@@ -21,7 +21,7 @@ def checkout(tmp_path: Path) -> Path:
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
         pytest.skip("no checkout of git")
-    copy = tmp_path / "checkout"
+    copy = tmp_path / "hypogoal"
     for name in listed.stdout.strip("\0").split("\0"):
         if (ROOT / name).is_file():
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
@@ -30,9 +30,12 @@ def checkout(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+@pytest.mark.parametrize("kind", ["wheel", "sdist", "editable"])
 def test_it_installs_elsewhere_and_runs_the_demos_first_stage(kind: str, checkout: Path, tmp_path: Path) -> None:
-    """Dependencies are those of this environment; hypogoal is not in it but by a link, which a path does not carry."""
+    """Dependencies are those of this environment; hypogoal is not in it but by a link, which a path does not carry.
+
+    Python runs beside the checkout, whose folder has the package's name.
+    """
     pytest.importorskip("setuptools", minversion="77")
 
     def called(*words: object) -> str:
@@ -42,17 +45,19 @@ def test_it_installs_elsewhere_and_runs_the_demos_first_stage(kind: str, checkou
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    built = tmp_path / "dist"
-    subprocess.run([sys.executable, "-c", BUILD, kind, str(built)], cwd=checkout, capture_output=True, check=True)
-    (package,) = built.iterdir()
+    package = ["-e", checkout]
+    if kind != "editable":
+        built = tmp_path / "dist"
+        subprocess.run([sys.executable, "-c", BUILD, kind, str(built)], cwd=checkout, capture_output=True, check=True)
+        package = [*built.iterdir()]
     elsewhere = tmp_path / "environment"
     venv.create(elsewhere)
     (site,) = elsewhere.glob("lib/python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
     python = elsewhere / "bin" / "python"
     offline = ("--no-deps", "--no-index", "--no-build-isolation", "--quiet")
-    called(sys.executable, "-m", "pip", "--python", python, "install", *offline, package)
-    assert Path(called(python, "-c", WHERE).strip()).is_relative_to(elsewhere)
+    called(sys.executable, "-m", "pip", "--python", python, "install", *offline, *package)
+    assert Path(called(python, "-c", WHERE).strip()).is_relative_to(checkout if kind == "editable" else elsewhere)
     data = tmp_path / "data.h5"
     few = ("--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1")
     called(elsewhere / "bin" / "hypogoal", "collect", "doorkey", "--preset", "demo", *few, "--out", data)

@@ -61,6 +61,13 @@ class Progress:
         self.advance(done - self.done, **numbers)
 
 
+def duration(seconds: float) -> str:
+    """A time as progress lines have it: ``03:20``, or ``1:03:20``."""
+    from tqdm import tqdm
+
+    return str(tqdm.format_interval(seconds))
+
+
 class MetricsLog:
     """``metrics.jsonl``: one JSON object per line; the file is not kept open.
 

@@ -87,6 +87,9 @@ def compare_runs(questions: Shared) -> pd.DataFrame:
     for contexts in questions.values():
         for method, alike in of_runs(contexts, "compared").groupby("method", sort=False):
             if alike["run"].nunique() == len(contexts):
+                solved = alike.loc[alike["of"] == "success", "value"]
+                if len(solved) and not solved.any():
+                    alike = alike[alike["of"] != "length"]  # that of the limit, where nobody solved an episode
                 parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))
     return pd.concat(parts) if parts else pd.DataFrame(columns=["N", "quantity", "first", "second", "of"])
 

@@ -125,13 +125,14 @@ def write(folder: Path, results: Results, every: list[Context]) -> None:
 
 def summary(results: Results, every: list[Context]) -> list[str]:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
+    domains = ", ".join(provenance.domains_of(results))
     tables = []
     for context in every:
         if context["folded"]:
             continue
         shown = page.words_of(context).shown
         if not shown.empty:  # such as the layouts of a run without agents
-            tables.append(page.terminal(context["title"], shown))
+            tables.append(page.terminal(f"{context['title']}: {domains}", shown))
     lines = Table.grid()
     lines.width = page.WIDTH
     if results.facts["missing"]:

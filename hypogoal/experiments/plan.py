@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.cells import HERE, Cell
-from hypogoal.core.config import DOMAIN, STAGES, assigned, resolve
+from hypogoal.core.config import DOMAIN, STAGES, Config, assigned, resolve
 from hypogoal.core.config import preset as read_preset
 from hypogoal.core.errors import UserError, reason
 from hypogoal.core.own_code import allow
 from hypogoal.domains.base import settings_of
 from hypogoal.experiments.experiment import STAGE, Command, find_experiment
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.stages import load_stage
 
 OUTPUT = re.compile("(|.*=)@(.+)")  # in a word an output: @data, --data=@data
 MEND = "An experiment yields (name, command) or (name, command, columns), see docs/formats.md."
 
+NAMES = ("diversity", "network", "teacher", "threshold", "view")  # settings that name code
 NEEDED = ("seeds", "layout_seeds", "layouts", "truths")  # without one there would be no agent
 
 
@@ -67,6 +69,19 @@ def plan(
         report = Cell(name="report", words=["report", HERE], needs=[evaluation.place], run=run)
         cells += [evaluation, report]
     return cells, config.workers
+
+
+def _check_names(config: Config, usual: Config) -> None:
+    """Load what settings of ``train-ensemble`` name, so that a wrong name is told before the first cell is made.
+
+    Those of its domain's ``usual`` settings need no look, and no PyTorch.
+    """
+    if not isinstance(config, TrainEnsembleConfig):
+        return
+    if any(getattr(config, name) != getattr(usual, name) for name in NAMES):
+        from hypogoal.hypotheses.sub_goals import check_names
+
+        check_names(config)
 
 
 def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any]) -> Iterator[Cell]:
@@ -138,6 +153,7 @@ def _with_shared(
             more += ["--device", device]
         shared = settings.get(stage, {})
         config = settings_of(stage, domain, values["preset"] or preset, typed, inherited=shared)
+        _check_names(config, settings_of(stage, domain))
         for name, value in shared.items():
             if name in type(config).model_fields and name not in typed:
                 more += ["--set", f"{name}={value}"]

@@ -17,6 +17,7 @@ from hypogoal.cells import CELLS, DONE, PLAN, RUNNING, Cell, read_plan, status_l
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.processes import CORES, cores, surroundings
+from hypogoal.core.progress import duration
 from hypogoal.experiments import slurm
 
 PRELOADED = [  # what stages import when they are called
@@ -136,6 +137,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
     if forked:
         context.set_forkserver_preload(PRELOADED)
     todo = [*cells]
+    begun_at = time.monotonic()
     running: dict[Any, Cell] = {}  # by process
     crashes: Counter[str] = Counter()
 
@@ -154,7 +156,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                 ready = [cell for cell in makeable if at_work.isdisjoint(cell.after)]
                 for cell in ready[:free]:
                     todo.remove(cell)
-                    say(f"{cell.name} ...; {len(todo)} to come")
+                    say(f"{cell.name} ...; {_to_come(cells, len(todo), time.monotonic() - begun_at)}")
                     # A fork has the environment of the process that it is forked from.
                     variables = {**os.environ, CORES: str(max(1, free // len(ready)))}
                     words = [*cell.command, "--resume"]
@@ -179,6 +181,13 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                 process.terminate()
             for process in [*running]:
                 end(process)
+
+
+def _to_come(cells: Sequence[Cell], waiting: int, seconds: float) -> str:
+    """How many cells wait, and how long all that is left takes at the pace of what is done after so many seconds."""
+    done = sum(cell.is_done for cell in cells)
+    left = f", some {duration(seconds / done * (len(cells) - done))} left" if done else ""
+    return f"{waiting} to come{left}"
 
 
 def _make(words: list[str], log: Path, variables: Mapping[str, str]) -> None:

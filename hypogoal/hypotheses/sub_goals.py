@@ -19,7 +19,7 @@ from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
 from hypogoal.hypotheses.auto import AutoTraining
-from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.observations import spread_rows
 
@@ -40,18 +40,26 @@ class Trained:
     chosen: dict[str, Any]
 
 
-def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
-    """The settings with the network that fits the data, and the sub-goals; what cannot be trained is refused."""
+def check_names(config: TrainEnsembleConfig) -> None:
+    """Load what settings name, before there is any data; a name that is none of them is a ``UserError``."""
     load_objective(config.diversity)
     thresholds.threshold_rule(config.threshold)
     if config.teacher:
         teacher.load_teacher(config.teacher)
+    if config.view != FULL:
+        views.load_view(config.view)
+    for name in networks.names_in(config.network):
+        if name != networks.AUTO:
+            networks.load_network(name)
+
+
+def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
+    """The settings with the network that fits the data, and the sub-goals; what cannot be trained is refused."""
+    check_names(config)
     dtype = dataset.observation_dtype
     view = views.view_of(config.view, config.view_settings, dataset.observation_shape, dtype)
     network = networks.network_for(config.network, view.shape, dtype)
     config = config.model_copy(update={"network": network})
-    for name in networks.names_in(config.network):
-        networks.load_network(name)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
         raise UserError("a sub-goal is named twice", ", ".join(sub_goals), "Name each once.")

@@ -144,6 +144,11 @@ class FullView(View):
         return seen
 
 
+def load_view(name: str) -> type[View]:
+    """The view ``module:Class``; no such one, and code that the user did not allow, are a ``UserError``."""
+    return load_class(name, "view", View, {}, ENTRY_POINTS)
+
+
 def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype: DType) -> View:
     """The view ``full``, or ``module:Class`` with its settings, ``KEY=VALUE``, of such observations; it learns later.
 
@@ -151,7 +156,7 @@ def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype:
     """
     if name == FULL:
         return FullView(observation_shape, dtype)
-    kind = load_class(name, "view", View, {}, ENTRY_POINTS)
+    kind = load_view(name)
     chosen = resolve(kind.Settings, assigned(settings), stage=name)
     view = kind(observation_shape, chosen)
     if view.dtype != dtype:

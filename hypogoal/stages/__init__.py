@@ -225,7 +225,7 @@ class Stage:
                 if then := done.then or self.then:
                     places = {"source": source, "out": call.out, "run": call.out.parent}
                     words = [word.format(**places) for word in then.split()]
-                    say(f"next: {own_code.command(*words)}")
+                    say(f"next: {own_code.command(*words, *_kept(call, words[0]))}")
             page = call.out / "index.html"
             say(done.told or done.path or (page if page.is_file() else call.out))
             raise typer.Exit(done.code)
@@ -292,6 +292,21 @@ class Stage:
         except Complete as complete:
             say(complete, err=True)
             return call, Done()
+
+
+def _kept(call: Call, then: str) -> Iterator[str]:
+    """The preset and the typed settings of the world that hold for the next stage as well."""
+    from hypogoal.core.config import STAGES, model_of
+    from hypogoal.learners.config import WorldConfig
+
+    if then not in STAGES:
+        return
+    if call.preset:
+        yield from ("--preset", call.preset)
+    known = model_of(then).model_fields.keys() & {*WorldConfig.model_fields, "layouts"}
+    for name, value in call.typed.items():
+        if name in known:
+            yield from ("--set", f"{name}={value}")
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:

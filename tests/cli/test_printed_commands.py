@@ -38,6 +38,7 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     folder = tmp_path / "where it's  at"
     folder.mkdir()
     (folder / "tiny.py").write_text(OWN)
+    (folder / "few.toml").write_text("[train-meta]\ndecisions = 16\n")
     monkeypatch.chdir(folder)
     for place in (TESTS, TESTS.parent / "examples", folder):
         monkeypatch.syspath_prepend(str(place))
@@ -70,9 +71,12 @@ def test_what_follows_a_stage_with_code_of_ones_own(shell: Shell) -> None:
     while line:
         if "train-ensemble" in line:
             line += " --diversity tiny:pair_loss --set network=tiny:wide"
+        if "train-options" in line:
+            line += " --preset few.toml --layout-seed 3 --set environments=3"
         ran.append(line)
         text = shell(line)
         line = printed(text, "next: ") if "next: " in text else ""
+    assert "--preset few.toml --set layout_seed=3 --trust" in ran[3] and "environments" not in ran[3]
     stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
     assert [shlex.split(line)[1] for line in ran] == stages
     assert all("--trust" in line for line in ran[1:])

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from command_line import fails, run, settings
+from command_line import FIXED, fails, run, settings
 from openings import agrees
 from PIL import Image
 from safetensors.torch import load_file
@@ -39,7 +39,7 @@ LAYOUTS = settings("labelled_seeds=0", "unlabelled_seeds=1", "heldout_seeds=2", 
 PLAY = settings("steps=240", "environments=2", "warm_up=50", "layout_seed=0", "max_episode_steps=60")
 SHORT = {  # appended to the page's commands, so that they end in seconds
     "collect": LAYOUTS,
-    "train-ensemble": settings("steps=20", "members=2", "workers=1"),
+    "train-ensemble": settings("steps=20", "members=2", "workers=1", *FIXED),
     "train-options": PLAY,
     "train-meta": PLAY,
 }
@@ -198,9 +198,10 @@ def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: py
     example = EXAMPLES / "own_pictures.py"
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(example))
-    for line in example.read_text(encoding="utf-8").splitlines():
-        if line.startswith("    hypogoal "):
-            assert main(line.split()[1:]) == 0, line
+    lines = (ast.get_docstring(ast.parse(example.read_text(encoding="utf-8"))) or "").replace("\\\n", "").splitlines()
+    for words in (line.split() for line in lines):
+        if words[:1] == ["hypogoal"]:
+            assert main(words[1:]) == 0, words
     members = pd.read_csv("runs/lamp/evaluation/tables/hypotheses.csv").set_index("quantity")["mean"]
     assert members["best"] > 0.95 and members["worst"] < 0.9
     assert "lamp-on" in Path("runs/lamp/report/index.html").read_text(encoding="utf-8")

@@ -93,6 +93,10 @@ NO_FUNCTION = [
     ('f"agent/size-{size}"', 'f"ensemble/size-{size}"', "a name of its own"),
     ("--members {size}", "--members {size} --set stepps=3", "(?s)train-ensemble has no setting.*ensemble/size-1"),
     ("--members {size}", "--members {size} --steps 0", "(?s)steps.*ensemble/size-1"),
+    ("--members {size}", "--diversity bogus", "(?s)unknown diversity objective.*ensemble/size-1"),
+    ("--members {size}", "--set network=bogus", "(?s)unknown network.*ensemble/size-1"),
+    ("--members {size}", "--set threshold=bogus", "(?s)unknown threshold.*ensemble/size-1"),
+    ("--members {size}", "--set view=members:bogus", "(?s)the view cannot be loaded.*ensemble/size-1"),
     ("small: bool = False", "small: bool", "Field required"),
     ("def members", "members = 3\ndef other", "not an experiment"),
 ]

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 DATA = "collect rooms --set labelled=64 --set unlabelled=128"
-SMALL = "--set steps=20 --set members=2"
+SMALL = "--set steps=20 --set members=2 --set diversity_weight=1e-4 --set restarts=1"
 PLAY = "--layout-seed 990 --set steps=200"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from command_line import refuses, run, settings, trusting
+from command_line import FIXED, refuses, run, settings, trusting
 from stable_baselines3 import PPO
 
 import hypogoal
@@ -134,7 +134,7 @@ def test_options_say_that_they_cannot(tmp_path: Path, monkeypatch: pytest.Monkey
     run("check", "doors:DOMAIN", *few)
     run("collect", "doors:DOMAIN", "--out", tmp_path / "d.h5", "-q", *few)
     with trusting():
-        few = settings("steps=2", "members=2")
+        few = settings("steps=2", "members=2", *FIXED)
         run("train-ensemble", tmp_path / "d.h5", "--out", tmp_path / "e", "-q", *few)
         words = ["train-options", tmp_path / "e", "--out", tmp_path / "o", "-q"]
         refuses("agents see pictures or numbers, not both: front, state, wrist. Reward", *words)

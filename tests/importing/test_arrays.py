@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import refuses, run, settings
+from command_line import FIXED, refuses, run, settings
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
@@ -26,7 +26,7 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     found = open_dataset(data)
     np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
     assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
-    few = settings("steps=40", "members=2", "learning_rate=1e-3")
+    few = settings("steps=40", "members=2", "learning_rate=1e-3", *FIXED)
     run("train-ensemble", data, "--out", folder / "ensemble", "-q", *few)
     run("evaluate", folder, "-q")
     members = pd.read_csv(folder / "evaluation" / "tables" / "hypotheses.csv").set_index("quantity")["mean"]

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from command_line import run, settings, trusting
+from command_line import FIXED, run, settings, trusting
 from corridor_env import CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
@@ -43,7 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with trusting():
         layouts = settings("steps=200", "heldout_seeds=4,5")
         run("collect", "corridor_env:DOMAIN", "--out", made / "data.h5", "-q", *layouts)
-        few = settings("steps=100", f"members={MEMBERS}", "workers=1", "learning_rate=1e-3")
+        few = settings("steps=100", f"members={MEMBERS}", "workers=1", "learning_rate=1e-3", *FIXED)
         run("train-ensemble", made / "data.h5", "--out", made / "ensemble", "-q", *few)
         play = settings("steps=3000", "environments=4", "warm_up=100", "update_interval=4", "layout_seed=0")
         quick = settings("option_batch=32", "epsilon_steps=500", "max_episode_steps=30")
@@ -168,7 +168,7 @@ def test_options_end_by_the_rule_they_were_trained_with(made: Path) -> None:
     ends = settings(f"termination={__name__}:Falling", "option_timeout=2", "option_batch=32")
     out, meta = made / "patient", made / "patient-meta"
     with trusting():
-        sure = settings("steps=40", f"members={MEMBERS}", "workers=1", "threshold=0.9")
+        sure = settings("steps=40", f"members={MEMBERS}", "workers=1", "threshold=0.9", *FIXED)
         ensemble = str(made / "sure")
         run("train-ensemble", made / "data.h5", "--out", ensemble, "-q", *sure)
         few = settings("steps=400")

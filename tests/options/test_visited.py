@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from command_line import refuses, run
+from command_line import FIXED, refuses, run, settings
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.artefacts import open_artefact
@@ -84,7 +84,8 @@ def test_an_ensemble_learns_from_what_was_visited(corridor_run: Path, tmp_path: 
         assert len(np.unique(found.unlabelled(), axis=0)) == 5
         assert found.counts()["labelled"]["left-end"] == {"states": 0, "positives": 0}
     data, options = corridor_run / "data.h5", corridor_run / "options-more"
-    train = ["train-ensemble", data, "--set", "members=2", "--set", "workers=1", "--set", "steps=10", "-q"]
+    few = settings("members=2", "workers=1", "steps=10", *FIXED)
+    train = ["train-ensemble", data, *few, "-q"]
     run(*train, "--unlabelled", data, "--unlabelled", options, "--out", tmp_path / "both")
     run(*train, "--unlabelled", options, "--out", tmp_path / "visited")
     weights = [folder / "left-end.safetensors" for folder in (corridor_run / "ensemble", tmp_path / "both")]

@@ -17,12 +17,12 @@ from hypogoal.tools.compare import compare
 STEPS = 3_000
 
 
-def write_baseline(run, agent, layout, seed, length, steps=STEPS, **more):
-    """A baseline artefact whose episodes all take ``length`` steps and reach the goal."""
+def write_baseline(run, agent, layout, seed, length, steps=STEPS, solved=1, **more):
+    """A baseline artefact whose episodes all take ``length`` steps and reach the goal, or are cut."""
     config = {"agent": agent, "setting": "tuned", "steps": steps, "layout_seed": layout, "domain": "doorkey", **more}
     with create(run / f"{agent}/layout-{layout}-seed-{seed}", kind="baseline", config=config, seed=seed) as draft:
         out = draft.files
-        rows = [(end, length, 1, 1, 1) for end in range(length, steps + 1, length)]
+        rows = [(end, length, solved, solved, solved) for end in range(length, steps + 1, length)]
         write_table(out / "episodes.csv", ("step", "length", "reward", "terminated", "succeeded"), rows)
         facts = {"layout_seed": layout, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
         (out / "layout.json").write_text(json.dumps(facts), encoding="utf-8")
@@ -81,6 +81,18 @@ def test_the_page_shows_both(compared):
     artefact = open_artefact(compared, "comparison")
     assert [entry.kind for entry in artefact.manifest.inputs] == ["evaluation", "evaluation"]
     assert len([*(compared / "figures").iterdir()]) == 1, "rewards are alike, lengths are not"
+
+
+def test_lengths_are_compared_where_somebody_solved_something(tmp_path):
+    """Spec F5: an episode that was cut is as long as its limit, which is no tie of two agents."""
+    for name, solved in (("one", 0), ("other", 0), ("solving", 1)):
+        for seed in (0, 1):
+            write_baseline(tmp_path / name, "ppo", 100, seed, 40, solved=solved)
+        evaluate(tmp_path / name, quiet=True)
+    nobody = read_pairs(compare([tmp_path / "one", tmp_path / "other"], tmp_path / "nobody").path)
+    assert nobody["quantity"].tolist() == ["success", "near"] and (nobody["ties"] == 2).all()
+    one = read_pairs(compare([tmp_path / "one", tmp_path / "solving"], tmp_path / "somebody").path)
+    assert {"success", "length"} <= {*one["quantity"]}
 
 
 def test_methods_side_by_side(runs, tmp_path):
