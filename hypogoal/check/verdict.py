@@ -1,5 +1,6 @@
 """What a check finds: a verdict on each law, up to the first that is broken, since later ones build on it."""
 
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -7,6 +8,8 @@ from typing import Any
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import message
+
+COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal's text, as Gymnasium's warnings have
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ def verdicts(laws: Iterable[Callable[[Any], str | None]], subject: Any) -> Itera
                 ok, text = True, law(subject) or str(law.__doc__)
             except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code raises
                 ok, (text, _) = False, message(error)
-        texts = dict.fromkeys(str(warning.message) for warning in caught)
+        texts = dict.fromkeys(COLOUR.sub("", str(warning.message)) for warning in caught)
         yield Verdict(law.__name__.replace("_", " "), ok, text, tuple(texts))
         if not ok:
             return

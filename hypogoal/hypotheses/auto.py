@@ -30,6 +30,7 @@ import torch
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import State
 from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.data import GROUP
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.config import AUTO, LABELS, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
@@ -44,7 +45,6 @@ FOLDS = 4  # one state in so many is held out
 FEWEST = 8  # held-out states of a class: with fewer, each fold is held out in turn; with fewer in all, nothing is tried
 EARLY = 1 / 3  # of a first member's steps
 SMALL = 1e-9  # probabilities below have no entropy
-GROUP = "group"  # the origin of states that are held out together
 FEW = "{} labels of a class are too few to choose the diversity weight by, so it is {}"
 SINGLE = "too few groups have both classes, so single states are held out: near copies make them easy"
 

@@ -9,7 +9,7 @@ import pandas as pd
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import Collected, Labels, States, doubts_of, require_classes
+from hypogoal.data import GROUP, Collected, Labels, States, doubts_of, require_classes
 from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNLABELLED, Frames, together
 from hypogoal.observations import digest, packed
 
@@ -50,6 +50,8 @@ def assemble(
     table = with_roles(table, seed)
     doubts = contradictions(table, labels, goals)
     table, remarks = apart(table, labels, share, seed)
+    in_group = table["group"] != ""
+    groups, _ = pd.factorize(table["group"].where(in_group, table["look"]))
     sets = []
     for role in ROLES:
         is_own = table["role"] == role
@@ -57,7 +59,7 @@ def assemble(
         if not rows.size:
             do = "; ".join(remarks) or MORE
             raise UserError(f"there are no {role} states", source, do)
-        origins = {ROW: np.arange(len(rows))}
+        origins = {ROW: np.arange(len(rows)), GROUP: groups[is_own]}
         sets.append(States(observations[rows], labels[rows], origins))
     labelled, unlabelled, heldout = sets
     require_classes(labelled.labels, goals, None, "Give states of both kinds.")

@@ -104,6 +104,9 @@ def test_a_group_is_held_out_whole_or_not_at_all(tmp_path: Path) -> None:
     learned = {rows[state.tobytes()] // 4 for state in found.labelled("sub-goal").observations}
     assert len(held) == 2 and held | learned == set(range(10)) and not held & learned
     assert len(found.unlabelled()) == 20 - 2 * len(held)
+    labelled = found.labelled("sub-goal")
+    takes = [rows[state.tobytes()] // 4 for state in labelled.observations]
+    assert len({*zip(takes, labelled.origins["group"].tolist(), strict=True)}) == len({*takes})
     refuses("no such array: tape", "import", tmp_path / "own.npz", "--out", tmp_path / "x.h5", "--group", "tape")
     with pytest.raises(UserError, match="none of 40 labelled states, or groups of them, can be held out"):
         assembled(given | {"take": np.zeros(40)}, "take")
