@@ -9,6 +9,7 @@ file without it was cut off.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -189,7 +190,7 @@ def _is_covered(data: Any) -> bool:
     import h5py
 
     whole_file = Path(data.file.filename)
-    with h5py.File("covered", "w", driver="core", backing_store=False) as scratch:
+    with h5py.File(io.BytesIO(), "w") as scratch:
         covered = scratch.create_dataset("covered", data.shape, np.bool_)
         for target, file, name, source in data.virtual_sources():
             path = whole_file if file == "." else whole_file.parent / file

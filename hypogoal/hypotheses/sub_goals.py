@@ -13,7 +13,7 @@ import numpy as np
 from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import prepare
-from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.core.progress import MetricsLog, Progress, say
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
@@ -106,6 +106,9 @@ def train_sub_goal(
         device=device,
         saved=saved["training"] if saved else None,
     )
+    if training.folds and not quiet:
+        once = training.cost(folds=0, weights=0)
+        say(f"train-ensemble {sub_goal}: at most {training.most} steps, {once} of them when the weight is chosen", err=True)
     log = MetricsLog(log_of(draft, sub_goal), tensorboard)
     log.restore(saved["log"] if saved else 0)
 

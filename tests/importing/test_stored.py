@@ -89,6 +89,12 @@ def part_of(group: h5py.Group, key: str, values: np.ndarray, file: Path, draw: D
                 other[f"y{begin}" if is_last and damage == "other name" else f"x{begin}"] = kept
     if damage == "gone":
         file.unlink()
+    if draw.random() < 0.3:  # a part that has parts itself
+        joined = file.with_name(f"{file.name}-joined")
+        with h5py.File(joined, "w") as other:
+            other.create_virtual_dataset("x", layout)
+        layout = h5py.VirtualLayout(values.shape, values.dtype)
+        layout[:] = h5py.VirtualSource(joined.name, "x", values.shape)
     group.create_virtual_dataset(key, layout)
 
 
