@@ -108,7 +108,8 @@ def train_sub_goal(
     )
     if training.folds and not quiet:
         once = training.cost(folds=0, weights=0)
-        say(f"train-ensemble {sub_goal}: at most {training.most} steps, {once} of them when the weight is chosen", err=True)
+        told = f"at most {training.most} steps, {once} of them when the weight is chosen"
+        say(f"train-ensemble {sub_goal}: {told}", err=True)
     log = MetricsLog(log_of(draft, sub_goal), tensorboard)
     log.restore(saved["log"] if saved else 0)
 
