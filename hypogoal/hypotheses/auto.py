@@ -169,6 +169,7 @@ class AutoTraining:
             self.folds, self.remark = held_out(labels, self.origins.labelled.get(GROUP), seed)
         one_by_one = config.schedule == "sequential" and config.members > 1 and not config.teacher
         self.begins_alone = acts and one_by_one and (self.searches or config.restarts > 1)
+        self.early = max(1, round(config.steps * EARLY))
         self.most = self.cost(len(self.folds), len(WEIGHTS))
 
     @property
@@ -180,7 +181,7 @@ class AutoTraining:
     def cost(self, folds: int, weights: int) -> int:
         """The steps of all trainings, if in so many folds so many weights are tried, each to its end."""
         config = self.config
-        first = round(config.steps * (1 + (config.restarts - 1) * EARLY)) if self.begins_alone else 0
+        first = config.steps + (config.restarts - 1) * self.early if self.begins_alone else 0
         rounds = config.members if config.schedule == "sequential" else 1
         others = config.steps * (rounds - self.begins_alone)
         return folds * ((first or others) + weights * others) + first + others
@@ -252,8 +253,7 @@ class AutoTraining:
         candidates: list[State] = []
         for restart in range(restarts if restarts > 1 else 0):
             seed = seed_for(self.seed, "restart", restart) if restart else self.seed
-            until = max(1, round(self.config.steps * EARLY))
-            candidates.append((yield from self._train(rows, seed, members=1, until=until)))
+            candidates.append((yield from self._train(rows, seed, members=1, until=self.early)))
         best: State = {"seed": self.seed, "training": None}
         if candidates:
             best = max(candidates, key=lambda candidate: candidate["information"])

@@ -45,6 +45,8 @@ def test_the_largest_weight_is_taken_that_members_bear() -> None:
     easy, hard = follows(training.ensemble)
     assert easy.max() > 0.9 and hard.max() > 0.9
     assert training.step <= training.cost(1, len(training.tried))
+    odd = trained(AUTO.model_copy(update={"steps": 5, "restarts": 4, "diversity_weight": 0.01}))
+    assert odd.step == odd.most == odd.cost(0, 0) == 5 + 3 * 2 + 5
 
 
 def test_the_final_members_have_all_labels() -> None:
