@@ -1,5 +1,6 @@
 """Domains made from Gymnasium environments: collection, the engine, and what users get wrong (Spec B6, B7)."""
 
+from itertools import count
 from typing import Any
 
 import corridor_env
@@ -23,8 +24,8 @@ def collected(domain: GymnasiumDomain = DOMAIN, config: GymnasiumConfig = SMALL,
     return domain.collect(config, seed, Progress("collect", 1, quiet=True))
 
 
-def engine_of(count: int = 3, **arguments: int) -> GymnasiumEngine:
-    return DOMAIN.make_engine(0, count, 30, **arguments)
+def engine_of(number: int = 3, **arguments: int) -> GymnasiumEngine:
+    return DOMAIN.make_engine(0, number, 30, **arguments)
 
 
 def test_collection_has_each_picture_once_with_its_labels() -> None:
@@ -86,6 +87,14 @@ def test_an_environment_that_loses_its_seed_is_not_collected() -> None:
     """Spec B7: its states would be of other layouts than the file says."""
     with pytest.raises(UserError, match="reset shows something else in a later episode: seed=0"):
         collected(GymnasiumDomain(Deaf, SUB_GOALS))
+
+
+def test_a_label_that_keeps_something_is_not_collected() -> None:
+    """Spec B7: what it says of a state would depend on how often it was asked."""
+    asked = count()
+    goals = {**SUB_GOALS, "third": lambda env: next(asked) % 3 == 0}
+    with pytest.raises(UserError, match="a label differs when it is asked for again: third"):
+        collected(GymnasiumDomain(CorridorEnv, goals))
 
 
 def test_the_engine_is_the_environment() -> None:

@@ -99,6 +99,12 @@ def sampled(
             continue
         seen.add(look)
         labels = labels_of(env, domain.label_functions)
+        changed = labels != labels_of(env, domain.label_functions)
+        if changed.any():
+            names = ", ".join(np.array(domain.sub_goals)[changed])
+            raise UserError(
+                "a label differs when it is asked for again", names, "Have it keep nothing."
+            )
         state = Met(values, labels, origin)
         combination = labels.tobytes()
         sample = kept.setdefault(combination, [])
