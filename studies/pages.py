@@ -25,6 +25,7 @@ from studies import (
     ladders,
     one_room,
     weight,
+    weight_elsewhere,
 )
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -44,6 +45,7 @@ TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "preference-doorkey": choosing.tables,
     "rooms": choosing.rooms,
     "weight": weight.tables,
+    "weight-elsewhere": weight_elsewhere.tables,
 }
 MARKED = re.compile(r"<!-- ([\w-]+) (\d+) -->\n(?:\|.*\n)*")
 
