@@ -13,6 +13,11 @@ Of the ``n_c`` held-out states of class c, ``right_c`` are predicted right witho
 succession: a member without a fault would have s = 0. A member that predicts one class for all unlabelled states is no
 hypothesis, so its weight is passed over, unless members without diversity do so, too.
 
+Members keep all labels at any weight if they can tell the labelled place from others: they then say one thing there and
+contradict each other elsewhere. So a weight is passed over, too, at which two members differ on more than half of the M
+unlabelled states, ``1/2 + sqrt(1/4 / M)``. Rules that know nothing of each other and say yes to shares a and b of the
+states differ on ``a (1 - b) + b (1 - a)``, which is at most 1/2 if neither says yes to more than half.
+
 The first member of a sequential ensemble is trained on the labels alone, once for all weights. If it mixes features,
 later members can only mix what is left. So ``restarts`` of them begin, and after ``EARLY`` of its steps the one stays
 whose predictions tell most about unlabelled states, by the mutual information of state and prediction, H(mean p) -
@@ -43,6 +48,7 @@ from hypogoal.observations import Observations
 WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
 FOLDS = 4  # one state in so many is held out
 FEWEST = 8  # held-out states of a class: with fewer, each fold is held out in turn; with fewer in all, nothing is tried
+HALF = 0.5
 EARLY = 1 / 3  # of a first member's steps
 SMALL = 1e-9  # probabilities below have no entropy
 FEW = "{} labels of a class are too few to choose the diversity weight by, so it is {}"
@@ -59,6 +65,7 @@ class Tried:
     accuracy: float
     disagreement: float | None  # None with one member
     constant: bool  # some member predicts one class for all unlabelled states
+    contrary: bool  # members differ on more than half of them
     kept: bool
 
 
@@ -231,6 +238,7 @@ class AutoTraining:
         labels = np.concatenate([self.labels[fold] for fold in self.folds])
         self.lowest = lowest_kept(np.concatenate([begun["right"] for begun in without]), labels)
         was_constant = any(begun["constant"] for begun in without)
+        half = HALF + sqrt(HALF**2 / len(self.unlabelled))
         for weight in WEIGHTS:
             outcomes = []
             for fold, begun in zip(self.folds, without, strict=True):
@@ -241,8 +249,9 @@ class AutoTraining:
             accuracy = float(accuracies_of(right, labels).min())
             differs = float(np.mean([outcome["disagreement"] for outcome in outcomes]))
             constant = any(outcome["constant"] for outcome in outcomes) and not was_constant
-            kept = accuracy >= self.lowest and not constant
-            self.tried.append(Tried(weight, accuracy, None if isnan(differs) else differs, constant, kept))
+            contrary = differs > half
+            kept = accuracy >= self.lowest and not constant and not contrary
+            self.tried.append(Tried(weight, accuracy, None if isnan(differs) else differs, constant, contrary, kept))
             if kept:
                 break
         return weight

@@ -92,7 +92,13 @@ def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
         yield f"  weight  accuracy there (at least {chosen['lowest']:.3f})  disagreement on unlabelled states"
     for tried in chosen["tried"]:
         differs = "-" if tried["disagreement"] is None else f"{tried['disagreement']:.2f}"
-        remark = "  chosen" if tried["kept"] else "  a member is constant" if tried["constant"] else ""
+        remark = ""
+        if tried["kept"]:
+            remark = "  chosen"
+        elif tried["constant"]:
+            remark = "  a member is constant"
+        elif tried["contrary"]:
+            remark = "  on more than half"
         yield f"  {tried['weight']:<6g}  {tried['accuracy']:<32.3f}  {differs}{remark}"
     if chosen["tried"] and not chosen["tried"][-1]["kept"]:
         yield "  members keep the labels with none of these weights, so the smallest is taken"

@@ -102,9 +102,7 @@ def sampled(
         changed = labels != labels_of(env, domain.label_functions)
         if changed.any():
             names = ", ".join(np.array(domain.sub_goals)[changed])
-            raise UserError(
-                "a label differs when it is asked for again", names, "Have it keep nothing."
-            )
+            raise UserError("a label differs when it is asked for again", names, "Have it keep nothing.")
         state = Met(values, labels, origin)
         combination = labels.tobytes()
         sample = kept.setdefault(combination, [])
