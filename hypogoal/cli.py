@@ -117,7 +117,7 @@ def _commands() -> Any:
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
     of_stages = {name: stages.load_stage(name).command for name in stages.LISTED}
-    return {**_commands().commands, **of_stages}
+    return _commands().commands | of_stages
 
 
 def _called(words: list[str]) -> int:
@@ -327,7 +327,7 @@ def check(
     from hypogoal.data import open_dataset
     from hypogoal.domains import base as domains
 
-    checks: list[Any] = []
+    checks = []
     observations: tuple[Any, ...] = ()
     loaded = chosen = None
     assigned = settings.assigned(set_ or ())

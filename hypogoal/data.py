@@ -16,11 +16,12 @@ from dataclasses import dataclass, field
 from itertools import chain
 from math import prod
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Array
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import NO_FILE_NAME, plain_names, reading, replacing
@@ -45,8 +46,8 @@ GROUP = "group"  # an origin: states of a group are held out together, to choose
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
-Labels: TypeAlias = NDArray[np.bool_]
-Integers: TypeAlias = NDArray[np.int64]
+Labels = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class States:
     labels: Labels
     origins: Mapping[str, Integers] = field(default_factory=dict)
 
-    def where(self, kept: NDArray[Any]) -> States:
+    def where(self, kept: Array) -> States:
         """The states that are ``kept``, bool (N,), or the rows of some, int (M,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         observations = self.observations[kept]
@@ -95,7 +96,7 @@ def leave_out(states: States, *training: Observations) -> States:
     """Spec B3: the states without those that look like one of ``training``, observations (M, ...) each."""
     digests = set(map(digest, chain(*training)))
     apart = [digest(observation) not in digests for observation in states.observations]
-    return states.where(np.array(apart, np.bool_))
+    return states.where(np.array(apart, bool))
 
 
 def joined(parts: Sequence[States]) -> States:
@@ -191,11 +192,11 @@ def _is_covered(data: Any) -> bool:
 
     whole_file = Path(data.file.filename)
     with h5py.File(io.BytesIO(), "w") as scratch:
-        covered = scratch.create_dataset("covered", data.shape, np.bool_)
+        covered = scratch.create_dataset("covered", data.shape, bool)
         for target, file, name, source in data.virtual_sources():
             path = whole_file if file == "." else whole_file.parent / file
             with opened(path, ANEW, "a part of the recording") as part:
-                ones = np.ones(whole(part[name]).shape, np.bool_)
+                ones = np.ones(whole(part[name]).shape, bool)
                 source.set_extent_simple(ones.shape)
                 covered.id.write(source, target, ones)
         return bool(np.all(covered))
@@ -222,11 +223,11 @@ def write_dataset(
     Raises ``UserError`` if a name cannot be a file name, labels are not truth values or numbers not finite.
     """
     require_names(collected.sub_goals)
-    attributes: dict[str, Any] = {
+    attributes = {
         "format": DATA_FORMAT,
         "domain": domain,
-        "sub_goals": json.dumps(list(collected.sub_goals)),
-        "observation_shape": json.dumps(list(collected.observation_shape)),
+        "sub_goals": json.dumps(collected.sub_goals),
+        "observation_shape": json.dumps(collected.observation_shape),
         "observation_dtype": type_text(collected.unlabelled.observations.dtype),
         "config": json.dumps(dict(config)),
         "seed": seed,
@@ -243,14 +244,14 @@ def write_dataset(
         _write_split(file, "heldout", collected.heldout, collected.sub_goals)
         _write_states(file.create_group("unlabelled"), collected.unlabelled)
         if collected.features:  # a dataset, because they may exceed an attribute's size
-            file["features"] = fixed(json.dumps(list(collected.features)))
+            file["features"] = fixed(json.dumps(collected.features))
         file.attrs.modify("complete", True)
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
     """A group for each sub-goal; the same states are stored once, with a hard link in each group."""
     labels = np.asarray(states.labels)
-    if labels.dtype != np.bool_:  # NumPy turns the text 'False' into True
+    if labels.dtype != bool:  # NumPy turns the text 'False' into True
         raise UserError(f"the domain's {split} labels are not truth values", labels.dtype, "Give bool (N, sub-goals).")
     first = file.create_group(f"{split}/{sub_goals[0]}")
     _write_states(first, states)
@@ -273,14 +274,15 @@ def _write_states(group: Any, states: States) -> None:
         _store(group, f"origin/{name}", values)
 
 
-def _store(group: Any, name: str, values: NDArray[Any]) -> None:
+def _store(group: Any, name: str, values: Array) -> None:
     """Write observations compressed, other values with checksums: a flipped label would still be valid."""
-    filters: dict[str, Any] = {}
-    if len(values) and name == "observations":
-        chunk = (min(64, len(values)), *values.shape[1:])
+    filters = {}
+    count = len(values)
+    if count and name == "observations":
+        chunk = (min(64, count), *values.shape[1:])
         filters = {"chunks": chunk, "compression": "gzip", "compression_opts": 1}
-    elif len(values):
-        chunk = (min(COLUMN_CHUNK, len(values)),)
+    elif count:
+        chunk = (min(COLUMN_CHUNK, count),)
         filters = {"chunks": chunk, "fletcher32": True}
     group.create_dataset(name, data=values, **filters)
 
@@ -311,7 +313,7 @@ class Dataset:
         with opened(self.path) as file:
             if "features" in file:
                 return [*json.loads(file["features"][()])]
-        names: list[str] = []
+        names = []
         for key, (kind, shape) in fields_of(self.observation_shape, self.observation_dtype).items():
             size = prod(shape) if kind == NUMBERS else 1
             numbered = [f"{key or 'x'}[{place}]" for place in range(size)]
@@ -373,12 +375,12 @@ class Dataset:
             values = read[place]
             if not np.isfinite(numbers_of(values)).all():
                 raise ValueError(f"{data.name} has numbers that are not finite")
-            labels = np.zeros((len(values), 0), np.bool_)
+            labels = np.zeros((len(values), 0), bool)
             if sub_goal:
-                labels = _column(group, "labels").astype(np.bool_)
+                labels = _column(group, "labels").astype(bool)
             origins = {}
             for name in group.get("origin", ()):
-                origins[name] = _column(group, f"origin/{name}").astype(np.int64)
+                origins[name] = _column(group, f"origin/{name}").astype(int)
             return States(values, labels, origins)
 
 
@@ -388,7 +390,7 @@ def _plain(attribute: Any) -> Any:
     return value.decode() if isinstance(value, bytes) else value
 
 
-def _column(group: Any, name: str) -> NDArray[Any]:
+def _column(group: Any, name: str) -> Array:
     """One value for each state of a group."""
     values, states = whole(group[name])[()], len(group["observations"])
     if values.shape != (states,):

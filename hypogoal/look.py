@@ -6,7 +6,7 @@ from html import escape
 from os import PathLike
 from pathlib import Path
 from statistics import fmean
-from typing import Any, TypeAlias
+from typing import Any
 
 from hypogoal.cells import read_plan, status_lines
 from hypogoal.core.artefacts import LOG, MANIFEST, Artefact, Draft
@@ -20,7 +20,7 @@ WIDTH = 80  # columns
 EVALUATION = "evaluation"
 # Of a training's log, in the order in which they are shown.
 LOGGED = ("labelled", "success", "length", "reached", "terminated", "duration", "episodes")
-Details: TypeAlias = dict[str, Any]  # a description
+Details = dict[str, Any]  # a description
 
 
 def parts_of(path: Path) -> list[Path]:

@@ -4,13 +4,11 @@ Pictures are bytes (H, W, C). Numbers are float32 of any shape; networks see the
 mixed: of shape (), and of a structured type with a field for each key.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from hashlib import blake2b
 from math import prod
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +17,16 @@ from hypogoal.core.files import plain_names
 
 PICTURE = np.dtype(np.uint8)
 NUMBERS = np.dtype(np.float32)
-DType: TypeAlias = np.dtype[Any]
-Shape: TypeAlias = tuple[int, ...]
+DType = np.dtype[Any]
+Shape = tuple[int, ...]
 KINDS: dict[str, DType] = {
     "uint8": PICTURE,
     "float32": NUMBERS,
 }
-Observations: TypeAlias = NDArray[Any]  # (N, *shape), of any of these types
-Fields: TypeAlias = dict[str, tuple[DType, Shape]]  # by key
-Floats: TypeAlias = NDArray[np.float32]
-Standard: TypeAlias = tuple[Floats, Floats]  # mean and deviation of numbers
+Observations = NDArray[Any]  # (N, *shape), of any of these types
+Fields = dict[str, tuple[DType, Shape]]  # by key
+Floats = NDArray[np.float32]
+Standard = tuple[Floats, Floats]  # mean and deviation of numbers
 DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
 MOST_ROWS = 20_000  # states from which mean and deviation are computed
 
@@ -64,9 +62,7 @@ def mixed_type(fields: Fields) -> DType:
     are_plain = plain_names([*fields])
     if not are_plain or min(sizes) <= 0:
         raise ValueError(f"malformed observations: {fields}")
-    parts = []
-    for key, (dtype, shape) in sorted(fields.items()):
-        parts.append((key, dtype.str, shape))
+    parts = [(key, dtype.str, shape) for key, (dtype, shape) in sorted(fields.items())]
     return np.dtype(parts)
 
 
@@ -74,9 +70,7 @@ def type_text(dtype: DType) -> str:
     """An observation's type as files keep it: ``uint8``, ``float32``, or JSON of ``{key: [type, shape]}``."""
     if not dtype.names:
         return str(dtype)
-    parts = {}
-    for key, (kind, shape) in fields_of((), dtype).items():
-        parts[key] = [str(kind), shape]
+    parts = {key: [str(kind), shape] for key, (kind, shape) in fields_of((), dtype).items()}
     return json.dumps(parts)
 
 
@@ -99,7 +93,7 @@ def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations
     fields = {}
     for key, values in parts.items():
         array = np.asarray(values)
-        kind = NUMBERS if array.dtype == np.float64 else array.dtype
+        kind = NUMBERS if array.dtype == float else array.dtype
         arrays[key] = array
         fields[key] = (kind, array.shape[1:])
     stored = mixed_type(fields)
@@ -132,8 +126,8 @@ def standard_of(shape: Shape, *observations: Observations) -> Standard:
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
     nothing = np.zeros((1, *shape), NUMBERS)
     sample = np.concatenate(rows or [nothing])
-    mean = sample.mean(0, dtype=np.float64)
-    deviation = sample.std(0, dtype=np.float64)
+    mean = sample.mean(0, dtype=float)
+    deviation = sample.std(0, dtype=float)
     varies = deviation > 1e-6 * np.abs(mean)
     scale = np.where(varies, deviation, 1.0)
     return mean.astype(NUMBERS), scale.astype(NUMBERS)
@@ -147,7 +141,5 @@ def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
 
 def spread_rows(count: int, most: int) -> NDArray[np.int64]:
     """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
-    last = count - 1
     wanted = min(count, most)
-    rows = np.linspace(0, last, wanted)
-    return rows.astype(np.int64)
+    return np.linspace(0, count - 1, wanted, dtype=int)

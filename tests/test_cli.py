@@ -88,7 +88,7 @@ def places(tiny_run: Path, tmp_path: Path) -> dict[str, Path]:
         ("train-ensemble {data} --out {data} --force", "would replace an input"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
         ("train-ensemble {data} --out {out} --set sub_goals=open-red-door,open-red-door", "a sub-goal is named twice"),
-        ("collect doorkey --out {out} --seed -1", "greater than or equal to 0"),
+        ("collect doorkey --out {out} --seed -1", "--seed"),
         ("collect chess --out {out}", "unknown domain: chess"),
         ("train-ensemble {data} --out {out} --diversity magic", "magic"),
         ("train-meta {ensemble} --out {out} --device tpu", "unknown device"),

@@ -9,13 +9,11 @@ from time import perf_counter
 
 from hypogoal.check.verdict import Verdict, verdicts
 from hypogoal.core.processes import allowed, prepare
-from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, doubts_of, open_dataset
-from hypogoal.hypotheses.auto import AutoTraining
+from hypogoal.hypotheses.auto import AutoTraining, training_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.sub_goals import checked
-from hypogoal.hypotheses.views import StateOrigins
 
 SECONDS = 45.0  # of training, for all sub-goals together
 TIMED = 10  # steps
@@ -104,14 +102,7 @@ class _Data:
     def training(self, sub_goal: str, config: TrainEnsembleConfig) -> AutoTraining:
         """The training of a sub-goal's ensemble, not begun."""
         labelled, unlabelled = self.dataset.labelled(sub_goal), self.dataset.unlabelled_states()
-        return AutoTraining(
-            labelled.observations,
-            labelled.labels,
-            unlabelled.observations,
-            config,
-            seed_for(self.seed, "ensemble", sub_goal),
-            origins=StateOrigins(labelled.origins, unlabelled.origins),
-        )
+        return training_of(labelled, unlabelled, sub_goal, config, self.seed)
 
 
 def _minutes(seconds: float) -> str:

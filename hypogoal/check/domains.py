@@ -81,7 +81,7 @@ class _Played:
             images = engine.images(engine.ids)
             labels = engine.labels(engine.ids)
             self.require_observations("images", images, COUNT)
-            _require_array("labels", labels, np.bool_, COUNT, len(domain.sub_goals))
+            _require_array("labels", labels, bool, COUNT, len(domain.sub_goals))
             elapsed += 1
             over = shown["terminated"] | shown["truncated"]
             is_late = elapsed >= MAX_STEPS
@@ -94,7 +94,10 @@ class _Played:
             text = f"{len(looks)} observations have {len(seen)} different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=1)
         if images.dtype == PICTURE:
-            _warn_of_small(images.shape[1:])
+            try:  # members see pictures of any size
+                embedding_for(images.shape[1:], None, AUTO)
+            except UserError as error:
+                warnings.warn(f"options cannot be learned from these pictures: {error}", stacklevel=1)
         return f"{images.dtype} {images.shape[1:]}"
 
     def two_engines(self) -> None:
@@ -169,14 +172,6 @@ class _Played:
             shown["images"] = engine.images(ids)
             shown["labels"] = engine.labels(ids)
             yield shown
-
-
-def _warn_of_small(picture: tuple[int, ...]) -> None:
-    """Members see pictures of any size."""
-    try:
-        embedding_for(picture, None, AUTO)
-    except UserError as error:
-        warnings.warn(f"options cannot be learned from these pictures: {error}", stacklevel=1)
 
 
 def _require_step(step: Any) -> None:

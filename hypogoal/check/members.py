@@ -16,12 +16,12 @@ from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import stored
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
-from hypogoal.hypotheses.config import FULL, EnsembleConfig
+from hypogoal.hypotheses import views
+from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import inputs_of
 from hypogoal.hypotheses.training import train
-from hypogoal.hypotheses.views import StateOrigins, changed_by, view_of
 from hypogoal.observations import PICTURE
 
 FEW = 8  # states
@@ -79,7 +79,7 @@ class _Trained:
         is_same = np.array_equal(seen, np.concatenate(alone))
         promise(is_same, "a state alone and among others differ", "Look at each state alone.")
         batch = view.to_change(few)
-        plain = changed_by(view, batch, None)
+        plain = views.changed_by(view, batch, None)
         is_plain = np.array_equal(seen, plain)
         promise(is_plain, "without a generator a batch is not what members see", "Change nothing without one.")
 
@@ -87,7 +87,7 @@ class _Trained:
         """What it learned is in its parameters and buffers."""
         view = self.ensemble().view
         observations = self.states.labelled.observations
-        fresh = view_of(self.name, (), observations.shape[1:], observations.dtype)
+        fresh = views.view_of(self.name, (), observations.shape[1:], observations.dtype)
         fresh.load_state_dict(view.state_dict())
         seen = view.see(observations)
         is_same = np.array_equal(fresh.see(observations), seen)
@@ -96,14 +96,14 @@ class _Trained:
     def ensemble(self) -> Ensemble:
         """A fresh one, trained."""
         labelled, unlabelled = self.states.labelled, self.states.unlabelled
-        settings: dict[str, Any] = {**SMALL, self.setting: self.name}
+        settings = SMALL | {self.setting: self.name}
         return train(
             labelled.observations,
             labelled.labels[:, 0],
             unlabelled.observations,
             EnsembleConfig(**settings),
             self.seed,
-            origins=StateOrigins(labelled.origins, unlabelled.origins),
+            origins=views.StateOrigins(labelled.origins, unlabelled.origins),
         )
 
 
@@ -122,8 +122,8 @@ class _Network:
     states: Any  # observations (N, *obs)
 
     def ensemble(self, seed: int = 0) -> Ensemble:
-        view = view_of(FULL, (), self.states.shape[1:], self.states.dtype)
-        view.fit(self.states, self.states, StateOrigins(), 0)
+        view = views.view_of(views.FULL, (), self.states.shape[1:], self.states.dtype)
+        view.fit(self.states, self.states, views.StateOrigins(), 0)
         return Ensemble(self.name, view.shape, 2, torch_generator(seed, "check"), view)
 
     def inputs(self, ensemble: Ensemble) -> Tensor:

@@ -81,5 +81,5 @@ def _derived(objective: Objective, members: int, states: int, frozen: int, gap: 
     labels = torch.tensor([0, 1, 0, 1, 1, 0])
     context = Context(labels, labelled, unlabelled, logits[members:, 6:], 0.25)
     loss = disagreement_of(objective, context)
-    (gradient,) = torch.autograd.grad(loss + 0 * trained.sum(), trained)
+    [gradient] = torch.autograd.grad(loss + 0 * trained.sum(), trained)
     return loss, gradient

@@ -104,7 +104,7 @@ class _PlayedPart:
 
     def loop(self) -> OptionLoop:
         """It and other parts, fresh."""
-        settings = {**SMALL, "network": "light", "chooser": "random", self.setting: self.name}
+        settings = SMALL | {"network": "light", "chooser": "random", self.setting: self.name}
         config = TrainMetaConfig.of(**settings)
         setup = Setup(self.domain, SOURCE, Path(), config, self.seed)
         return assemble(setup, _made_up)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, TypeAlias, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Self, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,12 @@ from hypogoal.core.checkpoints import Resumable, State
 if TYPE_CHECKING:
     import torch
 
-Bools: TypeAlias = NDArray[np.bool_]
-Bytes: TypeAlias = NDArray[np.uint8]  # pictures, and the console's memory
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float32]
-Doubles: TypeAlias = NDArray[np.float64]
+Array = NDArray[Any]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]  # pictures, and the console's memory
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Columns(Resumable):
         self.put(slice(None), type(self)(**snapshot))
 
 
-def tensor(values: NDArray[Any], device: torch.device) -> torch.Tensor:
+def tensor(values: Array, device: torch.device) -> torch.Tensor:
     """An array as a tensor on a device; on the CPU it shares the array's memory."""
     import torch
 

@@ -355,7 +355,7 @@ def _manifest_of(out: Path) -> Manifest:
     with reading(out, ANEW, "the data file"), h5py.File(out) as file:
         domain = file.attrs["domain"]
         name = domain if isinstance(domain, str) else domain.decode()
-        config = {**json.loads(file.attrs["config"]), "domain": name}
+        config = json.loads(file.attrs["config"]) | {"domain": name}
         return Manifest(kind=DATA, config=config, seed=int(file.attrs["seed"]))
 
 

@@ -4,8 +4,6 @@ A state is nested dicts and lists of arrays, tensors and plain JSON values; obje
 it back with ``restore(snapshot)``. One state is one safetensors file with its JSON part as bytes; no pickle.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -14,7 +14,7 @@ from functools import cache
 from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, ClassVar, TypeAlias, TypeVar, Union, get_args, get_origin
+from typing import Any, ClassVar, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -31,7 +31,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 
 C = TypeVar("C", bound="Config")
-Values: TypeAlias = Mapping[str, Any]  # of settings, by name
+Values = Mapping[str, Any]  # of settings, by name
 DOMAIN = "doorkey"  # its presets and defaults hold if no domain is named
 PRESETS = Path(__file__).parents[1] / "presets"
 MODELS = {  # by stage; collect's are its domain's, those of run its experiment's
@@ -120,8 +120,7 @@ def setting(default: Any, meaning: str, **details: Any) -> Any:
 
 def model_of(stage: str) -> type[Config]:
     """The model of the settings of one of ``MODELS``."""
-    model: type[Config] = resolve_name(MODELS[stage])
-    return model
+    return resolve_name(MODELS[stage])
 
 
 def assigned(assignments: Iterable[str]) -> dict[str, str]:
@@ -197,7 +196,7 @@ def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str
     sources: dict[str, str] = {}
     for values, source in layers:
         sources |= dict.fromkeys(values, source)
-    rows: dict[str, dict[str, Any]] = {}
+    rows = {}
     for home in (*model.__mro__, *every.__mro__):
         for name in inspect.get_annotations(home):
             field = every.model_fields.get(name)
@@ -287,7 +286,7 @@ def _joined(model: type[C], *parts: type[Config]) -> Any:
     """One model of all fields, ``model``'s first; a part may derive from ``model``."""
     if not parts:
         return model
-    bases: Any = parts
+    bases = parts
     if not any(issubclass(part, model) for part in parts):
         bases = (model, *parts)
     return create_model(model.__name__, __base__=bases, __doc__=model.__doc__)

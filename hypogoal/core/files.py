@@ -49,7 +49,7 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """The rows of a log that may still be growing, but for a half-written one; none if it cannot be read."""
-    rows: list[dict[str, Any]] = []
+    rows = []
     with contextlib.suppress(OSError, ValueError):
         for line in path.read_text(encoding="utf-8").splitlines():
             rows.append(json.loads(line))

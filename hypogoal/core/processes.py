@@ -86,14 +86,15 @@ def in_processes(
     not survive it. ``forked`` is for tasks that need neither; it holds on Linux only. The program that called is not
     run again in spawned ones: it may have no file, or no main guard.
     """
-    if min(workers, len(tasks)) <= 1 or multiprocessing.current_process().daemon:
+    workers = min(workers, len(tasks))
+    if workers <= 1 or multiprocessing.current_process().daemon:
         for number, task in enumerate(tasks):
             done(number, task())
         return
     others = set(multiprocessing.active_children())
     context = multiprocessing.get_context("fork" if forked and sys.platform == "linux" else "spawn")
     try:
-        pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _begin, (own_code.environment(),))
+        pool = ProcessPoolExecutor(workers, context, _begin, (own_code.environment(),))
     except (OSError, ImportError) as error:
         do = f"Make /dev/shm writable, or give {CORES}=1 in the environment: one process."
         raise UserError(f"processes cannot share memory ({error})", "/dev/shm", do) from None
@@ -172,8 +173,11 @@ def prepare(device: str = "auto") -> str:
     of unused weights end) count as 0: arithmetic with them takes many times as long. An unknown device, or one that
     torch does not find, is a ``UserError``.
     """
+    import numpy
     import torch
 
+    for kind in (numpy.float32, numpy.float64):
+        numpy.finfo(kind)  # while there are denormal numbers: else NumPy 2.3 and older warn that there are none
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     if device not in DEVICES:

@@ -76,7 +76,7 @@ class MetricsLog:
 
     def __init__(self, path: Path, tensorboard: Path | None = None):
         self._path = path
-        self._board: Any = None
+        self._board = None
         if tensorboard:
             from torch.utils.tensorboard import SummaryWriter
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core import own_code
 from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import Resumable, State
-from hypogoal.core.config import Config, model_of, preset, resolve
+from hypogoal.core.config import Config, Values, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
 from hypogoal.observations import PICTURE, DType, Observations, Shape, Standard
@@ -127,8 +127,8 @@ class Engine(Resumable, ABC):
 
     def reset(self) -> Ints:
         """Begin a new episode in every environment; returns the ids, int64 (E,). Uses ``restart`` by default."""
-        self.ids = self.elapsed = np.zeros(self.count, np.int64)
-        self.restart(np.ones(self.count, np.bool_))
+        self.ids = self.elapsed = np.zeros(self.count, int)
+        self.restart(np.ones(self.count, bool))
         return self.ids.copy()
 
     @abstractmethod
@@ -245,7 +245,7 @@ class TurnEngine(Engine):
         return seen
 
     def snapshot(self) -> State:
-        return {**super().snapshot(), "facts": np.frombuffer(self._facts, np.uint8).copy()}
+        return super().snapshot() | {"facts": np.frombuffer(self._facts, np.uint8).copy()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
@@ -302,7 +302,7 @@ class Domain(ABC):
     sub_goals: tuple[str, ...]
     config_class: type[Config]
     engine_settings: tuple[str, ...] = ()
-    defaults: Mapping[str, Mapping[str, Any]] = {}
+    defaults: Mapping[str, Values] = {}
     sources: Mapping[str, str] = {}
     env_id: str = ""
     starts: tuple[str, ...] = ()
@@ -341,7 +341,7 @@ class Domain(ABC):
             raise UserError("this domain has no Gymnasium environment", self.name, "Name an environment instead.")
         return gymnasium.make(self.env_id, **arguments)
 
-    def world(self, config: Mapping[str, Any]) -> dict[str, Any]:
+    def world(self, config: Values) -> dict[str, Any]:
         """The engine settings among ``config``, the settings that states were collected with.
 
         ``config`` is that of a data file, or ``domain_config`` of an artefact. Missing settings are left to
@@ -351,7 +351,7 @@ class Domain(ABC):
         checked = resolve(self.config_class, values, stage="collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
-    def task(self, world: Mapping[str, Any]) -> str:
+    def task(self, world: Values) -> str:
         """What is rewarded and what ends an episode, in a sentence or two for people.
 
         ``world``: as of :meth:`world`; settings that it lacks have their defaults.
@@ -402,7 +402,7 @@ def installed_domain(name: str) -> Domain | None:
         return None
 
 
-def layers_of(stage: str, domain: str, preset_name: str | None) -> list[tuple[Mapping[str, Any], str]]:
+def layers_of(stage: str, domain: str, preset_name: str | None) -> list[tuple[Values, str]]:
     """What replaces the defaults of a stage's settings, and its source: the domain's own, then a preset's."""
     installed = installed_domain(domain)
     layers = []
@@ -415,9 +415,9 @@ def settings_of(
     stage: str,
     domain: str,
     preset_name: str | None = None,
-    typed: Mapping[str, Any] | None = None,
+    typed: Values | None = None,
     *,
-    inherited: Mapping[str, Any] | None = None,
+    inherited: Values | None = None,
 ) -> Any:
     """The settings of a stage on a domain: its defaults, a preset's, those ``inherited``, then what the user typed.
 

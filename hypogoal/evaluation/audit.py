@@ -98,14 +98,14 @@ def findings(
     most frequent kinds a film is put into ``folder``, of pictures.
     """
     engine = loop.engine
-    threshold = expit(loop.terminations.thresholds[option].astype(np.float64))
+    threshold = expit(loop.terminations.thresholds[option].astype(float))
     table = Exploits.read(folder / Exploits.FILE)
     last = table.at(table.option == option)
     executions = loop.recorder.executions[option]
     fooled = [*compress(executions, last.reached & ~last.near)]
-    ends = np.array([run.states[-1] for run in fooled], np.int64)
+    ends = np.array([run.states[-1] for run in fooled], int)
     labels = engine.labels(ends)
-    positions = engine.positions(ends) if engine.position_names else np.empty((len(ends), 0), np.int64)
+    positions = engine.positions(ends) if engine.position_names else np.empty((len(ends), 0), int)
     marks = pd.DataFrame(np.column_stack([labels, positions // CELL]))
     alike_ones = [rows.index for _, rows in marks.groupby([*marks])]
     kinds = []

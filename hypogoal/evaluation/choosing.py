@@ -36,11 +36,7 @@ TITLE = "What choosing is worth"
 BY = ["method", "chooser"]
 
 
-def qualities(
-    loop: OptionLoop,
-    goals: Ints,
-    states: Ints,
-) -> Doubles:
+def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
     Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
@@ -81,11 +77,7 @@ def qualities(
     return qualities
 
 
-def judge(
-    choices: Choices,
-    quality: Doubles,
-    members: int,
-) -> dict[str, Any]:
+def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
     ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
@@ -111,17 +103,8 @@ def judge(
     }
 
 
-def _within_rho(
-    quality,
-    preference,
-    goals,
-):
-    both = pd.DataFrame(
-        {
-            "quality": quality,
-            "preference": preference,
-        }
-    ).dropna()
+def _within_rho(quality, preference, goals):
+    both = pd.DataFrame({"quality": quality, "preference": preference}).dropna()
     rhos = []
     for _, alike in both.groupby(goals[both.index]):
         differ = house.at_least(np.ptp(alike["quality"]), DIFFERENCE)
@@ -131,12 +114,7 @@ def _within_rho(
     return pd.Series(rhos, dtype=float).mean()
 
 
-def _better_of_two(
-    quality,
-    taken,
-    among,
-    goals,
-):
+def _better_of_two(quality, taken, among, goals):
     better, both = 0, 0
     for pair in combinations(range(len(quality)), 2):
         bad, good = sorted(pair, key=quality.__getitem__)
@@ -147,11 +125,7 @@ def _better_of_two(
     return better / both if both else math.nan
 
 
-def _score(
-    quality,
-    taken,
-    among,
-):
+def _score(quality, taken, among):
     offered = pd.DataFrame(np.where(among, quality, np.nan))
     own = quality[taken]
     compared = (offered.count(axis=1) > 1) & np.isfinite(own)
@@ -170,7 +144,7 @@ def rows(work):
         played = play_agent(artefact)
         if played is None:
             continue
-        place = {**work.place(artefact), "scope": FROZEN}
+        place = work.place(artefact) | {"scope": FROZEN}
         agent, uniform, members = played
         yield house.tidy(agent, **place)
         yield house.tidy(uniform, **place | {"method": UNIFORM})
@@ -212,14 +186,7 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
         judged = judge(played.choices, quality, config["members"])
         preferences.append(judged.pop("preference"))
         numbers.append({name: scores[name].mean() for name in OF_PLAY} | judged)
-    return (
-        numbers[0],
-        numbers[1],
-        {
-            "quality": quality,
-            "conditional_preference": preferences[0],
-        },
-    )
+    return (numbers[0], numbers[1], {"quality": quality, "conditional_preference": preferences[0]})
 
 
 def context(results):
@@ -232,7 +199,4 @@ def with_choosers(runs: pd.DataFrame) -> pd.DataFrame:
     """The same with a column ``chooser``; the method of uniform-random choice is the agent whose options it has."""
     uniform = runs["method"] == UNIFORM
     agents = runs[~uniform].drop_duplicates("artefact").set_index("artefact")["method"]
-    return runs.assign(
-        chooser=runs["method"].where(uniform, "the agent's"),
-        method=runs["artefact"].map(agents),
-    )
+    return runs.assign(chooser=runs["method"].where(uniform, "the agent's"), method=runs["artefact"].map(agents))

@@ -58,7 +58,7 @@ class OwnClassifier:
         if isinstance(answer, torch.Tensor):
             answer = answer.detach().cpu().double()
         try:
-            probabilities = np.asarray(answer, dtype=np.float64)
+            probabilities = np.asarray(answer, float)
         except (TypeError, ValueError, RuntimeError):
             probabilities = np.array(np.nan)  # words, for example
         if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():

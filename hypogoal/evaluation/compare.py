@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pandas as pd
+from pandas import DataFrame
 
 from hypogoal.core.files import reading
 from hypogoal.evaluation import (
@@ -56,7 +57,7 @@ def shared(runs: Runs) -> Shared:
 def of_runs(
     contexts: Mapping[str, Context],
     name: str,
-) -> pd.DataFrame:
+) -> DataFrame:
     """The tables of this name, one run's after another's, with a column ``run``."""
     return pd.concat([context[name].assign(run=label) for label, context in contexts.items()])
 
@@ -73,7 +74,7 @@ def why_not(runs: Runs, questions: Shared) -> str | None:
     return None if questions else "they have no kind of result in common"
 
 
-def differences(runs: Runs) -> pd.DataFrame:
+def differences(runs: Runs) -> DataFrame:
     """What was not the same, a column per run: settings by the kind of artefact, seeds, data and versions."""
     settings = [settings_of(results).assign(run=label) for label, results in runs.items()]
     cells = pd.concat(settings).sort_values("text").groupby(["of", "setting", "run"])
@@ -81,7 +82,7 @@ def differences(runs: Runs) -> pd.DataFrame:
     return by_run[by_run.nunique(axis=1) > 1].rename_axis(columns=None).reset_index()
 
 
-def compare_runs(questions: Shared) -> pd.DataFrame:
+def compare_runs(questions: Shared) -> DataFrame:
     """Spec F5: the first run against each other, ``agent`` by agent and method by method, over what they share."""
     parts = []
     for contexts in questions.values():
@@ -91,16 +92,16 @@ def compare_runs(questions: Shared) -> pd.DataFrame:
                 if len(solved) and not solved.any():
                     alike = alike[alike["of"] != "length"]  # that of the limit, where nobody solved an episode
                 parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))
-    return pd.concat(parts) if parts else pd.DataFrame(columns=["N", "quantity", "first", "second", "of"])
+    return pd.concat(parts) if parts else DataFrame(columns=["N", "quantity", "first", "second", "of"])
 
 
-def read_pairs(path: Path) -> pd.DataFrame:
+def read_pairs(path: Path) -> DataFrame:
     """The pairs of a comparison artefact; a ``UserError`` where they are missing or damaged."""
     with reading(path, "Compare the runs again.", "the comparison"):
         return pd.read_csv(path / "pairs.csv").astype({"N": "Int64"})
 
 
-def winners(compared: pd.DataFrame) -> list[str]:
+def winners(compared: DataFrame) -> list[str]:
     """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
     rows = compared.astype(object).where(compared.notna(), None)
     return lines_of("winners.txt", pairs=rows.to_dict("records"))
@@ -110,7 +111,7 @@ def page_of(
     runs: Runs,
     questions: Shared,
     paths: Sequence[str],
-) -> tuple[str, list[Drawn], dict[str, pd.DataFrame]]:
+) -> tuple[str, list[Drawn], dict[str, DataFrame]]:
     """The page of a comparison, its figures, and its tables by name."""
     tables = {
         "pairs": compare_runs(questions),

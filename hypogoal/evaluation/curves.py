@@ -57,7 +57,7 @@ def scores(
 
     ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
     """
-    path = np.asarray(shortest, dtype=np.float64)
+    path = np.asarray(shortest, float)
     columns: dict[str, Any] = {"success": succeeded * 1.0}
     for name, factor in WITHIN.items():
         within = succeeded & (steps <= factor * path)
@@ -122,7 +122,7 @@ def rows(work):
     """Every agent's run at its end, and its curves; random play on each layout."""
     agents = work.ranked(work.contents.agents)
     most = max((budget_of(artefact.config) for artefact in agents), default=0)
-    grid = np.linspace(0, most, POINTS).round().astype(np.int64)
+    grid = np.linspace(0, most, POINTS).round().astype(int)
     random = {}
     for artefact in agents:
         place, steps = work.place(artefact), budget_of(artefact.config)
@@ -155,7 +155,7 @@ def context(results):
     """Every agent's numbers; Figure 6."""
     agents = results.of(method=[*results.facts["agents"]])
     tables = tables_of(per_run(agents, *QUANTITIES), BY, PAIRED)
-    return tables and {**tables, "figures": [*_figures(results)]}
+    return tables and tables | {"figures": [*_figures(results)]}
 
 
 def _figures(results):

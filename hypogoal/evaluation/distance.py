@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from hypogoal.core.arrays import Bytes
 from hypogoal.domains.base import installed_domain
@@ -44,14 +45,14 @@ FATES = {  # how Figure 5 marks it
 STOP = ["room", "column", "row", "fate"]  # where an execution stopped, in the picture of the room
 
 
-def last_executions(executions: Executions) -> pd.DataFrame:
+def last_executions(executions: Executions) -> DataFrame:
     """Spec F3: the last executions of each option, a row each, with what they count.
 
     ``counted``, the distance, is 300 where it began inside its own termination set; ``reached_base``: it stopped within
     4 of a true base and did not begin inside; ``timed_out``: neither classifier nor death ended it; ``fate`` as in
     Figure 5.
     """
-    last = pd.DataFrame(vars(executions)).groupby("option").tail(LAST)
+    last = DataFrame(vars(executions)).groupby("option").tail(LAST)
     inside = last["inside_at_start"]
     near = (last["distance"] <= NEAR) & ~inside
     return last.assign(
@@ -63,7 +64,7 @@ def last_executions(executions: Executions) -> pd.DataFrame:
     )
 
 
-def option_numbers(executions: Executions) -> pd.DataFrame:
+def option_numbers(executions: Executions) -> DataFrame:
     """Spec F3: a row for each option with the numbers of its last executions; no deviation of one execution.
 
     Units: the domain's; duration in steps; shares of executions.
@@ -101,7 +102,7 @@ def rows_of_ladder(
     config: Mapping[str, Any],
     validated: Mapping[str, float | None],
     place: Mapping[str, Any],
-) -> Iterator[pd.DataFrame]:
+) -> Iterator[DataFrame]:
     """Spec F3: one options artefact, trained from one start (a ladder) on G sub-goals with K members each.
 
     Per sub-goal each member's numbers; the best member (the least mean distance), the worst, and the validated one.
@@ -182,7 +183,7 @@ def _figures(results, table):
             stops = results.arrays.get(f"stops/{option['artefact']}")
             if stops is not None:
                 groups = "" if pd.isna(option["N"]) else f", N={option['N']}"
-                shown[option["method"] + groups] = pd.DataFrame(stops, columns=STOP)
+                shown[option["method"] + groups] = DataFrame(stops, columns=STOP)
         if shown:
             draw = partial(stops_over_rooms, rooms, shown)
             yield Drawn(
@@ -193,7 +194,7 @@ def _figures(results, table):
             )
 
 
-def distance_bars(best: pd.DataFrame) -> Figure:
+def distance_bars(best: DataFrame) -> Figure:
     """Figure 4: the best member's distance, methods side by side for each N; lower is better."""
     groups = best["N"].map("N={}".format).mask(best["N"].isna(), "true sub-goal")
     if best["sub_goal"].nunique() > 1:
@@ -205,7 +206,7 @@ def distance_bars(best: pd.DataFrame) -> Figure:
     return figure
 
 
-def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, pd.DataFrame]) -> Figure:
+def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, DataFrame]) -> Figure:
     """Figure 5: a row per option, side by side the two rooms in which most executions of all of them stopped.
 
     What became of an execution is told by shape and by colour. ``rooms`` are pictures uint8 (H, W, 3) by their numbers,

@@ -78,13 +78,13 @@ def play(
     engine = loop.engine
     episodes = episodes or max(EPISODES, STEPS // engine.max_steps)
     begin_anew(loop, chooser)
-    ended = np.zeros(engine.count, dtype=np.int64)
-    length, succeeded = np.zeros((2, engine.count, episodes), dtype=np.int64)
+    ended = np.zeros(engine.count, int)
+    length, succeeded = np.zeros((2, engine.count, episodes), int)
     decisions = []
     while ended.min() < episodes:
         free = np.flatnonzero((loop.option == NONE) & (ended < episodes))
         ids = engine.ids[free]
-        offered = np.ones((len(ids), loop.terminations.options), dtype=np.bool_)
+        offered = np.ones((len(ids), loop.terminations.options), bool)
         if loop.config.mask_reached:
             offered = offered_options(loop.terminations.of(ids))
         moved = loop.advance(learning=False)

@@ -1,17 +1,15 @@
 """The one table of results, and what is done with it: values of runs, means over runs, pairs of runs (Spec F5, H7)."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Iterable, Sequence
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from pandas import DataFrame
 from pydantic_core import to_json
 from scipy.special import bdtr, stdtrit
 
@@ -52,13 +50,13 @@ BOOTSTRAP_FROM = 8  # values: of 2 a bootstrap would hold in 49 % of cases, of 5
 @cache
 def shares() -> set[str]:
     """The quantities that lie within 0 and 1."""
-    text = resources.files("hypogoal.evaluation").joinpath("quantities.toml").read_text(encoding="utf-8")
+    text = Path(__file__).with_name("quantities.toml").read_text(encoding="utf-8")
     return {name for name, (unit, _) in tomllib.loads(text).items() if unit == "fraction"}
 
 
-def tidy(numbers: Any, **place: Any) -> pd.DataFrame:
+def tidy(numbers: Any, **place: Any) -> DataFrame:
     """A row for each number by its name, all of one place (columns of the table)."""
-    rows = pd.DataFrame(numbers.items(), columns=["quantity", "value"])
+    rows = DataFrame(numbers.items(), columns=["quantity", "value"])
     return rows.assign(**place)
 
 
@@ -66,9 +64,9 @@ def melted(
     columns: Any,
     index: Any = None,
     **place: Any,
-) -> pd.DataFrame:
+) -> DataFrame:
     """A row for each value of each column, by the names of its ``index``; without any it is of each of K members."""
-    table = pd.DataFrame(columns)
+    table = DataFrame(columns)
     if index is not None:
         table = table.set_axis(index)
     if table.index.names == [None]:
@@ -83,12 +81,12 @@ def options_of(config: Any) -> pd.MultiIndex:
     return pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])
 
 
-def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
+def joined(parts: Iterable[DataFrame]) -> DataFrame:
     """The table of rows of several parts; a number that is not defined has no row."""
-    return typed(pd.concat([pd.DataFrame(columns=[*TYPES]), *parts]))
+    return typed(pd.concat([DataFrame(columns=[*TYPES]), *parts]))
 
 
-def typed(rows: pd.DataFrame) -> pd.DataFrame:
+def typed(rows: DataFrame) -> DataFrame:
     """The same rows, with the columns and types that all others here expect."""
     rows = rows.reindex(columns=[*TYPES]).astype(object)
     rows[TEXTS] = rows[TEXTS].fillna("")
@@ -96,7 +94,7 @@ def typed(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[np.isfinite(rows["value"])].reset_index(drop=True)
 
 
-def read_numbers(path: Path) -> pd.DataFrame:
+def read_numbers(path: Path) -> DataFrame:
     """``numbers.csv`` of this version, or of one with other columns; a ``UserError`` where it is missing or damaged."""
     nothing = dict.fromkeys(NUMBERS, "")
     with reading(path, EVALUATE_AGAIN, "the table of numbers"):
@@ -105,12 +103,12 @@ def read_numbers(path: Path) -> pd.DataFrame:
 
 
 def per_run(
-    numbers: pd.DataFrame,
+    numbers: DataFrame,
     *quantities: str,
     scope: str = "",
     member: str = "mean",
     name: str = "{}",
-) -> pd.DataFrame:
+) -> DataFrame:
     """Quantities' final values in each run: columns ``RUN``, ``value``, ``quantity`` as tables call it, ``of`` which.
 
     ``member``: which of a run's members, ``best`` (the highest), ``mean`` or ``worst``, or the quantity whose value is
@@ -163,10 +161,10 @@ def interquartile_mean(values: Any, axis: int = 0) -> Any:
 
 
 def tables_of(
-    runs: pd.DataFrame,
+    runs: DataFrame,
     by: Sequence[str],
     paired: Sequence[str] = (),
-) -> dict[str, pd.DataFrame]:
+) -> dict[str, DataFrame]:
     """What a question's template is given of :func:`per_run`: ``table``, and ``compared``; nothing without runs."""
     if runs.empty:
         return {}
@@ -176,7 +174,7 @@ def tables_of(
     }
 
 
-def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+def over(runs: DataFrame, by: Sequence[str]) -> DataFrame:
     """Spec F5: a row of statistics for each combination of ``by`` and each quantity of :func:`per_run`.
 
     The values are layouts, each by the mean of its runs or, with one layout, the runs. Columns: ``by``, ``quantity``,
@@ -188,10 +186,10 @@ def over(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     for key, cell in runs.groupby(names, dropna=False, sort=False):
         labels = dict(zip(names, key, strict=True))
         rows.append(labels | statistics(cell))
-    return pd.DataFrame(rows)
+    return DataFrame(rows)
 
 
-def statistics(runs: pd.DataFrame) -> dict[str, float]:
+def statistics(runs: DataFrame) -> dict[str, float]:
     """See :func:`over`: of runs that are alike."""
     values = runs["value"]
     if runs["layout"].nunique() > 1:
@@ -211,7 +209,7 @@ def statistics(runs: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def pairs(runs: pd.DataFrame) -> pd.DataFrame:
+def pairs(runs: DataFrame) -> DataFrame:
     """Spec F5: the first method against each other by each quantity, at each N, over runs that share ``SHARED``.
 
     Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Columns: N,
@@ -228,19 +226,19 @@ def pairs(runs: pd.DataFrame) -> pd.DataFrame:
             both = paired(first, second, SHARED)
             if len(both):
                 rows.append(place | compare(both))
-    return pd.DataFrame(rows)
+    return DataFrame(rows)
 
 
 def paired(
-    first: pd.DataFrame,
-    second: pd.DataFrame,
+    first: DataFrame,
+    second: DataFrame,
     on: Sequence[str],
-) -> pd.DataFrame:
+) -> DataFrame:
     """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
     return first.merge(second, on=list(on), suffixes=("", "_second"))
 
 
-def compare(both: pd.DataFrame, unit: str = "layout") -> dict[str, Any]:
+def compare(both: DataFrame, unit: str = "layout") -> dict[str, Any]:
     """Spec F5: the first of two methods against the second over n pairs of runs, see :func:`paired`.
 
     Pairs of one unit (a column: the layout, or the seed where there is one layout) are not independent: everything but

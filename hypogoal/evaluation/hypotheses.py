@@ -11,20 +11,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import (
-    Bools,
-    Doubles,
-    Floats,
-    Ints,
-)
+from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import (
-    at_least,
-    melted,
-    per_run,
-    tables_of,
-    tidy,
-)
+from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
 from hypogoal.evaluation.judging import Judged
 from hypogoal.evaluation.page import Drawn
 from hypogoal.hypotheses import scores
@@ -68,13 +57,7 @@ def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
     if planted:
         numbers["coverage"] = coverage(judged.probabilities, planted)
     positive = pd.DataFrame(judged.unlabelled).mean()
-    yield melted(
-        {
-            "threshold": judged.thresholds,
-            "positive_unlabelled": positive,
-        },
-        scope=HELDOUT,
-    )
+    yield melted({"threshold": judged.thresholds, "positive_unlabelled": positive}, scope=HELDOUT)
     yield tidy(numbers, scope=HELDOUT)
     yield tidy({"disagreement": scores.mean_disagreement(judged.unlabelled)}, scope="unlabelled")
     scopes = {HELDOUT: labels | True}
@@ -95,11 +78,7 @@ def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
     yield tidy(crossed, scope=scope)
 
 
-def knowledge(
-    judged: Judged,
-    inside: Bools,
-    contexts: Ints | None,
-) -> tuple[dict[str, Doubles], dict[str, float]]:
+def knowledge(judged: Judged, inside: Bools, contexts: Ints | None) -> tuple[dict[str, Doubles], dict[str, float]]:
     """What K members know of the states ``inside``, (N,) like ``contexts``, layouts or rooms.
 
     Returns of each member (K,) ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that its
@@ -123,11 +102,7 @@ def knowledge(
     return columns, dict(zip(CROSS_FITTED, crossed, strict=True))
 
 
-def choose(
-    predictions: Bools,
-    labels: Bools,
-    seen: Ints,
-) -> dict[str, float | None]:
+def choose(predictions: Bools, labels: Bools, seen: Ints) -> dict[str, float | None]:
     """Spec F1: the member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
 
     The first of equally good ones, since their order is random; None where those rooms lack a class.
@@ -154,16 +129,7 @@ def context(results):
     """The numbers of ensembles but those judged room by room, which ``rooms`` has; Figure 3's for one context."""
     by_room = results.of(scope="unseen")["artefact"]
     numbers = results.numbers[~results.numbers["artefact"].isin(by_room)]
-    values = [
-        per_run(
-            numbers,
-            "balanced_accuracy",
-            scope=HELDOUT,
-            member=which,
-            name=which,
-        )
-        for which in WHICH
-    ]
+    values = [per_run(numbers, "balanced_accuracy", scope=HELDOUT, member=which, name=which) for which in WHICH]
     values.append(per_run(numbers, *KNOWN, "coverage", scope=HELDOUT))
     for states in ("unlabelled", HELDOUT):
         values.append(per_run(numbers, "disagreement", scope=states, name=f"{{}}_{states}"))
@@ -171,12 +137,7 @@ def context(results):
     if not tables:
         return {}
     table = tables["table"]
-    means = table[table["quantity"].isin(WHICH)].pivot_table(
-        "mean",
-        BY,
-        "quantity",
-        sort=False,
-    )
+    means = table[table["quantity"].isin(WHICH)].pivot_table("mean", BY, "quantity", sort=False)
     label = "Members' balanced accuracy on held-out states"
     figure = Drawn("members", label, partial(members_figure, means))
     return tables | chosen_in(results) | {"figures": [figure] if len(means) else []}

@@ -1,7 +1,5 @@
 """What members say of held-out and of unlabelled states: by far the longest part of an evaluation, on several cores."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -75,7 +73,7 @@ class Work:
 
     def place_of(self, judgement: Judgement) -> dict[str, Any]:
         """Where the numbers of a sub-goal's members stand."""
-        return {**self.place(judgement.artefact), "sub_goal": judgement.sub_goal}
+        return self.place(judgement.artefact) | {"sub_goal": judgement.sub_goal}
 
     def ranked(self, artefacts: list[Artefact]) -> list[Artefact]:
         """Some of the run's, the paper's method first."""

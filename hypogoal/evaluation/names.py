@@ -4,13 +4,14 @@ Runs that were not made alike are never averaged: they have different names.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from hypogoal.core.artefacts import Artefact
+from hypogoal.core.config import Values
 from hypogoal.evaluation.run import Contents, takes
 
 # Settings that may differ between two runs that are averaged, or that follow from others.
@@ -39,7 +40,7 @@ METHODS = ("D-BAT", "DivDis", "no diversity", ONE)  # of ensembles
 ORDER = (*METHODS, LEARNED, RANDOM, PRETRAINING, ORACLE_AGENT, ORACLE_RANDOM)  # in tables and figures
 
 
-def ensemble_title(config: Mapping[str, Any]) -> str:
+def ensemble_title(config: Values) -> str:
     """An ensemble by its objective and its number of members."""
     if config["members"] == 1:
         return ONE
@@ -47,7 +48,7 @@ def ensemble_title(config: Mapping[str, Any]) -> str:
     return f"{objective}, {config['members']} members"
 
 
-def agent_title(kind: str, config: Mapping[str, Any]) -> str:
+def agent_title(kind: str, config: Values) -> str:
     """Spec E6, E7: an agent by how it chooses and what ends its options."""
     if kind == "baseline":
         return f"{config['agent'].upper()} {config['setting']}"
@@ -68,7 +69,7 @@ def rank(name: str) -> int:
 
 def names_apart(
     titles: Sequence[str],
-    configs: Sequence[Mapping[str, Any]],
+    configs: Sequence[Values],
     groups: Sequence[Any] = (),
 ) -> list[str]:
     """A name for each of n things: its title, and the settings by which it differs from most of that title.
@@ -108,7 +109,7 @@ def as_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
-def groups_of(config: Mapping[str, Any]) -> int | None:
+def groups_of(config: Values) -> int | None:
     """N, the number of labelled ladder groups that an ensemble's data have; None where its domain has no such thing."""
     groups = (config.get("domain_config") or {}).get("groups")
     return groups if isinstance(groups, int) else None
@@ -116,7 +117,7 @@ def groups_of(config: Mapping[str, Any]) -> int | None:
 
 def places_of(contents: Contents) -> dict[Path, dict[str, Any]]:
     """Of each of a run's artefacts, by path, what stands in the table of numbers: method, N, ladder, layout, seed."""
-    configs: list[Mapping[str, Any]] = [ensemble.config for ensemble in contents.ensembles]
+    configs: list[Values] = [ensemble.config for ensemble in contents.ensembles]
     names = names_apart([*map(ensemble_title, configs)], configs)
     places: list[dict[str, Any]] = [{"N": number} for number in map(groups_of, configs)]
     paths = [ensemble.path.resolve() for ensemble in contents.ensembles]

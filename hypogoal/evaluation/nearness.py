@@ -23,13 +23,9 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     """
     domain, sub_goals = setup.domain, setup.source["sub_goals"]
     labels, shape = engine.labels(engine.ids[:1]), (1, len(domain.sub_goals))
-    if labels.shape != shape or labels.dtype != np.bool_:
+    if labels.shape != shape or labels.dtype != bool:
         fault = f"the engine's labels of one state are {labels.dtype} {labels.shape}, not bool {shape}"
-        raise UserError(
-            fault,
-            type(engine).__name__,
-            "Give a truth value for each state and sub-goal.",
-        )
+        raise UserError(fault, type(engine).__name__, "Give a truth value for each state and sub-goal.")
     if setup.config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
         return None
     columns = np.repeat(columns_of(domain, sub_goals), setup.members)
@@ -44,15 +40,11 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     return near
 
 
-def distances_of(
-    domain: Domain,
-    sub_goals: Sequence[str],
-    members: int,
-) -> Distances:
+def distances_of(domain: Domain, sub_goals: Sequence[str], members: int) -> Distances:
     """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
 
     def away(positions: Ints, options: Ints) -> Ints:
-        distances = np.zeros(len(options), np.int64)
+        distances = np.zeros(len(options), int)
         for number, sub_goal in enumerate(sub_goals):
             of_goal = options // members == number
             distances[of_goal] = domain.distance_to(sub_goal, positions[of_goal])

@@ -17,6 +17,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from pandas import DataFrame
 from rich.console import Console
 from rich.table import Table
 
@@ -55,11 +56,11 @@ class Drawn:
 class Results:
     """An evaluated run: what ``numbers.csv``, ``run.json`` and ``arrays.h5`` hold."""
 
-    numbers: pd.DataFrame
+    numbers: DataFrame
     facts: Mapping[str, Any]
     arrays: Mapping[str, Any] = field(default_factory=dict)
 
-    def of(self, **fields: Any) -> pd.DataFrame:
+    def of(self, **fields: Any) -> DataFrame:
         """The numbers whose columns have these values; a list: any of them."""
         rows = self.numbers
         for name, value in fields.items():
@@ -126,10 +127,10 @@ def counted(row: Any) -> str:
 
 
 def displayed(
-    table: pd.DataFrame,
+    table: DataFrame,
     by: dict[str, str],
     columns: Mapping[str, Any],
-) -> pd.DataFrame:
+) -> DataFrame:
     """A table of :func:`house.over` as people read it: a row for each combination of ``by``, whose titles it gives.
 
     ``columns`` are by title a quantity, and a function that writes a row's statistics with its further arguments.
@@ -150,7 +151,7 @@ def displayed(
     return shown.rename(columns=by).set_index([by[name] for name in names])
 
 
-def rows_of(frame: pd.DataFrame) -> list[list[str]]:
+def rows_of(frame: DataFrame) -> list[list[str]]:
     """The rows of a displayed table, labels first, see :func:`sparse`."""
     rows = frame.reset_index(allow_duplicates=True)
     return sparse(rows.to_numpy(), frame.index.nlevels)
@@ -158,14 +159,14 @@ def rows_of(frame: pd.DataFrame) -> list[list[str]]:
 
 def sparse(rows: Any, labels: int) -> list[list[str]]:
     """Rows as texts; so many ``labels`` of each but the last are left out where they are as in the row above."""
-    table = pd.DataFrame(rows).map(str)
+    table = DataFrame(rows).map(str)
     first = table.iloc[:, : labels - 1]
     repeated = first.eq(first.shift()).cummin(axis=1)
     table[first.columns] = first.mask(repeated, "")
     return table.to_numpy().tolist()
 
 
-def terminal(title: str, frame: pd.DataFrame) -> Table:
+def terminal(title: str, frame: DataFrame) -> Table:
     """A displayed table for a terminal, 80 columns wide: of its first columns as many as fit, means alone."""
     frame = frame.map(lambda text: re.split(r" ±| \[", text)[0])
     labels = min(40, max(len(" | ".join(map(str, np.atleast_1d(key)))) for key in frame.index))
@@ -208,7 +209,7 @@ def spans(numbers: Iterable[int]) -> str:
     """Seeds in order, three and more in a row as '970 to 972'."""
     values = np.unique([*numbers])
     gaps = np.flatnonzero(np.diff(values) > 1)
-    texts: list[Any] = []
+    texts = []
     for row in np.split(values, gaps + 1):
         texts += [f"{row[0]} to {row[-1]}"] if len(row) > 2 else [*row]
     return listed(texts)

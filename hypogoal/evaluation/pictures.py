@@ -44,7 +44,7 @@ def coloured(
     colours: int | None = None,
 ) -> Bytes:
     """Observations (..., C) as they are shown, (..., 3): of the last frame."""
-    shown: Bytes = last_frame(observations, colours)
+    shown = last_frame(observations, colours)
     return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
 
 

@@ -22,12 +22,7 @@ def provenance(contents: Contents) -> dict[str, Any]:
     collected = []
     for path in contents.data():
         dataset = open_dataset(path)
-        facts = {
-            "path": path.name,
-            "config": dataset.config,
-            "counts": dataset.counts(),
-            "seed": dataset.seed,
-        }
+        facts = {"path": path.name, "config": dataset.config, "counts": dataset.counts(), "seed": dataset.seed}
         collected.append(facts)
     return {"artefacts": artefacts, "data": collected}
 
@@ -41,16 +36,7 @@ def domains_of(results: Results) -> list[str]:
 def settings_of(results: Results) -> pd.DataFrame:
     """Each value that a setting has in a run: columns ``of`` (a kind of artefact, data, versions), setting, text."""
     recorded = results.facts["provenance"]
-    parts = [
-        (
-            "data",
-            {
-                "seed": data["seed"],
-                **data["config"],
-            },
-        )
-        for data in recorded["data"]
-    ]
+    parts = [("data", {"seed": data["seed"], **data["config"]}) for data in recorded["data"]]
     for artefact in recorded["artefacts"]:
         parts.append((artefact["kind"], {"seed": artefact["seed"], **artefact["config"]}))
         parts.append(("versions", artefact["versions"]))
@@ -67,4 +53,4 @@ def settings_of(results: Results) -> pd.DataFrame:
 
 def context(results):
     """For the template: what was collected, the artefacts, and settings."""
-    return {**results.facts["provenance"], "settings": settings_of(results)}
+    return results.facts["provenance"] | {"settings": settings_of(results)}

@@ -40,7 +40,7 @@ from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.run import FORMAT
 
 Context = dict[str, Any]  # what a question's template is given
-QUESTIONS: list[ModuleType] = [  # in the order of the page
+QUESTIONS = [  # in the order of the page
     curves,
     rooms,
     distance,

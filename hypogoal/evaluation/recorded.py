@@ -126,7 +126,7 @@ def sketches_of(observations: Observations) -> Doubles:
             small = [resized_picture(picture, height, width).ravel() for picture in pictures]
             parts.append(np.stack(small) / 255.0)
     weighed = [part / (np.sqrt(part.var(axis=0).sum()) or 1.0) for part in parts if part.shape[1]]
-    values = np.concatenate(weighed, axis=1).astype(np.float64)
+    values = np.concatenate(weighed, axis=1).astype(float)
     values -= values.mean(axis=0)
     _, directions = np.linalg.eigh(values.T @ values)
     return values @ directions[:, ::-1][:, :DIRECTIONS]

@@ -51,7 +51,7 @@ def context(results):
         name = f"{{}}, {scope}, {which}"
         values.append(per_run(numbers, *SCORED, scope=scope, member=member, name=name))
     tables = tables_of(pd.concat(values), BY, PAIRED)
-    return {**tables, "figures": [*_figures(tables["table"])]}
+    return tables | {"figures": [*_figures(tables["table"])]}
 
 
 def _figures(table):

@@ -39,27 +39,11 @@ def context(results):
                 figures += _figures(of_goal[0], facts["kinds"][0], suffix)
         elif arrays:
             draw = partial(bars_of_features, arrays["attributions"], facts["features"])
-            figures.append(
-                Drawn(
-                    f"features{suffix}",
-                    "What members go by",
-                    draw,
-                    {"sub_goal": name},
-                )
-            )
-    return {
-        "ensemble": looked_at["ensemble"],
-        "explained": explained,
-        "states": states,
-        "figures": figures,
-    }
+            figures.append(Drawn(f"features{suffix}", "What members go by", draw, {"sub_goal": name}))
+    return {"ensemble": looked_at["ensemble"], "explained": explained, "states": states, "figures": figures}
 
 
-def _gallery(
-    arrays,
-    sub_goal,
-    facts,
-):
+def _gallery(arrays, sub_goal, facts):
     """Each state with its arrays, those of attributions if it has any."""
     shared = {"sub_goal": sub_goal, "colours": facts["colours"], "attributions": []}
     outcome = outcomes(arrays["predictions"], arrays["labels"])
@@ -68,11 +52,7 @@ def _gallery(
         yield shared | of_state | {"place": place, "outcome": outcome[index]}
 
 
-def _figures(
-    state,
-    kind,
-    suffix,
-):
+def _figures(state, kind, suffix):
     """Figures 2 and 9 of a sub-goal's first state, a true positive where there is one."""
     about = {"sub_goal": state["sub_goal"], "kind": kind, "place": state["place"]}
     members = partial(attributions_of_members, state)
@@ -123,14 +103,7 @@ def with_key(shown: Sequence[tuple[str, Bytes]], columns: int) -> Figure:
     """
     figure, places = plots.panels(shown, columns, titles=0.5)
     key = ScalarMappable(Normalize(-1, 1), SIGNED)
-    bar = figure.colorbar(
-        key,
-        ax=places,
-        location="bottom",
-        fraction=0.05,
-        shrink=0.6,
-        aspect=40,
-    )
+    bar = figure.colorbar(key, ax=places, location="bottom", fraction=0.05, shrink=0.6, aspect=40)
     bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
     bar.set_label("attribution in log-odds, each picture on its own scale")
     return figure

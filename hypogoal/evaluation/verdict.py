@@ -35,18 +35,10 @@ def facts(work):
             task_of[work.place(artefact)["method"]] = domain.task(world)
             caps.append(config.get("cap") or 0)
     tasks = dict.fromkeys(filter(None, task_of.values()))
-    return {
-        "tasks": [*tasks],
-        "task_of": task_of,
-        "cap": max(caps, default=0),
-    }
+    return {"tasks": [*tasks], "task_of": task_of, "cap": max(caps, default=0)}
 
 
-def outcome_of(
-    difference: float,
-    low: float,
-    high: float,
-) -> str:
+def outcome_of(difference: float, low: float, high: float) -> str:
     """What a difference of shares says; of one unit, whose bounds are NaN, the difference alone.
 
     An interval within ``MARGIN`` of 0 is no difference, one above or below 0 is a difference, any other undecided.
@@ -60,12 +52,7 @@ def outcome_of(
     return WORSE if high < 0 else UNDECIDED
 
 
-def finding(
-    subject: str,
-    first: pd.DataFrame,
-    second: pd.DataFrame,
-    on: list[str],
-) -> list[dict[str, Any]]:
+def finding(subject: str, first: pd.DataFrame, second: pd.DataFrame, on: list[str]) -> list[dict[str, Any]]:
     """Two shares, of runs that agree in ``on``; each layout or ladder counts once, or each run of one.
 
     Nothing without pairs.
@@ -75,13 +62,7 @@ def finding(
         return []
     result = compare(both.assign(of="success"), "ladder" if subject == OPTIONS else "layout")
     bounds = [result[f"difference{end}"] for end in ("", "_low", "_high")]
-    return [
-        {
-            "subject": subject,
-            **result,
-            "outcome": outcome_of(*bounds),
-        }
-    ]
+    return [{"subject": subject, **result, "outcome": outcome_of(*bounds)}]
 
 
 def findings(results: Results) -> list[dict[str, Any]]:
@@ -93,17 +74,12 @@ def findings(results: Results) -> list[dict[str, Any]]:
     random = trained[trained["method"].isin([*chosen_by(results, "random")])]
     learned = chosen_by(results, "learned")
     task_of = results.facts.get("task_of", {})
-    result: list[dict[str, Any]] = []
+    result = []
     for name, agent in learned.items():
         if agent["members"] == 1:
             continue
         training, frozen = _of(name, trained), _of(name, played)
-        of_choosing = finding(
-            CHOOSING,
-            frozen,
-            _of(UNIFORM, played),
-            ["artefact", "layout"],
-        )
+        of_choosing = finding(CHOOSING, frozen, _of(UNIFORM, played), ["artefact", "layout"])
         # random choice while learning has other options
         result += of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
         for other, single in learned.items():

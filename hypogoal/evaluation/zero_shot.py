@@ -64,8 +64,8 @@ def alone(
     begin_anew(loop, Always(option))
     engine = loop.engine
     holds = engine.labels(engine.ids)[:, goal]
-    steps = np.zeros(engine.count, dtype=np.int64)
-    positive, reached = np.zeros((2, engine.count), dtype=np.bool_)
+    steps = np.zeros(engine.count, int)
+    positive, reached = np.zeros((2, engine.count), bool)
     going = ~positive
     for _ in range(PATIENCE * loop.config.option_timeout):
         moved = loop.advance(learning=False)

@@ -20,14 +20,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias, get_type_hints
+from typing import Any, Literal, NamedTuple, get_type_hints
 
 import numpy as np
 from pydantic import Field, create_model
 
 from hypogoal.cells import Value
 from hypogoal.core import own_code
-from hypogoal.core.config import DOMAIN, MODELS, STAGES, Config, model_of, setting
+from hypogoal.core.config import DOMAIN, MODELS, STAGES, Config, Values, model_of, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.domains.base import load_domain
@@ -44,10 +44,10 @@ EXPERIMENTS = {
     "figure4": "hypogoal.experiments.built_in:figure4",
     "figure6": "hypogoal.experiments.built_in:figure6",
 }
-Names: TypeAlias = tuple[str, ...]
-Integers: TypeAlias = tuple[int, ...]
-Function: TypeAlias = Callable[..., Iterable[Any]]  # of settings, by keyword; yields Command or its fields
-Columns: TypeAlias = Mapping[str, Value]  # of results.csv: seed, method, ...
+Names = tuple[str, ...]
+Integers = tuple[int, ...]
+Function = Callable[..., Iterable[Any]]  # of settings, by keyword; yields Command or its fields
+Columns = Mapping[str, Value]  # of results.csv: seed, method, ...
 
 
 class Command(NamedTuple):
@@ -75,7 +75,7 @@ class Experiment:
     model: type[RunConfig]  # the settings of ``hypogoal run``: those of all experiments, and the function's
     domain: str | None = None  # whose presets have settings of this experiment
     preset: str | None = None  # if no other is given
-    given: Mapping[str, Any] = field(default_factory=dict)  # settings, unless others are given
+    given: Values = field(default_factory=dict)  # settings, unless others are given
 
 
 def experiment(domain: str | None = None, preset: str | None = None) -> Callable[[Function], Experiment]:
@@ -84,7 +84,7 @@ def experiment(domain: str | None = None, preset: str | None = None) -> Callable
     def decorated(function: Function) -> Experiment:
         hints = get_type_hints(function)
         parameters = inspect.signature(function).parameters
-        fields: dict[str, Any] = {}
+        fields = {}
         for name, parameter in parameters.items():
             if name == STAGE:
                 continue
@@ -160,7 +160,7 @@ class File(RunConfig):
             for values in product(*(axes[axis] for axis in row.axes)):
                 point = dict(zip(row.axes, values, strict=True))
                 others = [other for other in self.cells if point.keys() >= {*other.axes}]
-                places: dict[str, Value] = {other.name: f"@{other.at(point)}" for other in others}
+                places = {other.name: f"@{other.at(point)}" for other in others}
                 command = row.command.format_map(places | point)
                 for name in own_code.names_in(command):
                     own_code.require_trust(name, "setting")
@@ -173,7 +173,7 @@ def read_toml(path: Path) -> Experiment:
     with readable():
         text = path.read_text(encoding="utf-8-sig")
         file = File.model_validate(tomllib.loads(text))
-        fields: dict[str, Any] = {}
+        fields = {}
         for name, axis in file.axes.items():
             kind: Any = int if isinstance(axis, str) else type(axis[0])
             fields[name] = (tuple[kind, ...], ())

@@ -94,8 +94,8 @@ def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any])
     for command in commands:
         try:
             name, text, columns, after = Command(*command)
-            words: list[str] = []
-            needs: list[str] = []
+            words = []
+            needs = []
             for word in shlex.split(text):
                 if output := OUTPUT.match(word):
                     option, other = output.groups()
@@ -144,7 +144,7 @@ def _with_shared(
         raise UserError("a cell must be able to go on after a break, which this command is not", stage, MEND)
     values, typed = loaded.parsed([*rest, "--out", stage])
     domain = values.get("domain") or domain
-    more: list[str] = []
+    more = []
     if stage in STAGES:
         allow(words)  # a TOML file's names are allowed already, others are those of code that the user gave
         if preset and not values["preset"]:

@@ -26,21 +26,22 @@ mean H(p) (Bridle et al. 1991): a mixture is in doubt where its features part, o
 
 from collections.abc import Generator, Iterator
 from dataclasses import asdict, dataclass
-from math import isnan, sqrt
-from typing import Any, TypeAlias
+from math import inf, isnan, sqrt
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 import torch
 
+from hypogoal.core import seeding
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import State
-from hypogoal.core.seeding import rng_for, seed_for
-from hypogoal.data import GROUP
+from hypogoal.data import GROUP, States
 from hypogoal.diversity import load_objective
+from hypogoal.hypotheses import scores
 from hypogoal.hypotheses.config import AUTO, LABELS, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.fit import Losses
-from hypogoal.hypotheses.scores import mean_disagreement, member_scores
 from hypogoal.hypotheses.training import EnsembleTraining, require_unlabelled
 from hypogoal.hypotheses.views import StateOrigins
 from hypogoal.observations import Observations
@@ -54,7 +55,7 @@ SMALL = 1e-9  # probabilities below have no entropy
 FEW = "{} labels of a class are too few to choose the diversity weight by, so it is {}"
 SINGLE = "too few groups have both classes, so single states are held out: near copies make them easy"
 
-Outcome: TypeAlias = Generator[Losses, None, State]  # of a training: yields after each step, returns what came out
+Outcome = Generator[Losses, None, State]  # of a training: yields after each step, returns what came out
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,8 @@ def held_out(labels: Bools, groups: Ints | None, seed: int) -> tuple[list[Bools]
         units = units if remark else np.unique(groups, return_inverse=True)[1]
     positives, sizes = np.bincount(units, labels), np.bincount(units)
     kinds = np.stack([positives > 0, positives < sizes], axis=1)
-    fold_of = np.empty(len(sizes), np.int64)
-    rng = rng_for(seed, "folds")
+    fold_of = np.empty(len(sizes), int)
+    rng = seeding.rng_for(seed, "folds")
     for kind in np.unique(kinds, axis=0):
         alike = np.flatnonzero((kinds == kind).all(axis=1))
         fold_of[rng.permutation(alike)] = np.arange(len(alike)) % FOLDS
@@ -98,7 +99,7 @@ def held_out(labels: Bools, groups: Ints | None, seed: int) -> tuple[list[Bools]
 
 def accuracies_of(right: Bools, labels: Bools) -> Doubles:
     """Members' balanced accuracies (K,), from what they have right (N, K)."""
-    return member_scores(right == labels[:, None], labels)["balanced_accuracy"]
+    return scores.member_scores(right == labels[:, None], labels)["balanced_accuracy"]
 
 
 def lowest_kept(right: Bools, labels: Bools) -> float:
@@ -156,9 +157,10 @@ class AutoTraining:
         self.config, self.seed, self.device = config, seed, device
         self.origins = origins or StateOrigins()
         saved = saved or {"outcomes": [], "now": None, "step": 0}
-        self._outcomes: list[State] = [*saved["outcomes"]]
-        self._saved: State | None = saved["now"]
+        self._outcomes = [*saved["outcomes"]]
+        self._saved = saved["now"]
         self._turn = 0
+        self._fresh = {"seed": seed, "first": None, "training": None, "information": -inf}
         self.step: int = saved["step"]
         self.now: EnsembleTraining | None = None
         self.is_last = False
@@ -219,20 +221,18 @@ class AutoTraining:
         if self.searches:
             self.weight = yield from self._search()
             self.most = self.step + self.cost(folds=0, weights=0)
-        everything = np.ones(len(self.labels), np.bool_)
-        begun: State = {"seed": self.seed, "first": None}
+        everything = np.ones(len(self.labels), bool)
+        begun = self._fresh
         if self.begins_alone:
             begun = yield from self._begin(everything)
         self.is_last = True
-        yield from self._train(everything, begun["seed"], self.weight, first=begun["first"])
+        yield from self._train(everything, begun, self.weight)
 
     def _search(self) -> Generator[Losses, None, float]:
         """Try weights from the largest down, until members bear one."""
         without: list[State] = []
         for fold in self.folds:
-            begin = self._begin(~fold, fold) if self.begins_alone else self._train(~fold, self.seed, held=fold)
-            without.append((yield from begin))
-            self._take_share(without[-1])
+            without.append((yield from self._begin(~fold, fold)))
         if not without:
             return WEIGHTS[-1]
         labels = np.concatenate([self.labels[fold] for fold in self.folds])
@@ -242,8 +242,7 @@ class AutoTraining:
         for weight in WEIGHTS:
             outcomes = []
             for fold, begun in zip(self.folds, without, strict=True):
-                trial = self._train(~fold, begun["seed"], weight, first=begun["first"], held=fold)
-                outcomes.append((yield from trial))
+                outcomes.append((yield from self._train(~fold, begun, weight, held=fold)))
             trained = min(outcome["right"].shape[1] for outcome in outcomes)
             right = np.concatenate([outcome["right"][:, :trained] for outcome in outcomes])
             accuracy = float(accuracies_of(right, labels).min())
@@ -257,40 +256,39 @@ class AutoTraining:
         return weight
 
     def _begin(self, rows: Bools, held: Bools | None = None) -> Outcome:
-        """Train the first member on the labels of ``rows``: of those that begin the one that tells most."""
-        restarts = self.config.restarts
-        candidates: list[State] = []
+        """Train without diversity on the labels of ``rows``: all members, or a first one alone.
+
+        Of several first ones that begin, the one that tells most goes on. Among unlabelled states as many positives are
+        expected from then on as it predicts.
+        """
+        members, restarts = self.config.members, 1
+        if self.begins_alone:
+            members, restarts = 1, self.config.restarts
+        candidates = [self._fresh]
         for restart in range(restarts if restarts > 1 else 0):
-            seed = seed_for(self.seed, "restart", restart) if restart else self.seed
-            candidates.append((yield from self._train(rows, seed, members=1, until=self.early)))
-        best: State = {"seed": self.seed, "training": None}
-        if candidates:
-            best = max(candidates, key=lambda candidate: candidate["information"])
+            seed = seeding.seed_for(self.seed, "restart", restart) if restart else self.seed
+            begun = self._fresh | {"seed": seed}
+            candidates.append((yield from self._train(rows, begun, members=members, until=self.early)))
+        best = max(candidates, key=itemgetter("information"))
         for candidate in candidates:
             if candidate is not best:
                 candidate["training"] = None  # it may be large
-        outcome = yield from self._train(rows, best["seed"], members=1, held=held, begun=best["training"])
-        self._take_share(outcome)
-        return outcome
-
-    def _take_share(self, without: State) -> None:
-        """Expect so many positives among unlabelled states as a member without diversity predicts."""
+        outcome = yield from self._train(rows, best, members=members, held=held)
         if self.config.share == AUTO:
-            self.share = without["positive"]
+            self.share = outcome["positive"]
+        return outcome
 
     def _train(
         self,
         rows: Bools,
-        seed: int,
+        begun: State,
         weight: float = 0.0,
         *,
         members: int = 0,
-        first: State | None = None,
         held: Bools | None = None,
         until: int = 0,
-        begun: State | None = None,
     ) -> Outcome:
-        """One training on the labels of ``rows``.
+        """One training on the labels of ``rows``, from the seed, the first member and the snapshot that have ``begun``.
 
         It ends ``until`` so many steps, or, if there is one fold, once a member has too few of the labels of ``held``.
         """
@@ -298,58 +296,67 @@ class AutoTraining:
         if self._turn <= len(self._outcomes):
             return self._outcomes[self._turn - 1]
         origins = {name: values[rows] for name, values in self.origins.labelled.items()}
-        self.now = EnsembleTraining(
+        now = EnsembleTraining(
             self.observations[rows],
             self.labels[rows],
             self.unlabelled,
             self.config.training(weight, self.share, members=members or self.config.members),
-            seed,
+            begun["seed"],
             origins=StateOrigins(origins, self.origins.unlabelled),
             device=self.device,
-            first=first,
-            saved=self._saved or begun,
+            first=begun["first"],
+            saved=self._saved or begun["training"],
         )
-        self._saved = None
-        for _, losses in self.now.steps():
+        self.now, self._saved = now, None
+        for _, losses in now.steps():
             self.step += 1
             yield losses
-            if self.now.done == until or (held is not None and self._has_lost(held)):
+            if now.done == until or self._has_lost(now, held):
                 break
         if self.is_last:
             return {}
-        self._outcomes.append({"seed": seed, **self._outcome(held, until > 0)})
+        self._outcomes.append({"seed": begun["seed"], **self._outcome(now, held, until > 0)})
         self.now = None
         return self._outcomes[-1]
 
-    def _outcome(self, held: Bools | None, is_candidate: bool) -> State:
-        """What the members at work predict, of unlabelled states and of held-out labels, and what is gone on from."""
-        assert self.now is not None
-        probabilities = self.ensemble.predict(self.unlabelled)[:, : self._trained]
+    def _outcome(self, now: EnsembleTraining, held: Bools | None, is_candidate: bool) -> State:
+        """What members predict, of unlabelled states and of held-out labels, and what is gone on from."""
+        probabilities = now.predict(self.unlabelled)
         predictions = probabilities > THRESHOLD
         positive = predictions.mean(axis=0)
+        is_first = self.begins_alone and len(now.ensemble) == 1
         return {
             "information": information_of(probabilities[:, 0]),
-            "training": self.now.snapshot() if is_candidate else None,
-            "first": self.ensemble.networks[0].state_dict() if len(self.ensemble) == 1 else None,
+            "training": now.snapshot() if is_candidate else None,
+            "first": now.ensemble.networks[0].state_dict() if is_first and not is_candidate else None,
             "positive": float((predictions[:, 0].sum() + 1) / (len(predictions) + 2)),  # neither 0 nor 1
             "constant": bool(((positive == 0) | (positive == 1)).any()),
-            "disagreement": mean_disagreement(predictions),
-            "right": None if held is None else self._right(held),
+            "disagreement": scores.mean_disagreement(predictions),
+            "right": None if held is None else self._right(now, held),
         }
 
-    @property
-    def _trained(self) -> int:
-        """How many members of the training at work are trained, or being trained."""
-        assert self.now is not None
-        return self.now.rounds[self.now.number][-1] + 1
-
-    def _right(self, held: Bools) -> Bools:
+    def _right(self, now: EnsembleTraining, held: Bools) -> Bools:
         """What members have right of held-out labels (n, K)."""
-        predictions = self.ensemble.predict(self.observations[held])[:, : self._trained] > THRESHOLD
-        return predictions == self.labels[held][:, None]
+        return (now.predict(self.observations[held]) > THRESHOLD) == self.labels[held][:, None]
 
-    def _has_lost(self, held: Bools) -> bool:
+    def _has_lost(self, now: EnsembleTraining, held: Bools | None) -> bool:
         """Whether a member at the end of its training has fewer held-out labels right than it must keep."""
-        assert self.now is not None
-        is_trained = self.now.done == self.config.steps and len(self.folds) == 1
-        return is_trained and bool(accuracies_of(self._right(held), self.labels[held]).min() < self.lowest)
+        if held is None or now.done < self.config.steps or len(self.folds) > 1:
+            return False
+        accuracies = accuracies_of(self._right(now, held), self.labels[held])
+        return bool(accuracies.min() < self.lowest)
+
+
+def training_of(
+    labelled: States, unlabelled: States, sub_goal: str, config: TrainEnsembleConfig, seed: int, **more: Any
+) -> AutoTraining:
+    """The training of a sub-goal's ensemble, not begun; ``seed`` is the run's, ``more`` as of :class:`AutoTraining`."""
+    return AutoTraining(
+        labelled.observations,
+        labelled.labels,
+        unlabelled.observations,
+        config,
+        seeding.seed_for(seed, "ensemble", sub_goal),
+        origins=StateOrigins(labelled.origins, unlabelled.origins),
+        **more,
+    )

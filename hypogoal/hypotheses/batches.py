@@ -21,7 +21,7 @@ from hypogoal.observations import Observations, values_in
 
 Numbers = Ints  # of states, (B,)
 EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
-NONE = np.zeros(0, np.int64)
+NONE = np.zeros(0, int)
 
 
 class TrainingStates(Resumable):
@@ -56,7 +56,7 @@ class TrainingStates(Resumable):
         self.labels, self.n_unlabelled = labels, len(unlabelled)
         self.view, self.device = ensemble.view, ensemble.thresholds.device
         self._origins = origins
-        self._targets = tensor(labels.astype(np.int64), self.device)
+        self._targets = tensor(labels.astype(int), self.device)
         kept = self.view.to_change(observations), self.view.to_change(unlabelled)
         self._tables = None
         if self.device.type == "cpu" and not self.view.changes:  # changed pictures have changed patches
@@ -177,7 +177,7 @@ def _draws(
         streams.append(chain.from_iterable(map(rng.permutation, repeat(pool))))
     items = map(next, cycle(streams))
     while True:
-        yield np.fromiter(islice(items, count), np.int64, count)
+        yield np.fromiter(islice(items, count), int, count)
 
 
 def plain_forward(

@@ -134,6 +134,6 @@ class TrainEnsembleConfig(MembersConfig):
 
     def training(self, weight: float, share: float | Literal["labels"], **others: Any) -> EnsembleConfig:
         """The settings of one training with this weight and share; ``others`` replace the user's."""
-        shared = {name: getattr(self, name) for name in MembersConfig.model_fields}
-        settings = {**shared, "schedule": self.schedule, "diversity_weight": weight, "share": share, **others}
-        return EnsembleConfig(**settings)
+        shared = self.model_dump(include={*MembersConfig.model_fields, "schedule"})
+        chosen = {"diversity_weight": weight, "share": share}
+        return EnsembleConfig(**shared | chosen | others)

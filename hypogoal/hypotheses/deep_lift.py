@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.arrays import Doubles
+from hypogoal.core.arrays import Array, Doubles
 from hypogoal.hypotheses.networks import at_once, inputs_of
 from hypogoal.observations import (
     NUMBERS,
@@ -62,18 +62,19 @@ def mean_state(observations: Observations) -> Observations:
     most of the attribution, and black things (a pit, an open door) none. Against the mean state, only differences from
     the usual get any.
     """
-    if observations.dtype.names:
-        states = np.zeros((), observations.dtype)
-        for key in observations.dtype.names:
+    dtype = observations.dtype
+    if dtype.names:
+        states = np.zeros((), dtype)
+        for key in dtype.names:
             states[key] = mean_state(observations[key])
         return states
-    mean = observations.mean(axis=0, dtype=np.float64)
-    if observations.dtype == PICTURE:
+    mean = observations.mean(axis=0, dtype=float)
+    if dtype == PICTURE:
         mean = mean.round()
-    return mean.astype(observations.dtype)
+    return mean.astype(dtype)
 
 
-def by_key(values: NDArray[np.floating], dtype: DType) -> NDArray[Any]:
+def by_key(values: NDArray[np.floating], dtype: DType) -> Array:
     """Attributions (..., D) of mixed observations as float32 with a field for each key."""
     fields = fields_of((), dtype)
     states = values.shape[:-1]

@@ -1,7 +1,5 @@
 """An ensemble of K members, each a hypothesis about the features that make a sub-goal, and its file."""
 
-from __future__ import annotations
-
 import copy
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -113,7 +111,7 @@ class Ensemble(nn.Module):
             if dtype.names and isinstance(observations, Mapping):
                 observations = packed(observations, dtype)
             observations = np.asarray(observations)
-            if dtype == NUMBERS and observations.dtype == np.float64:
+            if dtype == NUMBERS and observations.dtype == float:
                 observations = observations.astype(NUMBERS)
             if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
                 raise ValueError(f"{observations.dtype} {observations.shape}")
@@ -184,21 +182,21 @@ class Ensemble(nn.Module):
     def _logits(self, observations: Observations) -> Tensor:
         """Logits (K, N, 2); computes each distinct patch once if that pays."""
         members, device = self.networks, self.thresholds.device
-        if device.type == "cpu" and len(observations) >= PATCHES_FROM:
+        count = size = len(observations)
+        if device.type == "cpu" and count >= PATCHES_FROM:
             tables = patches.make_tables(members[0], observations)
             if tables is not None:
-                batch = patches.take(tables, np.arange(len(observations)))
+                batch = patches.take(tables, np.arange(count))
                 return torch.stack([patches.forward(member, batch) for member in members])
-        if len(observations) >= FOLD_FROM:
+        if count >= FOLD_FROM:
             members = tuple(map(networks.folded, members))
-        size = len(observations)
         if device.type == "cpu":
             size = networks.at_once(
                 IMAGES_AT_ONCE,
                 (values_in(observations.shape[1:], observations.dtype),),
             )
         logits = []
-        for start in range(0, len(observations), size):
+        for start in range(0, count, size):
             inputs = networks.inputs_of(observations[start : start + size], device)
             logits.append(torch.stack([member(inputs) for member in members]))
         return torch.cat(logits, dim=1)

@@ -60,8 +60,7 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
 
     They are of the type and shape of training: pictures are bytes. Others are a ``ValueError``.
     """
-    text = (HERE / "config.json").read_text(encoding="utf-8")
-    config = json.loads(text)
+    config = json.loads((HERE / "config.json").read_bytes())
     state = load_file(HERE / f"{sub_goal}.safetensors")
     standard = [state[name].flatten() for name in ("view.mean", "view.deviation") if name in state]
     weights = {}

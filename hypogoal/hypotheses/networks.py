@@ -10,8 +10,6 @@ The paper states the number and kinds of layers, not their sizes. These come fro
 network, which the paper does not have.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable
 from itertools import pairwise

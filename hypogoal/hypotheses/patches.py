@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.arrays import Bytes, Ints
+from hypogoal.core.arrays import Array, Bytes, Ints
 from hypogoal.observations import spread_rows
 
 Ids = NDArray[np.int32]  # of patches, rows or colours
@@ -90,7 +90,7 @@ def _side(size: Any) -> Any:
     return height if height == width else -1
 
 
-def make_tables(network: nn.Sequential, *parts: NDArray[Any]) -> Tables | None:
+def make_tables(network: nn.Sequential, *parts: Array) -> Tables | None:
     """The distinct patches of images, uint8 (N, H, W, C), part after part, as ``network`` sees them.
 
     None if too few repeat to be worthwhile, or if the network has unsupported layers.
@@ -162,7 +162,7 @@ def _join(pieces: Sequence[Ids], bound: int) -> tuple[Ids, Ids]:
     ids = pieces[0]
     tuples = np.arange(bound, dtype=np.int32)[:, None]
     for piece in pieces[1:]:
-        pairs = ids.astype(np.int64) * bound + piece
+        pairs = ids.astype(int) * bound + piece
         ids, distinct = _rank(pairs, len(tuples) * bound)
         before, last = np.divmod(distinct, bound)
         joined = last.astype(np.int32)
@@ -175,8 +175,8 @@ def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
     if bound > LOOKUP_PER_VALUE * values.size:
         ordered, inverse = np.unique(values, return_inverse=True)
         whole = inverse.reshape(values.shape)
-        return whole.astype(np.int32), ordered.astype(np.int64)
-    occurs = np.zeros(bound, np.bool_)
+        return whole.astype(np.int32), ordered.astype(int)
+    occurs = np.zeros(bound, bool)
     occurs[values] = True
     ranks = np.cumsum(occurs, dtype=np.int32) - 1
     return ranks[values], np.flatnonzero(occurs)
@@ -220,7 +220,7 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
             used, offset = occurring, before[number]
             before[number] += len(occurring)
         places = ranks.reshape(len(images), -1)
-        last.append(places.astype(np.int64) + offset)
+        last.append(places.astype(int) + offset)
     return PatchBatch(
         tables.colours,
         [torch.from_numpy(np.concatenate(of_groups)) for of_groups in parts],
@@ -232,7 +232,7 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
 def _positions(values: Ids, among: Ints) -> Ints:
     """The index of each value in the sorted ``among``, which has them all."""
     size = int(among[-1]) + 1
-    position = np.empty(size, np.int64)
+    position = np.empty(size, int)
     position[among] = np.arange(len(among))
     return position[values]
 

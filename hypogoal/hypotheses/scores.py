@@ -1,26 +1,21 @@
 """How well members predict the true sub-goal (Spec F1), also whatever their thresholds, and how they differ (F2)."""
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
+from hypogoal.core.arrays import Array, Bools, Doubles, Floats, Ints
 
 SAME = 0.99  # of unlabelled states: a member that predicts so many as another one does is no other hypothesis
 
 
-def member_scores(
-    predictions: Bools,
-    labels: Bools,
-) -> dict[str, Doubles]:
+def member_scores(predictions: Bools, labels: Bools) -> dict[str, Doubles]:
     """Spec F1: every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
 
     Undefined scores are NaN: recall without positives, balanced accuracy without positives or negatives, precision
     without positive predictions, any score without states.
     """
-    truth = labels.astype(np.bool_)[:, None]
+    truth = labels.astype(bool)[:, None]
     hits = (predictions & truth).sum(0)
     false_alarms = (predictions & ~truth).sum(0)
     misses = (~predictions & truth).sum(0)
@@ -37,10 +32,7 @@ def member_scores(
     }
 
 
-def ranking(
-    probabilities: Floats,
-    labels: Bools,
-) -> Doubles:
+def ranking(probabilities: Floats, labels: Bools) -> Doubles:
     """The area under the ROC curve: how well members rank positives above negatives, whatever their thresholds.
 
     Takes probabilities (N, K) and labels (N,). Returns float64 (K,): the share of pairs of a positive and a negative in
@@ -55,10 +47,7 @@ def ranking(
     return ratio(won, pairs)
 
 
-def best_threshold(
-    probabilities: Floats,
-    labels: Bools,
-) -> tuple[Floats, Doubles]:
+def best_threshold(probabilities: Floats, labels: Bools) -> tuple[Floats, Doubles]:
     """Each member's best threshold for the true sub-goal, and its balanced accuracy there.
 
     It is chosen on the labels (N,) that it is scored by, so it is a bound, not a method. Takes probabilities (N, K).
@@ -79,10 +68,7 @@ def best_threshold(
     return thresholds, accuracies
 
 
-def _share_above(
-    values: Floats,
-    cuts: Floats,
-) -> Doubles:
+def _share_above(values: Floats, cuts: Floats) -> Doubles:
     """The share of values that are above each cut."""
     not_above = np.searchsorted(np.sort(values), cuts, side="right")
     return (len(values) - not_above) / len(values)
@@ -99,10 +85,7 @@ def halves(contexts: Ints) -> Bools | None:
     return np.isin(contexts, numbers[::2])
 
 
-def cross_fitted(
-    first: Doubles,
-    second: Doubles,
-) -> float:
+def cross_fitted(first: Doubles, second: Doubles) -> float:
     """The best member's score, picked on one half of the states and scored on the other, to exclude luck.
 
     Takes members' scores (K,) on both halves; returns the mean of both directions, NaN if one has no score.
@@ -114,10 +97,7 @@ def cross_fitted(
     return float(second[first.argmax()] + first[second.argmax()]) / 2
 
 
-def ratio(
-    numerator: NDArray[Any],
-    denominator: NDArray[Any],
-) -> Doubles:
+def ratio(numerator: Array, denominator: Array) -> Doubles:
     """The quotient, element by element; NaN where the denominator is 0."""
     quotient = np.full(np.shape(numerator), np.nan)
     return np.divide(numerator, denominator, out=quotient, where=denominator != 0)
@@ -128,11 +108,7 @@ def best_mean_worst(scores: Doubles) -> dict[str, float]:
     defined = scores[~np.isnan(scores)]
     if not len(defined):
         defined = np.array([math.nan])
-    return {
-        "best": float(defined.max()),
-        "mean": float(defined.mean()),
-        "worst": float(defined.min()),
-    }
+    return {"best": float(defined.max()), "mean": float(defined.mean()), "worst": float(defined.min())}
 
 
 def most_and_least(values: Doubles) -> tuple[int | None, int | None]:

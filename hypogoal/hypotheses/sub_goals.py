@@ -1,7 +1,5 @@
 """The ensemble of one sub-goal: checked, trained with a log, written, and judged for a first time (Spec A2)."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,12 +12,11 @@ from hypogoal.core.artefacts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import MetricsLog, Progress, say
-from hypogoal.core.seeding import seed_for
 from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
-from hypogoal.hypotheses.auto import AutoTraining
-from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
+from hypogoal.hypotheses.auto import training_of
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.observations import spread_rows
 
@@ -46,7 +43,7 @@ def check_names(config: TrainEnsembleConfig) -> None:
     thresholds.threshold_rule(config.threshold)
     if config.teacher:
         teacher.load_teacher(config.teacher)
-    if config.view != FULL:
+    if config.view != views.FULL:
         views.load_view(config.view)
     for name in networks.names_in(config.network):
         if name != networks.AUTO:
@@ -96,20 +93,12 @@ def train_sub_goal(
     unlabelled = joined([open_dataset(file).unlabelled_states() for file in others or [data]])
     checkpoints = draft.checkpoints(sub_goal)
     saved = checkpoints.load()
-    training = AutoTraining(
-        labelled.observations,
-        labelled.labels,
-        unlabelled.observations,
-        config,
-        seed_for(seed, "ensemble", sub_goal),
-        origins=views.StateOrigins(labelled.origins, unlabelled.origins),
-        device=device,
-        saved=saved["training"] if saved else None,
-    )
+    begun = saved["training"] if saved else None
+    training = training_of(labelled, unlabelled, sub_goal, config, seed, device=device, saved=begun)
     if training.folds and not quiet:
         once = training.cost(folds=0, weights=0)
-        told = f"at most {training.most} steps, {once} of them when the weight is chosen"
-        say(f"train-ensemble {sub_goal}: {told}", err=True)
+        steps = f"at most {training.most} steps, {once} of them when the weight is chosen"
+        say(f"train-ensemble {sub_goal}: {steps}", err=True)
     log = MetricsLog(log_of(draft, sub_goal), tensorboard)
     log.restore(saved["log"] if saved else 0)
 
@@ -131,7 +120,7 @@ def train_sub_goal(
     some = unlabelled.where(spread_rows(len(unlabelled.observations), LOOKED_AT))
     predictions = training.ensemble.predictions(some.observations)
     idle = scores.idle_members(predictions, some.origins.get("layout_seed")) if len(predictions) else []
-    return Trained(heldout_accuracy(training.ensemble, dataset, sub_goal), {**training.summary(), "idle": idle})
+    return Trained(heldout_accuracy(training.ensemble, dataset, sub_goal), training.summary() | {"idle": idle})
 
 
 def log_of(draft: Draft, sub_goal: str) -> Path:

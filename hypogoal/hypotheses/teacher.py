@@ -42,9 +42,9 @@ def taught_by(
     do = f"Give finite ones, {shape}: above 0 for positive, below for negative."
     try:
         given = np.asarray(taught)
-        scores = given.astype(np.float64)
+        scores = given.astype(float)
     except (TypeError, ValueError, RuntimeError) as error:
         raise UserError(f"the teacher gave no scores ({error})", name, do) from None
-    if scores.shape != shape or given.dtype == np.bool_ or not np.isfinite(scores).all():
+    if scores.shape != shape or given.dtype == bool or not np.isfinite(scores).all():
         raise UserError(f"the teacher gave scores {given.dtype} {scores.shape}", name, do)
     return torch.from_numpy(scores.clip(-1, 1).astype(np.float32))

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Bools, Doubles, Floats
+from hypogoal.core.arrays import Array, Bools, Doubles, Floats
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load
 
@@ -19,9 +18,9 @@ BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
 Probabilities = Floats  # (states, K)
 
 
-def log_odds_of(probabilities: NDArray[Any]) -> Doubles:
+def log_odds_of(probabilities: Array) -> Doubles:
     """The log-odds of probabilities (...,), always finite."""
-    exact = probabilities.astype(np.float64).clip(CERTAIN, 1 - CERTAIN)
+    exact = probabilities.astype(float).clip(CERTAIN, 1 - CERTAIN)
     return np.log(exact) - np.log1p(-exact)
 
 

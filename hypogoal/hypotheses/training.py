@@ -3,7 +3,7 @@
 :mod:`hypogoal.hypotheses.fit` has the loop and its words.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import islice
 from typing import Any
 
@@ -13,17 +13,16 @@ from torch import nn
 
 from hypogoal.core import seeding
 from hypogoal.core.adam import Adam
-from hypogoal.core.arrays import Bools
+from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.tensors import stored
-from hypogoal.hypotheses import views
+from hypogoal.hypotheses import thresholds, views
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.fit import Losses, fit, objective_of
 from hypogoal.hypotheses.teacher import taught_by
-from hypogoal.hypotheses.thresholds import PAPER, SPLIT, thresholds
 from hypogoal.observations import Observations
 
 CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
@@ -72,10 +71,10 @@ class EnsembleTraining(Resumable):
         *,
         origins: views.StateOrigins | None = None,
         device: torch.device | str = "cpu",
-        first: Mapping[str, Any] | None = None,
-        saved: Mapping[str, Any] | None = None,
+        first: State | None = None,
+        saved: State | None = None,
     ):
-        if objective_of(config) or config.teacher or config.threshold == SPLIT:
+        if objective_of(config) or config.teacher or config.threshold == thresholds.SPLIT:
             require_unlabelled(unlabelled)
         origins = origins or views.StateOrigins()
         self.config, self.seed = config, seed
@@ -95,13 +94,7 @@ class EnsembleTraining(Resumable):
         elif config.teacher:
             drawn = seeding.seed_for(seed, "proposals")
             self.taught = taught_by(config.teacher, observations, labels, unlabelled, config.members, drawn)
-        self.states = TrainingStates(
-            observations,
-            labels,
-            unlabelled,
-            self.ensemble,
-            origins.labelled,
-        )
+        self.states = TrainingStates(observations, labels, unlabelled, self.ensemble, origins.labelled)
         members = list(range(config.members))
         self.rounds = [[member] for member in members] if config.schedule == "sequential" else [members]
         self._begin(saved["number"] if saved else int(bool(first)))
@@ -112,7 +105,7 @@ class EnsembleTraining(Resumable):
 
     def snapshot(self) -> State:
         """All that the next steps depend on."""
-        return {**super().snapshot(), "layers": torch.get_rng_state()}
+        return super().snapshot() | {"layers": torch.get_rng_state()}
 
     def steps(self) -> Iterator[tuple[int, Losses]]:
         """Take the steps that are left, then set thresholds; yields each step's number and losses.
@@ -127,16 +120,16 @@ class EnsembleTraining(Resumable):
                 self._begin(self.number + 1)
                 yield from self._round()
         self.ensemble.eval()
-        if self.config.threshold != PAPER:
+        if self.config.threshold != thresholds.PAPER:
             on_labelled = self.ensemble.predict(self.observations)
             on_unlabelled = self.ensemble.predict(self.unlabelled)
-            chosen = thresholds(
-                self.config.threshold,
-                on_labelled,
-                self.labels,
-                on_unlabelled,
-            )
+            chosen = thresholds.thresholds(self.config.threshold, on_labelled, self.labels, on_unlabelled)
             self.ensemble.thresholds.copy_(torch.from_numpy(chosen))
+
+    def predict(self, observations: Observations) -> Floats:
+        """The probabilities (N, k) of the k members that are trained, or being trained, see :class:`Ensemble`."""
+        *_, last = self.rounds[self.number]
+        return self.ensemble.predict(observations)[:, : last + 1]
 
     def _begin(self, number: int) -> None:
         """Begin to train the members of one round."""
@@ -156,11 +149,7 @@ class EnsembleTraining(Resumable):
             self._layers = None
         earlier = self.ensemble.networks[: members[0]]
         taught = None if self.taught is None else self.taught[members].to(device)
-        batches = islice(
-            self.states.batches(config, self._round_seed),
-            self.done,
-            None,
-        )
+        batches = islice(self.states.batches(config, self._round_seed), self.done, None)
         unchecked = []
         for losses in fit(self.networks, earlier, self.states, batches, self.optimiser, config, taught):
             self.done += 1

@@ -1,7 +1,5 @@
 """What members see of an observation: all of it, or what a view of one's own shows (beyond the paper)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -20,7 +19,7 @@ SETS = {
 DO = "Give a .npz file that numpy.savez wrote, of numbers, not of Python objects."
 LABELS = "Give (N,), or (N, sub-goals) and --sub-goal NAME for each column: 1 where it holds, 0 where not."
 
-Arrays: TypeAlias = dict[str, Array]
+Arrays = dict[str, Array]
 
 
 def read_arrays(path: Path, left: Counter[str]) -> Arrays:
@@ -28,7 +27,7 @@ def read_arrays(path: Path, left: Counter[str]) -> Arrays:
 
     ``left`` counts other files of the folder.
     """
-    arrays: Arrays = {"sub_goals": np.array(["sub-goal"]), "features": np.array([])}
+    arrays = {"sub_goals": np.array(["sub-goal"]), "features": np.array([])}
     for file in files_of(path, (".npy",), left):
         inner = file.relative_to(path).with_suffix("")
         with reading(file, DO):
@@ -68,7 +67,7 @@ def episodes_of(
         if columns.shape != (len(sub_goals), count) or not np.isin(columns, (0, 1)).all():
             fault = f"labels of {count} {role} states and {len(sub_goals)} sub-goals are not 0 or 1 for each"
             raise UserError(fault, f"{labels.dtype} {labels.shape}", LABELS)
-        by_goal = dict(zip(sub_goals, columns.astype(np.bool_), strict=True))
+        by_goal = dict(zip(sub_goals, columns.astype(bool), strict=True))
         groups = arrays.get(f"{prefix}{group}", np.full(count, ""))
         rest -= {f"{prefix}labels", f"{prefix}{group}"}
         if count:

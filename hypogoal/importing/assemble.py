@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from pandas import DataFrame
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
@@ -75,7 +76,7 @@ def assemble(
     return collected, doubts + remarks + doubts_of(labelled.labels, heldout.labels, goals)
 
 
-def contradictions(table: pd.DataFrame, labels: Labels, goals: Sequence[str]) -> list[str]:
+def contradictions(table: DataFrame, labels: Labels, goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal of which equal states have both labels; a ``UserError`` if a class has no others."""
     lines = []
     judged = table[table["role"] != UNLABELLED]
@@ -94,7 +95,7 @@ def contradictions(table: pd.DataFrame, labels: Labels, goals: Sequence[str]) ->
     return lines
 
 
-def with_roles(table: pd.DataFrame, seed: int) -> pd.DataFrame:
+def with_roles(table: DataFrame, seed: int) -> DataFrame:
     """What is known of frames, with a role for all: :attr:`Frames.table`.
 
     Whole episodes whose role is open are drawn for those of the three that no frame has yet, ``SPLIT`` of them each,
@@ -117,18 +118,18 @@ def with_roles(table: pd.DataFrame, seed: int) -> pd.DataFrame:
 
 
 def apart(
-    table: pd.DataFrame,
+    table: DataFrame,
     labels: Labels,
     share: float,
     seed: int,
-) -> tuple[pd.DataFrame, list[str]]:
+) -> tuple[DataFrame, list[str]]:
     """The frames without those that are in two sets, and lines that say so.
 
     Where no states are held out, nor drawn by episodes, a ``share`` of the labelled ones is.
     """
     lines = []
     learned = [LABELLED, UNLABELLED]
-    groups: set[str] = set()
+    groups = set()
     if HELDOUT not in {*table["role"]} and "place" not in table:
         labelled = table[table["role"] == LABELLED]
         is_held = held_out(labels[labelled.index], labelled, share, seed)
@@ -151,7 +152,7 @@ def apart(
     return table, lines
 
 
-def held_out(labels: Labels, table: pd.DataFrame, share: float, seed: int) -> Labels:
+def held_out(labels: Labels, table: DataFrame, share: float, seed: int) -> Labels:
     """Which states are held out, bool (N,): whole groups, and without groups all that look alike.
 
     Of each combination of labels (N, G) that groups have, a random ``share``, never all. A remainder of less than one
@@ -159,13 +160,13 @@ def held_out(labels: Labels, table: pd.DataFrame, share: float, seed: int) -> La
     """
     in_group = table["group"] != ""
     unit = table["group"].where(in_group, table["look"])
-    units = pd.DataFrame(labels).groupby(unit.to_numpy(), sort=False)
+    units = DataFrame(labels).groupby(unit.to_numpy(), sort=False)
     kinds = units.first()
     if in_group.any():
         kinds = pd.concat([units.any(), units.all()], axis=1)
     of_each = kinds.to_numpy()
     rng = rng_for(seed, "held-out")
-    chosen = np.zeros(len(of_each), np.bool_)
+    chosen = np.zeros(len(of_each), bool)
     due = 0.0
     for kind in np.unique(of_each, axis=0):
         rows = np.flatnonzero((of_each == kind).all(axis=1))

@@ -46,7 +46,7 @@ def _marks(frames: Frames, rule: str) -> Any:
         is_last = behind < int(count)
         for name in SUCCESS:
             if name in columns:
-                numbers = pd.to_numeric(columns[name], errors="coerce").astype(np.float64)
+                numbers = pd.to_numeric(columns[name], errors="coerce").astype(float)
                 return is_last * numbers.groupby(episode).transform("max")  # NaN where it has none
         return is_last
     if ":" in rule and rule not in columns:
@@ -108,19 +108,16 @@ def add_labels(source: Path, file: Path, sub_goal: str, path: Path, seed: int) -
     dataset = open_dataset(source)
     if dataset.sub_goals != (sub_goal,):
         goals = ", ".join(dataset.sub_goals)
-        fault = "a table labels data of one sub-goal, its own"
-        raise UserError(fault, sub_goal, f"It has {goals}.")
+        raise UserError("a table labels data of one sub-goal, its own", sub_goal, f"It has {goals}.")
     unlabelled = dataset.unlabelled_states()
-    places = {}
-    for place, state in enumerate(unlabelled.observations):
-        places[digest(state).hex()] = place
+    places = {digest(state).hex(): place for place, state in enumerate(unlabelled.observations)}
     table = read_table(path, {"label": str, "digest": str})
     filled = table[table["label"] != ""]
     with reading(path, "Give states of these data, each once, with 1 or 0; or audit an ensemble of these data again."):
         numbers = [places.pop(look) for look in filled["digest"]]
         labels = [TRUTHS[label] for label in filled["label"]]
-    rows = np.array(numbers, np.int64)
-    marked = replace(unlabelled.where(rows), labels=np.array(labels, np.bool_))
+    rows = np.array(numbers, int)
+    marked = replace(unlabelled.where(rows), labels=np.array(labels, bool))
     every = np.arange(len(unlabelled.labels))
     others = np.delete(every, rows)
     features: Sequence[str] = ()

@@ -20,7 +20,13 @@ from typing import Any
 import numpy as np
 import PIL.Image
 import PIL.ImageOps
-from PIL.TiffImagePlugin import TiffImageFile
+from PIL.TiffImagePlugin import (
+    BITSPERSAMPLE,
+    PHOTOMETRIC_INTERPRETATION,
+    PLANAR_CONFIGURATION,
+    SAMPLEFORMAT,
+    TiffImageFile,
+)
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
@@ -42,8 +48,6 @@ PLACES = {
     "heldout/negative": HELDOUT,
 }
 FILMS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi")
-# A TIFF's tags; some of what they say Pillow reads otherwise: 12 bits, 0 as white, each colour for itself, signs.
-BITS, WHITE, PLANES, SIGNS = 258, 262, 284, 339
 DEEP = re.compile("[^R];16|65535")  # in the arguments of Pillow's decoders, whose mode says 8 bits of most such files
 SHOWN = "Write or download it again; 'ffmpeg -i FILM -crf 0 NEW.mkv' keeps what can be shown of a film."
 SHORT = "hypogoal: {} ends earlier than it says, as if it was cut off: what is left is taken"
@@ -65,11 +69,12 @@ def picture_of(data: bytes, where: Path) -> Array:
             raise ValueError(f"it is none of {', '.join(FORMATS)}, or of a kind that Pillow does not read") from None
         is_deep = any(DEEP.search(str(tile.args)) for tile in opened.tile)
         if isinstance(opened, TiffImageFile):
+            # Some of these Pillow reads otherwise: 12 bits, 0 as white, each colour for itself, signs.
             tags = opened.tag_v2
-            bits = {*tags.get(BITS, (1,))}
-            is_white = tags.get(WHITE, 0) == 0
-            is_apart = tags.get(PLANES) == 2 and (is_white or bits != {8})
-            if is_apart or (is_white and 16 in bits) or 12 in bits or 2 in tags.get(SIGNS, ()):
+            bits = {*tags.get(BITSPERSAMPLE, (1,))}
+            is_white = tags.get(PHOTOMETRIC_INTERPRETATION, 0) == 0
+            is_apart = tags.get(PLANAR_CONFIGURATION) == 2 and (is_white or bits != {8})
+            if is_apart or (is_white and 16 in bits) or 12 in bits or 2 in tags.get(SAMPLEFORMAT, ()):
                 raise ValueError("it is a TIFF of 12 bits, with signs, with 0 as white in 16, or of planes")
         opened.load()  # in a PNG the orientation may follow the pixels
         image = PIL.ImageOps.exif_transpose(opened)
@@ -171,16 +176,14 @@ def frames_in(
                 yield _upright(frame, path)
             if not missing:
                 return
-    fault = f"the film lacks {len(missing)} of {len(rows)} frames that are listed"
-    raise UserError(fault, path, SHOWN)
+    raise UserError(f"the film lacks {len(missing)} of {len(rows)} frames that are listed", path, SHOWN)
 
 
 def _upright(frame: Any, path: Path) -> Array:
     """A frame as a player shows it, uint8 (H, W, 3)."""
     first, *others = frame.format.components
     if first.bits > 8 and not others:
-        fault = f"the film is grey, of {first.bits} bits, of which 8 would be left"
-        raise UserError(fault, path, SCALE)
+        raise UserError(f"the film is grey, of {first.bits} bits, of which 8 would be left", path, SCALE)
     if frame.is_corrupt:
         raise UserError("the film is damaged", path, SHOWN)
     if others and others[-1].is_alpha and frame.to_ndarray(format="rgba")[..., 3].min() < 255:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,12 +30,11 @@ KEYS = "Choose those that have one by --key; () is a single value, None a broken
 MASK = "Give names of data/*, or take the mask out: del file['mask/valid']."
 TABLE = ".csv"  # labels of films, beside them
 
-# From a source, the keys to read, and what counts by suffix the files that are not read.
-Reader: TypeAlias = Callable[[Path, Sequence[str], Counter[str]], Iterator[Episode]]
+Reader = Callable[[Path, Sequence[str]], Iterator[Episode]]  # from a source, the keys to read
 
 
-def reader_of(source: Path) -> Reader | None:
-    """What reads a recording; None of what is none."""
+def reader_of(source: Path, left: Counter[str]) -> Reader | None:
+    """What reads a recording; None of what is none. ``left`` counts by suffix the files that are not read."""
     if (source / MINARI).exists():
         return read_minari
     if (source / INFO).exists():
@@ -43,14 +42,10 @@ def reader_of(source: Path) -> Reader | None:
     if source.suffix.lower() in HDF5:
         return read_robomimic
     films = files_of(source, FILMS, Counter())
-    return read_films if films else None
+    return partial(read_films, left=left) if films else None
 
 
-def read_minari(
-    source: Path,
-    keys: Sequence[str],
-    left: Counter[str],
-) -> Iterator[Episode]:
+def read_minari(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
     """The episodes of a dataset in any of Minari's formats; T is one more than the steps."""
     import minari
 
@@ -81,16 +76,12 @@ def _space_of(part: dict[str, Any]) -> Any:
     return deserialize_space(part) if isinstance(kind, str) else part
 
 
-def read_robomimic(
-    source: Path,
-    keys: Sequence[str],
-    left: Counter[str],
-) -> Iterator[Episode]:
+def read_robomimic(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
     """The demonstrations ``data/*/obs/KEY``; those that ``mask/valid`` lists are held out."""
     with opened(source, DEMOS, "the recording") as file:
         demos = file["data"]
         masks = file.get("mask", {})
-        valid: set[str] = set()
+        valid = set()
         if "valid" in [*masks]:
             listed = np.ravel(masks["valid"]).astype("S")
             valid = {name.decode().strip() for name in listed}
@@ -113,12 +104,8 @@ def read_robomimic(
             yield episode
 
 
-def read_films(
-    source: Path,
-    keys: Sequence[str],
-    left: Counter[str],
-) -> Iterator[Episode]:
-    """The films in a folder, an episode each, called by their path in it."""
+def read_films(source: Path, keys: Sequence[str], left: Counter[str]) -> Iterator[Episode]:
+    """The films in a folder, an episode each, called by their path in it; each has one key, whatever ``keys`` say."""
     for file in files_of(source, FILMS, left):
         name = file.relative_to(source).with_suffix("")
         seen = {"video": partial(frames_in, file)}
@@ -126,14 +113,9 @@ def read_films(
     left.pop(TABLE, None)
 
 
-def read_lerobot(
-    source: Path,
-    keys: Sequence[str],
-    left: Counter[str],
-) -> Iterator[Episode]:
+def read_lerobot(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
     """The episodes of a dataset, with ``keys`` of its features beside all ``observation*``."""
-    text = (source / INFO).read_text(encoding="utf-8-sig")
-    info = json.loads(text)
+    info = json.loads((source / INFO).read_bytes())
     table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
     listed = _listed(source)
     for key in info["features"]:
@@ -142,23 +124,25 @@ def read_lerobot(
     for row in listed.to_dict("records"):
         file = source / info["data_path"].format(**_facts(row, "data"))
         table = table_of(file)
-        frames = table[table[OWNER] == row[OWNER]]
+        number = row[OWNER]
+        frames = table[table[OWNER] == number]
+        length = len(frames)
         if "timestamp" in frames:
-            numbers = np.rint(frames["timestamp"].to_numpy(np.float64) * info["fps"])
-            if not np.array_equal(numbers, np.arange(row.get("length", len(frames)))):
+            numbers = np.rint(frames["timestamp"].to_numpy(float) * info["fps"])
+            if not np.array_equal(numbers, np.arange(row.get("length", length))):
                 fault = "rows are not the frames of their episode in order, by their timestamps"
-                raise UserError(fault, f"{file}, episode {row[OWNER]}", AGAIN)
+                raise UserError(fault, f"{file}, episode {number}", AGAIN)
         columns = {}
-        seen: dict[str, Any] = {}
+        seen = {}
         for key, feature in info["features"].items():
             if feature["dtype"] == "video":
                 facts = _facts(row, f"videos/{key}")
                 film = source / info["video_path"].format(video_key=key, **facts)
                 begin = facts["from_timestamp"]
                 shown = (row.get(f"videos/{key}/to_timestamp", np.inf) - begin) * info["fps"]
-                if not shown > len(frames) - 0.5:
-                    fault = f"the film has {shown:.0f} frames of an episode of {len(frames)}"
-                    raise UserError(fault, f"{film}, episode {row[OWNER]}", AGAIN)
+                if not shown > length - 0.5:
+                    fault = f"the film has {shown:.0f} frames of an episode of {length}"
+                    raise UserError(fault, f"{film}, episode {number}", AGAIN)
                 values: Any = partial(frames_in, film, rate=info["fps"], begin=begin)
             elif feature["dtype"] == "image":
                 values = partial(_cells, file, frames[key])
@@ -168,7 +152,7 @@ def read_lerobot(
                     columns[key] = values
             if key in keys or key.startswith("observation"):
                 seen[key] = values
-        yield Episode(str(row[OWNER]), len(frames), seen, columns)
+        yield Episode(str(number), length, seen, columns)
 
 
 def _listed(source: Path) -> pd.DataFrame:
@@ -185,7 +169,7 @@ def _cut_ends(listed: pd.DataFrame, head: str) -> None:
     begin, end = f"{head}/from_timestamp", f"{head}/to_timestamp"
     if begin in listed:
         films = listed.sort_values(begin).groupby([f"{head}/chunk_index", f"{head}/file_index"])
-        following = films[begin].shift(-1).astype(np.float64).fillna(np.inf)
+        following = films[begin].shift(-1).astype(float).fillna(np.inf)
         listed[end] = np.minimum(following, listed.get(end, np.inf))
 
 
@@ -219,7 +203,7 @@ def _episode(
 
     A column that is shorter has no numbers for the last frames, and one that is longer has none at all.
     """
-    shapes: dict[str, Any] = {key: getattr(seen[key], "shape", None) for key in keys or seen if key in seen}
+    shapes = {key: getattr(seen[key], "shape", None) for key in keys or seen if key in seen}
     lengths: set[tuple[int, ...]] = {(shape or ())[:1] for shape in shapes.values()}
     if len(lengths) > 1 or () in lengths:
         raise UserError("not all of these have an entry for each frame", f"{name}: {shapes}", KEYS)

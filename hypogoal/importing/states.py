@@ -8,18 +8,19 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pandas import DataFrame
 
+from hypogoal.core.arrays import Array
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.observations import NUMBERS, PICTURE, spread_rows
 
-Array: TypeAlias = NDArray[Any]
 ROLES = LABELLED, UNLABELLED, HELDOUT = "labelled", "unlabelled", "heldout"
 STACKED = "Give pictures as uint8 (H, W, C); 'import --stack' puts stacked frames among the channels."
 MOST_COMPARED = 2_000  # rows of numbers that are compared before and after the cast to float32, spread evenly
@@ -92,8 +93,8 @@ class Frames(NamedTuple):
         channels: frames and colours of stacks by key, see :class:`hypogoal.data.Collected`.
     """
 
-    table: pd.DataFrame
-    columns: pd.DataFrame
+    table: DataFrame
+    columns: DataFrame
     seen: dict[str, list[Array]]
     channels: dict[str, tuple[int, int]]
 
@@ -119,7 +120,7 @@ def frames_of(
     tables, columns = [], []
     episode_names = set()
     seen: dict[str, list[Array]] = {}
-    channels: dict[str, tuple[int, int]] = {}
+    channels = {}
     with reading(source):
         for episode in episodes:
             length = episode.length
@@ -132,10 +133,10 @@ def frames_of(
             episode_names.add(episode.name)
             names = [f"{episode.name}[{frame}]" for frame in frames]
             kept = slice((length - 1) % every, length, every)
-            table = pd.DataFrame({"name": names, "episode": episode.name, "group": episode.group, "role": episode.role})
+            table = DataFrame({"name": names, "episode": episode.name, "group": episode.group, "role": episode.role})
             table["kept"] = np.isin(frames, frames[kept])
             tables.append(table)
-            columns.append(pd.DataFrame(episode.columns, index=table.index))
+            columns.append(DataFrame(episode.columns, index=table.index))
             parts = _parts(episode, keys, kept, left)
             if seen and seen.keys() != parts.keys():
                 raise UserError("episodes have different observations", episode.name, "Choose some by --key.")
@@ -163,7 +164,7 @@ def _parts(
     An unknown key, one of another length, and none that can be read are a ``UserError``. In the names of several keys
     / becomes a dot, since they are names of fields.
     """
-    parts: dict[str, Iterable[Any]] = {}
+    parts = {}
     for key in sorted({*keys} or episode.observations):
         values: Any = episode.observations.get(key)
         dtype = getattr(values, "dtype", np.dtype(object))
@@ -251,8 +252,8 @@ def as_numbers(values: Array, subject: str) -> NDArray[np.float32]:
     before, after = values.reshape(count, -1), cast.reshape(count, -1)
     lost = ~np.isfinite(after) | ((after == 0) != (before == 0))
     rows = spread_rows(count, MOST_COMPARED)
-    distinct = pd.DataFrame(before[rows]).nunique()
-    merged = pd.DataFrame(after[rows]).nunique() < LEFT * distinct
+    distinct = DataFrame(before[rows]).nunique()
+    merged = DataFrame(after[rows]).nunique() < LEFT * distinct
     columns = np.flatnonzero(lost.any(axis=0) | merged)
     if len(columns):
         named = ", ".join(map(str, columns[:NAMED]))

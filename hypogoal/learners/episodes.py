@@ -30,7 +30,7 @@ class EpisodeRecorder(list[tuple[Any, ...]], Resumable):
     def __init__(self, environments: int):
         super().__init__()
         self.steps = 0
-        self.lengths = np.zeros(environments, np.int64)  # so far, of the episodes that run
+        self.lengths = np.zeros(environments, int)  # so far, of the episodes that run
         self.rewards = np.zeros(environments)
 
     def see(self, step: Step) -> None:
@@ -73,7 +73,7 @@ class EpisodeRecorder(list[tuple[Any, ...]], Resumable):
         return share > 0 and len(self) >= LAST and self.recent()["success"] >= share
 
     def snapshot(self) -> State:
-        return {**super().snapshot(), "rows": list(self)}
+        return super().snapshot() | {"rows": list(self)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)

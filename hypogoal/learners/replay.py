@@ -74,7 +74,7 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
 
     def set_priorities(self, indices: Ints, errors: Floats) -> None:
         """New priorities of sampled transitions: their absolute TD errors (n,)."""
-        priorities = errors.astype(np.float64) + 1e-3
+        priorities = errors.astype(float) + 1e-3
         self.largest = max(self.largest, float(priorities.max()))
         self.priorities[indices] = priorities**ALPHA
 
@@ -106,7 +106,7 @@ class StepsAhead(Resumable):
                 count = len(steps)
                 first = steps.pop(0)
                 complete.append((sequence, count, *first))
-        columns = np.array(complete, np.int64).reshape(-1, 4).T
+        columns = np.array(complete, int).reshape(-1, 4).T
         sequences, counts, states, actions = columns
         return replace(
             rows.at(sequences),

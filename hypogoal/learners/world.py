@@ -2,11 +2,11 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import assigned
+from hypogoal.core.config import Values, assigned
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, Engine
@@ -15,7 +15,7 @@ from hypogoal.learners.config import WorldConfig
 RANDOM_EPISODES = 200  # of random play, which say how hard a layout is
 
 
-def played_world(domain: Domain, collected: Mapping[str, Any], config: WorldConfig) -> dict[str, Any]:
+def played_world(domain: Domain, collected: Values, config: WorldConfig) -> dict[str, Any]:
     """The domain's settings with which states were collected, after the changes that the setting ``world`` names."""
     changes = assigned(config.world)
     for name in changes:
@@ -27,7 +27,7 @@ def played_world(domain: Domain, collected: Mapping[str, Any], config: WorldConf
 
 def make_engine(
     domain: Domain,
-    world: Mapping[str, Any],
+    world: Values,
     config: WorldConfig,
     environments: int,
     **begins: Any,
@@ -90,7 +90,7 @@ def write_layout(
     """
     success = engine.random_success(RANDOM_EPISODES, rng_for(seed, "random-play"))
     places = {"start": config.start, "layouts": layouts}
-    facts: dict[str, Any] = {
+    facts = {
         **{name: place for name, place in places.items() if place},
         "layout_seed": config.layout_seed,
         "shortest_path": engine.shortest_path(),

@@ -83,7 +83,7 @@ class RandomChooser(Chooser):
 
     def __init__(self, rng: np.random.Generator, options: int = 0):
         self.rng = rng
-        self.steps = np.zeros(options, np.int64)  # of each option so far
+        self.steps = np.zeros(options, int)  # of each option so far
 
     @classmethod
     def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
@@ -101,7 +101,7 @@ class EvenChooser(RandomChooser):
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         """For each environment in turn, int64 (n,); an option that runs counts as one step more."""
-        chosen = np.empty(len(environments), np.int64)
+        chosen = np.empty(len(environments), int)
         for row in range(len(environments)):
             tied = self.steps + self.rng.random(len(self.steps))
             chosen[row] = np.where(offered[row], tied, np.inf).argmin()

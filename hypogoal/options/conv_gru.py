@@ -170,8 +170,7 @@ class PaperLearner(Learner):
                 "Give --set experience=own.",
             )
         if engine.observation_dtype != PICTURE:
-            fault = "the paper's networks see pictures only"
-            raise UserError(fault, "network=paper", "Give --set network=light.")
+            raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
 
     def build(self, config: PaperConfig, seed: int) -> None:
         self.members = []
@@ -180,8 +179,8 @@ class PaperLearner(Learner):
             with DrawsFrom(torch_generator(seed, "option-weights", option)):
                 network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), config))
-        self.windows = np.zeros((self.engine.count, config.recurrence), np.int64)  # of running executions
-        self.lengths = np.zeros(self.engine.count, np.int64)  # theirs; the places behind have states of the window
+        self.windows = np.zeros((self.engine.count, config.recurrence), int)  # of running executions
+        self.lengths = np.zeros(self.engine.count, int)  # theirs; the places behind have states of the window
 
     @staticmethod
     def reach(config: PaperConfig, options: int) -> int:
@@ -200,16 +199,17 @@ class PaperLearner(Learner):
         age: Ints,
     ) -> Ints:
         """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
+        windows = self.windows
         begun, full = age == 0, age >= self.config.recurrence
-        self.windows[begun] = ids[begun, None]
-        self.windows[full, :-1] = self.windows[full, 1:]
+        windows[begun] = ids[begun, None]
+        windows[full, :-1] = windows[full, 1:]
         self.lengths = np.minimum(age + 1, self.config.recurrence)
-        self.windows[np.arange(len(ids)), self.lengths - 1] = ids
+        windows[np.arange(len(ids)), self.lengths - 1] = ids
         chosen = np.empty_like(ids)
         for option in np.unique(options):
             rows = options == option
             network = self.members[option].online.eval()
-            images, places = self._seen(self.windows[rows])
+            images, places = self._seen(windows[rows])
             lengths = tensor(self.lengths[rows], self.device)
             values = network(network.see(images), places, lengths)
             preferred = values.argmax(1)
@@ -254,7 +254,7 @@ class PaperLearner(Learner):
             return 0.0
         indices, weights, steps = indices[kept], weights[kept], steps.at(kept)
 
-        path, length = steps.path.astype(np.int64), steps.length
+        path, length = steps.path.astype(int), steps.length
         most = self.config.recurrence
         now, shifted = path[:, :-1], path[:, 1:]
         following = np.where(length[:, None] < most, now, shifted)

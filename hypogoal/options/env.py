@@ -16,7 +16,7 @@ from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.observations import Observations
 from hypogoal.options.loop import offered_options
-from hypogoal.options.reward import require_observations
+from hypogoal.options.reward import Env, require_observations
 from hypogoal.options.saved import Policies
 from hypogoal.options.termination import Terminations
 
@@ -59,14 +59,14 @@ class Options:
         """G * K."""
         return len(self.sub_goals) * self.members
 
-    def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
+    def make_env(self, **arguments: Any) -> Env:
         """The Gymnasium environment they were trained in, with the settings its states were collected with.
 
         ``arguments`` go to the environment, for example ``layout_seed``. Raises ``UserError`` if the domain is not
         installed, is code that the user did not allow, or has no environment.
         """
         domain = load_domain(self.domain)
-        return domain.make_env(**{**domain.world(self.domain_config), **arguments})
+        return domain.make_env(**domain.world(self.domain_config) | arguments)
 
     def name(self, option: int) -> str:
         """For example ``open-red-door/2``."""
@@ -80,7 +80,7 @@ class Options:
     def offered(self, observation: Observations) -> Bools:
         """Spec D6: which options may start in an observation (*obs): bool (G*K,)."""
         if not self.mask_reached:
-            return np.ones(self.count, np.bool_)
+            return np.ones(self.count, bool)
         log_odds = [ensemble.log_odds(observation[None]) for ensemble in self.ensembles]
         return offered_options(self.ends.positive(np.concatenate(log_odds, axis=1)))[0]
 
@@ -120,7 +120,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def __init__(
         self,
-        env: gymnasium.Env[Any, Any],
+        env: Env,
         options: Options,
         gamma: float = 1.0,
     ):
@@ -151,17 +151,18 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raises:
             UserError: there is no such option, or the environment was not reset.
         """
+        options = self.options
         if not self.action_space.contains(action):
             raise UserError(
                 "no such option",
                 repr(action),
-                f"They are 0 to {self.options.count - 1}.",
+                f"They are 0 to {options.count - 1}.",
             )
         option = int(action)
         masked = not self.action_masks()[option]
         if masked:
             warnings.warn(MASKED, UserWarning, stacklevel=2)
-        act = self.options.policies(option)
+        act = options.policies(option)
         running = np.array([option])
         total, duration, ended = 0.0, 0, False
         image = self._current()
@@ -169,12 +170,12 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observation, reward, terminated, truncated, info = self.env.step(act(image))
             image = self._look.read(observation)
             total += self.gamma**duration * float(reward)
-            log_odds = self.options.log_odds(option, image)
+            log_odds = options.log_odds(option, image)
             [reached] = self.ends.reached(log_odds, running, np.array([duration])).tolist()
             duration += 1
-            ended = reached or terminated or truncated or duration >= self.options.timeout
+            ended = reached or terminated or truncated or duration >= options.timeout
         self._image, self._masks = image, None
-        info = info | {"duration": duration, "reached": reached, "option": self.options.name(option), "masked": masked}
+        info = info | {"duration": duration, "reached": reached, "option": options.name(option), "masked": masked}
         return observation, total, terminated, truncated, info
 
     def _current(self) -> Observations:

@@ -29,8 +29,7 @@ class Exploration(Resumable):
     ):
         self.actions, self.rng = actions, rng
         self.persistent = config.exploration == "persistent"
-        self.kept = np.zeros(environments, np.int64)  # random actions
-        self.left = np.zeros(environments, np.int64)  # steps for which these still last
+        self.kept, self.left = np.zeros((2, environments), int)  # random actions, and for how many steps these last
 
     def mix(
         self,

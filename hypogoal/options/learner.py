@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hypogoal.core.arrays import Bools, Columns, Doubles, Floats, Ints
+from hypogoal.core.config import Values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
@@ -72,7 +73,7 @@ class Learner(Part, ABC):
         self.rng = rng_for(seed, "options")
         if isinstance(config, LearnerConfig):
             self.exploration = Exploration(config, engine.count, engine.n_actions, self.rng)
-        self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), np.int64)
+        self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), int)
         self.build(config, seed)
         reach = self.reach(config, self.options)
         if engine.memory is not None and reach > engine.memory:  # Spec D3
@@ -127,7 +128,7 @@ class Learner(Part, ABC):
     def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
         chosen = self.greedy(ids, options.copy(), age.copy())
-        chosen = answer_of(self, "greedy", chosen, np.int64, len(ids), self.engine.n_actions - 1)
+        chosen = answer_of(self, "greedy", chosen, int, len(ids), self.engine.n_actions - 1)
         if explore and isinstance(self.config, LearnerConfig):
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen
@@ -157,9 +158,7 @@ def load_learner(name: str) -> type[Learner]:
     return load_class(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]
 
 
-def make_policies(
-    config: Mapping[str, Any], weights: Mapping[str, Tensor], ensemble_config: Mapping[str, Any]
-) -> Policies:
+def make_policies(config: Values, weights: Mapping[str, Tensor], ensemble_config: Values) -> Policies:
     """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration."""
     if config["termination"] == ORACLE:
         raise UserError(

@@ -90,7 +90,8 @@ class LightLearner(Learner):
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        ones = np.ones(len(moved.ids), np.int64)
+        count = len(moved.ids)
+        ones = np.ones(count, int)
         steps = Lessons.cast(
             moved.ids,
             moved.actions,
@@ -106,8 +107,8 @@ class LightLearner(Learner):
             self.positive.put((option, self.positives[option] % POSITIVES_KEPT), rows.at(row))
             self.positives[option] += 1
         self.count(moved.options)
-        self.steps += len(moved.ids)
-        self.due += len(moved.ids)
+        self.steps += count
+        self.due += count
 
     def _judged(self, rows: Lessons) -> tuple[Bools, Bools]:
         """Which options learn from transitions, and which sub-goals hold where these lead to, bool (m, O) each.
@@ -167,13 +168,14 @@ class LightLearner(Learner):
             kept &= self.engine.remembers(self.positive.next_state)
         counts = kept.sum(1)
         have = np.flatnonzero(counts)
-        extra = round(self.config.option_batch * POSITIVE_SHARE) if len(have) else 0
-        extra = min(extra, self.config.option_batch - 1)  # priorities need one drawn by them
-        indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
+        size = self.config.option_batch
+        extra = round(size * POSITIVE_SHARE) if len(have) else 0
+        extra = min(extra, size - 1)  # priorities need one drawn by them
+        indices, weights = self.replay.sample(size - extra, self.rng)
         batch = self.replay.data.at(indices)
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
-            ranks = (self.rng.random(extra) * counts[options]).astype(np.int64)
+            ranks = (self.rng.random(extra) * counts[options]).astype(int)
             _options, kept_slots = np.nonzero(kept)
             firsts = counts.cumsum() - counts  # of each option among them
             slots = kept_slots[firsts[options] + ranks]

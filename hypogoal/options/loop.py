@@ -73,8 +73,8 @@ class OptionLoop(Resumable):
             )
         count = self.engine.count
         self.option = np.full(count, NONE)
-        self.began, self.age = np.zeros((2, count), np.int64)  # states in which options were chosen; steps since
-        self.inside = np.zeros(count, np.bool_)  # the running option's own sub-goal held where it began
+        self.began, self.age = np.zeros((2, count), int)  # states in which options were chosen; steps since
+        self.inside = np.zeros(count, bool)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
         self.engine.reset()
 
@@ -94,7 +94,7 @@ class OptionLoop(Resumable):
         step = self.engine.step(actions)
         log_odds = self.terminations.log_odds(step.next_ids, option)
         reached = self.terminations.reached(log_odds, option.copy(), self.age.copy())
-        reached = answer_of(self.terminations, "reached", reached, np.bool_, len(option))
+        reached = answer_of(self.terminations, "reached", reached, bool, len(option))
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
@@ -124,15 +124,16 @@ class OptionLoop(Resumable):
 
     def _choose(self, learning: bool) -> None:
         free = np.flatnonzero(self.option == NONE)
-        if not len(free):
+        count = len(free)
+        if not count:
             return
         ids = self.engine.ids[free]
-        offered = np.ones((len(free), self.terminations.options), np.bool_)
+        offered = np.ones((count, self.terminations.options), bool)
         if self.config.mask_reached:
             offered = offered_options(self.terminations.of(ids))
         chosen = self.chooser.choose(free, ids, offered.copy())
-        chosen = answer_of(self.chooser, "choose", chosen, np.int64, len(free), self.terminations.options - 1)
-        if learning and not offered[np.arange(len(free)), chosen].all():
+        chosen = answer_of(self.chooser, "choose", chosen, int, count, self.terminations.options - 1)
+        if learning and not offered[np.arange(count), chosen].all():
             raise UserError(
                 f"choose gave options {chosen}, of which not all are offered",
                 type(self.chooser).__name__,
@@ -156,7 +157,7 @@ class OptionLoop(Resumable):
             inside=self.inside,
             returns=self.returns,
             durations=self.age,
-            discounts=np.power(self.gamma, self.age, dtype=np.float64),
+            discounts=np.power(self.gamma, self.age, dtype=float),
             next_ids=step.next_ids,
             terminated=step.terminated,
             truncated=step.truncated,

@@ -216,7 +216,7 @@ def apply_to_states(
     """Output of a network on ``device`` for states of an engine: by tile codes where both know them, else by images."""
     tiles = engine.tiles
     if tiles is not None and isinstance(getattr(network, "cells", None), CellEmbedding):
-        codes = tensor(engine.codes(ids).astype(np.int64), device)
+        codes = tensor(engine.codes(ids).astype(int), device)
         return network(codes, tiles)
     return network(tensor(engine.images(ids), device))
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Array
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
@@ -26,10 +26,10 @@ class Part(Resumable):
         """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
 
 
-def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most: int = 1) -> NDArray[Any]:
+def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most: int = 1) -> Array:
     """What a part's method gave for each of ``count`` environments, from 0 to ``most``, else a ``UserError``."""
     given = np.asarray(values)
-    kinds = "b" if dtype == np.bool_ else "iu"
+    kinds = "b" if dtype is bool else "iu"
     if given.shape != (count,) or given.dtype.kind not in kinds:
         shown = f"{given.dtype} {given.shape}"
     elif count and (given.min() < 0 or given.max() > most):
@@ -53,7 +53,7 @@ def learned_by(part: Any) -> dict[str, float]:
     return numbers
 
 
-def saved_row(weights: Mapping[str, Tensor], name: str, options: int) -> NDArray[Any]:
+def saved_row(weights: Mapping[str, Tensor], name: str, options: int) -> Array:
     """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing."""
     row = weights.get(name)
     if row is None or row.shape != (options,):

@@ -79,7 +79,7 @@ def plan_of(
 
 def places_of(plan: Plan, engine: Engine) -> Ints:
     """Where in a plan each of the engine's states is, int64 (n_states,); -1 of those that are not in it."""
-    places = np.full(engine.n_states, -1, np.int64)
+    places = np.full(engine.n_states, -1, int)
     places[plan.ids] = np.arange(len(plan.ids))
     return places
 

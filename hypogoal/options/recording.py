@@ -47,7 +47,7 @@ class Recorder(Resumable):
         self.episodes = EpisodeRecorder(engine.count)
         self.choices: list[tuple[float, ...]] = []
         self.stops = latest(options, STOPS_KEPT)
-        self.executions: list[deque[Execution]] = latest(options, LAST)
+        self.executions = latest(options, LAST)
         self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # states that running executions came to
         self.counts = np.zeros((options, 5))  # in the window: offered, chosen, expected, reached, duration
         self.counted_from = 0  # the step at which the window began
@@ -169,8 +169,8 @@ class Recorder(Resumable):
         """
         runs = self._executions()
         stopped = [run.states[-1] for run in runs]
-        stops = np.array(stopped, np.int64)
-        options = np.array([run.option for run in runs], np.int64)
+        stops = np.array(stopped, int)
+        options = np.array([run.option for run in runs], int)
         places = self.engine.positions(stops)
         aways = distances(places, options)
         rows = [(*run[:6], *place, away) for run, place, away in zip(runs, places, aways, strict=True)]
@@ -189,7 +189,7 @@ class Recorder(Resumable):
         """
         rows = []
         for run in self._executions():
-            states = np.array(run.states, np.int64)
+            states = np.array(run.states, int)
             options = np.full_like(states, run.option)
             is_near, sure = near(states, options), log_odds(states, options)
             best_near = np.fmax.reduce(sure[is_near], initial=np.nan)  # NaN of none

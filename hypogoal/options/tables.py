@@ -44,7 +44,7 @@ class Table(Columns):
 
         with reading(path, AGAIN, "the table"):
             frame = read_csv(path, dtype=str, encoding="utf-8-sig")
-            frame = frame[[*cls.names()]].astype(np.float64)
+            frame = frame[[*cls.names()]].astype(float)
         for name, values in frame.items():
             known = np.isfinite(values)
             if name in BLANK:
@@ -101,7 +101,7 @@ class ChoiceCounts(Table):
 
     def total(self, name: str, options: int) -> Doubles:
         """The sum of column ``name`` over all windows, (O,)."""
-        return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
+        return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(float)
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,14 @@
 """Spec B7: states that a policy visited while it learned, kept to train ensembles with."""
 
-from collections.abc import Mapping
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hypogoal.core.arrays import Ints
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.config import Values
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected, Dataset, States, open_dataset, write_dataset
@@ -52,13 +51,13 @@ class Visited(Resumable):
     def write(
         self,
         folder: Path,
-        ensemble_config: Mapping[str, Any],
+        ensemble_config: Values,
         seed: int,
     ) -> None:
         """``visited.h5`` into ``folder``: a data file of unlabelled states, of the ensemble's domain."""
         sub_goals = tuple(ensemble_config["sub_goals"])
-        visited = States(self.states(), np.zeros((0, 0), np.bool_))
-        none = States(visited.observations[:0], np.zeros((0, len(sub_goals)), np.bool_))
+        visited = States(self.states(), np.zeros((0, 0), bool))
+        none = States(visited.observations[:0], np.zeros((0, len(sub_goals)), bool))
         collected = Collected(
             self.engine.observation_shape,
             sub_goals,

@@ -150,9 +150,8 @@ def load_stage(name: str) -> "Stage":
         raise UserError("this is no stage", name, f"Choose one of {', '.join(LISTED)}.")
     folder = "tools" if name in TOOLS else "stages"
     word = "import_data" if name == "import" else name.replace("-", "_")
-    function: Any = getattr(import_module(f"hypogoal.{folder}.{word}"), word)
-    loaded: Stage = function.stage
-    return loaded
+    function = getattr(import_module(f"hypogoal.{folder}.{word}"), word)
+    return function.stage
 
 
 def stage(example: str, **more: Any) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
@@ -187,7 +186,7 @@ class Stage:
         options = [option for option in shared if option.name not in self.leaves_out]
         self.options = [*self.inputs, *options]
         if self.into:
-            by_default: Any = Option("--out", help=f"Default: {self.source.name.upper()}/{self.into}.")
+            by_default = Option("--out", help=f"Default: {self.source.name.upper()}/{self.into}.")
             self.out = self.out.replace(default=None, annotation=Annotated[Path | None, by_default])
 
     def python(self) -> Callable[..., "Made"]:
@@ -266,7 +265,7 @@ class Stage:
             meaning = row["meaning"][0].upper() + row["meaning"][1:]
             choices = f" ({row['allowed']})" if "|" in row["allowed"] else ""
             text = f"{meaning}{choices}. [dim]\\[default: {row['default']}][/dim]"
-            option: Any = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
+            option = Option(metavar=f"<{row['type']}>", help=text, rich_help_panel=panel)
             annotation = Annotated[str | None, option]
             yield Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
@@ -303,9 +302,9 @@ def _kept(call: Call, then: str) -> Iterator[str]:
         return
     if call.preset:
         yield from ("--preset", call.preset)
-    known = model_of(then).model_fields.keys() & {*WorldConfig.model_fields, "layouts"}
+    shared = model_of(then).model_fields.keys() & {*WorldConfig.model_fields, "layouts"}
     for name, value in call.typed.items():
-        if name in known:
+        if name in shared:
             yield from ("--set", f"{name}={value}")
 
 

@@ -26,7 +26,7 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
     options are of another ensemble, it is a ``UserError``.
     """
     source = open_artefact(ensemble, "ensemble")
-    held: dict[str, Any] = {}
+    held = {}
     if practice:
         made_from = [entry.sha256 for entry in practice.manifest.inputs if entry.kind == "ensemble"]
         if sha256_of(source.path) not in made_from:

@@ -38,7 +38,7 @@ def report(
     if format != "svg":
         raise UserError("--format is for --figures", format, "Give --figures DIR too, or leave it out.")
 
-    from hypogoal.evaluation.films import NEEDED, Film, agent_to_film, films_of
+    from hypogoal.evaluation.films import NEEDED, agent_to_film, films_of
     from hypogoal.evaluation.page import source, write
     from hypogoal.evaluation.questions import answers, render
     from hypogoal.evaluation.run import evaluation_of, read_evaluation
@@ -50,7 +50,7 @@ def report(
     inputs = [evaluation.path] if agent is None else [evaluation.path, agent.path]
     with call.draft("report", {"videos": len(inputs) - 1 if videos is None else videos}, inputs) as draft:
         results = read_evaluation(run)
-        films: list[Film] = []
+        films = []
         try:
             films = films_of(agent, agent.path.relative_to(run).as_posix(), videos) if agent else []
         except UserError as error:
@@ -59,7 +59,7 @@ def report(
             results.facts["missing"].append(f"no film of an episode: {error}")
         every = answers(results)
         small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
-        shown = [{**film.about, "source": source(film.gif, "gif")} for film in small]
+        shown = [film.about | {"source": source(film.gif, "gif")} for film in small]
         page = render(results, every, shown)
         drawn = chain.from_iterable(each["figures"] for each in every)
         write(draft.files, page, drawn)

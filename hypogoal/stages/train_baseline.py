@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Argument, Option
 
@@ -38,12 +38,11 @@ def train_baseline(
     config = call.settings(domain)
     played = load_domain(domain)
     dataset = None
-    collected: dict[str, Any] = {}
+    collected = {}
     if data:
         dataset = open_dataset(data)
         if dataset.domain != domain:
-            fault = f"these are states of {dataset.domain!r}, not of {domain!r}"
-            raise UserError(fault, data, "Name their domain.")
+            raise UserError(f"these are states of {dataset.domain!r}, not of {domain!r}", data, "Name their domain.")
         collected = played.world(dataset.config)
     played_world = world.played_world(played, collected, config)
     chosen = HYPERPARAMETERS[config.agent, config.setting]

@@ -49,8 +49,8 @@ def train_ensemble(
     config, sub_goals = checked(call.settings(dataset.domain), dataset)
     others = [unlabelled_file(path, dataset) for path in unlabelled or ()]
     settings = config.model_dump(mode="json") | {
-        "sub_goals": list(sub_goals),
-        "observation_shape": list(dataset.observation_shape),
+        "sub_goals": sub_goals,
+        "observation_shape": dataset.observation_shape,
         "observation_dtype": type_text(dataset.observation_dtype),
         "domain": dataset.domain,
         "domain_config": dataset.config,
@@ -86,11 +86,12 @@ def train_ensemble(
 
 def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
     """What was chosen for a sub-goal, and which of its members are no hypotheses."""
-    if chosen["tried"]:
+    trials = chosen["tried"]
+    if trials:
         held_out = f"{chosen['positives']} positives, {chosen['negatives']} negatives held out"
         yield f"{sub_goal}: diversity_weight={chosen['diversity_weight']:g}, by {held_out}"
         yield f"  weight  accuracy there (at least {chosen['lowest']:.3f})  disagreement on unlabelled states"
-    for tried in chosen["tried"]:
+    for tried in trials:
         differs = "-" if tried["disagreement"] is None else f"{tried['disagreement']:.2f}"
         remark = ""
         if tried["kept"]:
@@ -100,7 +101,7 @@ def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
         elif tried["contrary"]:
             remark = "  on more than half"
         yield f"  {tried['weight']:<6g}  {tried['accuracy']:<32.3f}  {differs}{remark}"
-    if chosen["tried"] and not chosen["tried"][-1]["kept"]:
+    if trials and not trials[-1]["kept"]:
         yield "  members keep the labels with none of these weights, so the smallest is taken"
     if chosen["remark"]:
         yield f"{sub_goal}: {chosen['remark']}"

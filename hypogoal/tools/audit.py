@@ -100,7 +100,7 @@ def _in_play(
             loop = assemble(setup, ends)
             agents.learn(work, setup, loop, config.steps)
             files = work.draft.files
-            report: dict[str, Any] = dict.fromkeys(played.POLICIES)
+            report = dict.fromkeys(played.POLICIES)
             for option, name in enumerate(policies):
                 report[name] = played.findings(loop, option, name, world.sub_goals, files)
             rng = rng_for(call.seed, "random-play")
@@ -108,7 +108,7 @@ def _in_play(
             (files / REPORT).write_text(as_json(report) + "\n", encoding="utf-8")
     except Complete as complete:  # what was found stands, and may still fail
         say(complete, err=True)
-    findings = json.loads((call.out / REPORT).read_text(encoding="utf-8"))
+    findings = json.loads((call.out / REPORT).read_bytes())
     return lines_of("played.txt", **findings), played.shares_of(findings)
 
 

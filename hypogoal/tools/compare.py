@@ -37,8 +37,7 @@ def compare(
         questions = beside.shared(results)
         reason = beside.why_not(results, questions)
         if reason is not None:
-            do = "Choose runs of one experiment, evaluated alike."
-            raise UserError("these runs cannot be compared", reason, do)
+            raise UserError("these runs cannot be compared", reason, "Choose runs of one experiment, evaluated alike.")
         paths = [str(run) for run in runs]
         page, figures, tables = beside.page_of(results, questions, paths)
         write(draft.files, page, figures)

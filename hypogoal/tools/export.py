@@ -63,13 +63,14 @@ def export(
         with call.draft("hub", {}, [source]) as draft:
             write_hub(artefact, draft.files)
         return Done()
-    if not NAME.fullmatch(call.out.name):
-        raise UserError("a Minari dataset needs a version in its name", call.out.name, "Give --out DIR/NAME-v0.")
+    name = call.out.name
+    if not NAME.fullmatch(name):
+        raise UserError("a Minari dataset needs a version in its name", name, "Give --out DIR/NAME-v0.")
     with (
         call.draft("episodes", {"episodes": episodes}, [source]) as draft,
         Progress("export", total=episodes, quiet=call.quiet) as progress,
     ):
-        write_episodes(artefact, draft.files / "data", call.out.name, call.seed, progress)
+        write_episodes(artefact, draft.files / "data", name, call.seed, progress)
     return Done()
 
 
@@ -117,7 +118,7 @@ def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
 
     from hypogoal.hypotheses.load import ByKey
 
-    rows: list[tuple[str, dict[str, Any]]] = []
+    rows = []
     for layer in network:  # also one that is there twice
         kind = type(layer)
         if isinstance(layer, ByKey):
@@ -152,7 +153,7 @@ def write_episodes(meta: Artefact, folder: Path, name: str, seed: int, progress:
     loop = agent_of(meta, seed)
     engine = loop.engine
     low, high = (0, 255) if engine.observation_dtype == PICTURE else (-np.inf, np.inf)
-    kind: Any = engine.observation_dtype.type
+    kind = engine.observation_dtype.type
     storage = MinariStorage.new(
         folder.resolve(),
         observation_space=spaces.Box(low, high, engine.observation_shape, kind),

@@ -71,22 +71,21 @@ def import_data(
         if inputs and kind_of(source) == DATA:
             is_as_it_is = how == frames_of.__kwdefaults__ and domain == IMPORTED
             if len(rules) != 1 or sub_goal or group or not is_as_it_is:
-                do = "Give --label NAME=TABLE.csv and --out alone."
-                raise UserError("a data file is taken as it is", source, do)
+                raise UserError("a data file is taken as it is", source, "Give --label NAME=TABLE.csv and --out alone.")
             [(name, table)] = rules.items()
             remarks = add_labels(source, file, name, Path(table), call.seed)
         else:
             of_pictures = (source / POSITIVE).is_dir()
-            reader = None if of_pictures else reader_of(source)
+            left: Counter[str] = Counter()  # what is not read
+            reader = None if of_pictures else reader_of(source, left)
             if bool(rules) != bool(reader) or (rules and sub_goal):
                 fault = "this is no recording" if rules and not reader else "nothing says where the sub-goal holds"
                 raise UserError(fault, source, NAMING)
             if group and (reader or of_pictures):
                 raise UserError("--group is for arrays", source, "Episodes and folders are groups already.")
-            left: Counter[str] = Counter()  # what is not read
             features: list[str] = []
             if reader:
-                episodes = reader(source, how["keys"], left)
+                episodes = reader(source, how["keys"])
                 goals = [*rules]
             elif of_pictures:
                 goals = sub_goal or [source.resolve().name]

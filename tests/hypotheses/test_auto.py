@@ -59,8 +59,8 @@ def test_the_final_members_have_all_labels() -> None:
 
 @pytest.mark.parametrize(
     "changed",
-    [{}, {"schedule": "simultaneous"}, {"diversity": "divdis"}, {"restarts": 1}],
-    ids=["sequential", "simultaneous", "divdis", "one start"],
+    [{}, {"schedule": "simultaneous"}, {"diversity": "divdis"}, {"diversity": "divdis", "members": 1}, {"restarts": 1}],
+    ids=["sequential", "simultaneous", "divdis", "one member", "one start"],
 )
 def test_breaks_leave_no_trace_in_a_search(changed: dict[str, object], tmp_path: Path) -> None:
     """Spec G1: broken in each of its trainings, it tries, chooses and ends as if it had not been."""

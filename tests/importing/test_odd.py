@@ -145,7 +145,7 @@ def test_odd_keys_of_a_recording(tmp_path: Path, kind: str) -> None:
             file[f"data/demo_{episode}/rewards"] = (np.arange(LENGTH) > 2) * 1.0
 
     def read() -> dict[str, np.ndarray]:
-        frames = frames_of(path, read_robomimic(path, (), left), left)
+        frames = frames_of(path, read_robomimic(path, ()), left)
         return {key: together(seen, frames.table["name"], key) for key, seen in frames.seen.items()}
 
     if wanted is None:

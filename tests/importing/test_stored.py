@@ -39,9 +39,9 @@ DEMOS = 5
 def stored(source: Path, rule: str, keys: tuple[str, ...] = ()) -> Collected:
     """What a data file of a recording has."""
     left: Counter[str] = Counter()
-    reader = recordings_reader_of(source)
+    reader = recordings_reader_of(source, left)
     assert reader
-    frames = frames_of(source, reader(source, keys, left), left, keys=keys)
+    frames = frames_of(source, reader(source, keys), left, keys=keys)
     return assemble(source, frames, labels_of(frames, {"on": rule}), ["on"])[0]
 
 

@@ -118,7 +118,7 @@ def test_the_callers_settings_change_nothing(name: str, data: Path, plain: dict[
 
 def settings_of_torch() -> tuple[Any, ...]:
     return (
-        *(torch.get_default_dtype(), torch.get_default_device(), torch.get_num_threads()),
+        *(torch.get_default_dtype(), torch.empty(0).device, torch.get_num_threads()),
         *(torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.is_autocast_enabled("cpu")),
     )
 

@@ -3,14 +3,14 @@
 See also ``env`` (the Gymnasium environment and the sub-goals) and ``engine`` (many environments, fast).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from hypogoal.core.config import Config, setting
+from hypogoal.core.config import Config, Values, setting
 from hypogoal.data import Collected, States, joined, leave_out, require_classes
 from hypogoal.domains.base import EQUATION_1, Domain
 from hypogoal.domains.doorkey import env
@@ -110,7 +110,7 @@ class DoorKeyDomain(Domain):
         require_classes(labelled.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or wrong_key=harmless.")
         return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, labelled, unlabelled, heldout)
 
-    def task(self, world: Mapping[str, Any]) -> str:
+    def task(self, world: Values) -> str:
         ends = world.get("wrong_key") == "ends"
         keys = "the blue or the green key ends the episode" if ends else "the blue and the green key open nothing"
         return f"Take the red key, open the red door and reach the goal behind it, for a reward of 1; {keys}."

@@ -17,9 +17,8 @@ import numpy as np
 from minigrid.core.actions import Actions
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.random import Generator
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Bools, Bytes, Ints
+from hypogoal.core.arrays import Array, Bools, Bytes, Ints
 from hypogoal.domains.base import Engine, Layouts, Plan, Step
 from hypogoal.domains.doorkey.env import (
     DOOR_COLOUR,
@@ -60,11 +59,11 @@ _CELL, _DIRECTION = np.divmod(_POSE, 4)
 _ONE_ON = np.array((1, SIZE, -1, -SIZE))  # from a cell to the next, by direction
 AHEAD = np.clip(_CELL + _ONE_ON[_DIRECTION], 0, CELLS - 1)  # the cell in front of each pose
 # For each action, code ahead and pose: what to add to the pose; and may the configuration change?
-MOVES = np.zeros((N_ACTIONS, N_CODES, POSES), np.int64)
+MOVES = np.zeros((N_ACTIONS, N_CODES, POSES), int)
 MOVES[LEFT] = (_DIRECTION - 1) % 4 - _DIRECTION
 MOVES[RIGHT] = (_DIRECTION + 1) % 4 - _DIRECTION
 MOVES[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = (AHEAD - _CELL) * 4
-MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), np.bool_)
+MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), bool)
 MAY_CHANGE[PICKUP, KEY : KEY + 3] = True
 MAY_CHANGE[DROP, EMPTY] = True
 MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
@@ -130,15 +129,15 @@ class DoorKeyEngine(Engine):
         # For each configuration: the door's state and the keys' places; its cell codes without the agent; ids by pose.
         self._places = np.zeros((16, 4), np.uint8)
         self._bare_codes = np.zeros((16, CELLS), np.uint8)
-        self._id_at = np.full((16, POSES), UNKNOWN, np.int64)
+        self._id_at = np.full((16, POSES), UNKNOWN, int)
         # For each id: configuration * POSES + pose; the index of the cell ahead in the bare codes; cell codes; the
         # strips of its image, once it was asked for; whether the agent is on the goal; whether the episode ends.
-        self._site = np.zeros(256, np.int64)
-        self._ahead = np.zeros(256, np.int64)
+        self._site = np.zeros(256, int)
+        self._ahead = np.zeros(256, int)
         self._codes = np.zeros((256, CELLS), np.uint8)
         self._strips = np.full((256, SIZE), UNKNOWN)
-        self._on_goal = np.zeros(256, np.bool_)
-        self._final = np.zeros(256, np.bool_)
+        self._on_goal = np.zeros(256, bool)
+        self._final = np.zeros(256, bool)
         self._drawn = np.zeros((256, STRIP), np.uint8)
         self._strip_of: dict[int, int] = {}  # by the row's codes as one number
         self.reset()
@@ -148,7 +147,7 @@ class DoorKeyEngine(Engine):
         return tiles()
 
     def restart(self, where: Bools) -> None:
-        (numbers,) = where.nonzero()
+        [numbers] = where.nonzero()
         if not len(numbers):  # in most steps
             return
         self.ids = self.ids.copy()
@@ -183,15 +182,15 @@ class DoorKeyEngine(Engine):
         pose = site & (POSES - 1)
         ahead = self._ahead.take(ids)
         code_ahead = self._bare_codes.ravel().take(ahead)
-        case = np.asarray(actions, np.int64) * N_CODES + code_ahead
+        case = np.asarray(actions, int) * N_CODES + code_ahead
         following_site = site + MOVES.take(case * POSES + pose)
-        (changing,) = MAY_CHANGE.take(case).nonzero()
+        [changing] = MAY_CHANGE.take(case).nonzero()
         for index in changing.tolist():
             action = int(actions[index])
             changed = self._changed(site.item(index), action)
             following_site[index] = changed * POSES + pose.item(index)
         following = self._id_at.ravel().take(following_site)
-        (new,) = (following < 0).nonzero()
+        [new] = (following < 0).nonzero()
         for index in new.tolist():
             following[index] = self._id_of(following_site.item(index))
         return following
@@ -275,7 +274,7 @@ class DoorKeyEngine(Engine):
             "agent_x": cell % SIZE,
             "agent_y": cell // SIZE,
             "direction": direction,
-            "door_state": places[:, 0].astype(np.int64),
+            "door_state": places[:, 0].astype(int),
             "keys_held": (places[:, 1:] >= HELD) @ KEY_BITS,
         }
 
@@ -291,7 +290,7 @@ class DoorKeyEngine(Engine):
             starts = self._starts_of(self.layouts.seeds)
         frontier = starts
         rings: list[Ints] = []
-        seen = np.zeros(self.n_states, np.bool_)
+        seen = np.zeros(self.n_states, bool)
         seen[starts] = True
         while len(frontier):
             rings.append(frontier)
@@ -426,7 +425,7 @@ class DoorKeyEngine(Engine):
             setattr(self, name, _doubled(getattr(self, name)))
 
 
-def _doubled(table: NDArray[Any]) -> NDArray[Any]:
+def _doubled(table: Array) -> Array:
     """The table with twice as many rows; integers in the new ones are ``UNKNOWN``, bytes 0."""
-    filling = UNKNOWN if table.dtype == np.int64 else 0
+    filling = UNKNOWN if table.dtype == int else 0
     return np.concatenate([table, np.full_like(table, filling)])

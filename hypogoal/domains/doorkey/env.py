@@ -161,14 +161,15 @@ class DoorKeyGrid(MiniGridEnv):
         return observation, float(reward), terminated or wrong, truncated, info | {"labels": self._named_labels()}
 
     def _use_ring(self, pick_up: bool) -> None:
+        ring = self.ring
         x, y = self.front_pos
         cell = self.grid.get(x, y)
         if pick_up and isinstance(cell, Key):
-            self.ring.append(cell)
+            ring.append(cell)
             self.grid.set(x, y, None)
-        elif not pick_up and cell is None and self.ring:
-            self.grid.set(x, y, self.ring.pop())
-        hand: Any = self.ring[-1] if self.ring else None
+        elif not pick_up and cell is None and ring:
+            self.grid.set(x, y, ring.pop())
+        hand: Any = ring[-1] if ring else None
         self.carrying = hand  # MiniGrid's own view shows it
 
     def _reward(self) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from hypogoal.core.config import Config, setting
+from hypogoal.core.config import Config, Values, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium.engine import MEMORY, GymnasiumEngine, Label, Success
@@ -64,7 +64,7 @@ class GymnasiumDomain(Domain):
         DOMAIN = GymnasiumDomain(make, {"key": lambda env: env.unwrapped.carrying is not None})
     """
 
-    many_layouts = True
+    many_layouts = has_env = True
     collect = collect
 
     def __init__(
@@ -74,7 +74,7 @@ class GymnasiumDomain(Domain):
         *,
         success: Success | None = None,
         policy: Policy | Mapping[str, Policy | None] | None = None,
-        defaults: Mapping[str, Mapping[str, Any]] | None = None,
+        defaults: Mapping[str, Values] | None = None,
         memory: int = MEMORY,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
@@ -103,10 +103,6 @@ class GymnasiumDomain(Domain):
     def observation_dtype(self) -> DType:
         return self.reader.dtype
 
-    @property
-    def has_env(self) -> bool:
-        return True
-
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: the domain's own settings, defaults for those left out.
 
@@ -114,7 +110,7 @@ class GymnasiumDomain(Domain):
         """
         fields = self.config_class.model_fields
         defaults = {name: fields[name].default for name in self.engine_settings}
-        env = self.make(**{**defaults, **arguments})
+        env = self.make(**defaults | arguments)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0:
             raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
@@ -123,4 +119,4 @@ class GymnasiumDomain(Domain):
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
         """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory`` and the domain's own settings."""
         layouts = arguments.pop("layouts", layout_seed)
-        return GymnasiumEngine(self, layouts, count, max_steps=max_steps, **{"memory": self.memory, **arguments})
+        return GymnasiumEngine(self, layouts, count, max_steps=max_steps, **{"memory": self.memory} | arguments)

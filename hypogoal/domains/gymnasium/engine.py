@@ -34,7 +34,7 @@ def labels_of(env: gymnasium.Env, functions: Mapping[str, Label]) -> Bools:
                 "Give True or False.",
             )
         labels.append(bool(holds))
-    return np.array(labels, np.bool_)
+    return np.array(labels, bool)
 
 
 class GymnasiumEngine(TurnEngine):
@@ -123,11 +123,11 @@ class GymnasiumEngine(TurnEngine):
             del self._ids[oldest]
 
     def labels(self, ids: Ints) -> Bools:
-        return self.facts_of(ids).view(np.bool_)
+        return self.facts_of(ids).view(bool)
 
     def snapshot(self) -> State:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
-        return {**super().snapshot(), "images": np.stack([*self._seen.values()])}
+        return super().snapshot() | {"images": np.stack([*self._seen.values()])}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an engine made with the same arguments: replays the current episodes.

@@ -18,6 +18,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.observations import CLEARLY, reading_of
 from hypogoal.observations import NUMBERS, PICTURE, DType, Shape, mixed_type
 
+Space = spaces.Space[Any]
 COMPARED = (16, 64, 256)  # after so many observations it is asked which of their numbers float32 makes equal:
 KEPT = 0.9  # it must keep this share of the distinct values,
 NOTICED = 1e-6  # or change none by more than this
@@ -34,7 +35,7 @@ class Reader:
         met: the first observations, where float32 does not hold all their numbers.
     """
 
-    space: spaces.Space[Any]
+    space: Space
     shape: Shape
     dtype: DType
     features: tuple[str, ...] = ()
@@ -90,14 +91,17 @@ class Reader:
             raise UserError(fault, f"{self.features[place]}, such as {exact[place]}", do)
 
 
-def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
+def reader_of(space: Space, key: str = "") -> Reader:
     """A reader of an observation space, or of what a ``Dict`` has under ``key``.
 
-    A ``Dict`` of pictures and others, each under a key of its own, is read by key, without its text. Other spaces that
+    A ``Dict`` of pictures and others, each under a key of its own, is read by key, without its text, which a warning
+    names. Other spaces that
     Gymnasium's ``flatten`` accepts become float32 (D,) in its order. Observations that are neither pictures nor numbers
     are a ``UserError``.
     """
-    space = _without_text(space)
+    space, texts = _split(space)
+    if texts:
+        warnings.warn(f"observations are read without their text: {', '.join(texts)}", stacklevel=2)
     if isinstance(space, spaces.Dict) and any(map(_is_picture, space.values())):
         return _by_key(space)
     if not isinstance(space, spaces.Box):
@@ -111,15 +115,7 @@ def reader_of(space: spaces.Space[Any], key: str = "") -> Reader:
     return _numbers(space, key)
 
 
-def _without_text(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """A space without the text among its entries, which a warning names."""
-    rest, texts = _split(space)
-    if texts:
-        warnings.warn(f"observations are read without their text: {', '.join(texts)}", stacklevel=2)
-    return rest
-
-
-def _split(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], list[str]]:
+def _split(space: Space) -> tuple[Space, list[str]]:
     """A space without the text among its entries, and the keys of this; all of it if there is nothing else."""
     if not isinstance(space, spaces.Dict):
         return space, []
@@ -129,7 +125,7 @@ def _split(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], list[str]]:
     return spaces.Dict({key: part for key, part in space.items() if key not in texts}), texts
 
 
-def _is_picture(space: spaces.Space[Any]) -> bool:
+def _is_picture(space: Space) -> bool:
     """Whether this is a picture, or refused because it may be."""
     if not isinstance(space, spaces.Box):
         return False
@@ -155,7 +151,7 @@ def _by_key(space: spaces.Dict) -> Reader:
     return Reader(space, (), dtype, parts=parts)
 
 
-def _numbers(space: spaces.Space[Any], key: str) -> Reader:
+def _numbers(space: Space, key: str) -> Reader:
     """A reader of a space without pictures, which Gymnasium flattens."""
     features = []
     for name, part in _leaves(space, key):
@@ -182,9 +178,11 @@ def _leaves(space: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield from _leaves(part, inner_name)
 
 
-def _names(name: str, space: spaces.Space[Any]) -> list[str]:
+def _names(name: str, space: Space) -> list[str]:
     """The names of a space's numbers."""
     try:
+        if isinstance(space, spaces.Text):  # Gymnasium numbers its letters otherwise after a space was stored
+            raise ValueError
         size = spaces.flatdim(space)
     except (NotImplementedError, ValueError):
         raise UserError(
@@ -199,14 +197,14 @@ def _names(name: str, space: spaces.Space[Any]) -> list[str]:
     return [f"{name}[{place}]" for place in range(size)]
 
 
-def recorded(space: spaces.Space[Any], values: Any, keys: Collection[str] = (), place: str = "") -> dict[str, Any]:
+def recorded(space: Space, values: Any, keys: Collection[str] = (), place: str = "") -> dict[str, Any]:
     """Observations (T, ...) of a space by key, as those of an environment are read; pictures are not yet arranged.
 
     Where there are no pictures, numbers are flattened into one array. Each of ``keys``, if any, is a space of its own.
     """
     is_wanted = not keys or place in keys
     has_pictures = any(_is_picture(part) for _, part in _leaves(space, place))
-    arrays: dict[str, Any] = {}
+    arrays = {}
     if is_wanted and not has_pictures and not isinstance(space, spaces.Box | spaces.Text):
         numbers, texts = _split(space)
         arrays[place] = _flattened(numbers, values)
@@ -221,7 +219,7 @@ def recorded(space: spaces.Space[Any], values: Any, keys: Collection[str] = (), 
     return arrays
 
 
-def _flattened(space: spaces.Space[Any], values: Any) -> Any:
+def _flattened(space: Space, values: Any) -> Any:
     """Observations (T, ...) as Gymnasium flattens each, (T, D)."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         rows = [_flattened(part, values[key]) for key, part in _entries(space)]

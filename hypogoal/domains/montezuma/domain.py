@@ -154,7 +154,7 @@ class MontezumaDomain(Domain):
     sources = MappingProxyType({"train-ensemble": "paper, appendix (Table 1)"})
     defaults = MappingProxyType(
         {
-            "train-ensemble": {**TABLE_1, **EQUATION_1},
+            "train-ensemble": TABLE_1 | EQUATION_1,
             "train-options": ALONE,
             "train-meta": LEARNING,
             "audit": {name: value for name, value in ALONE.items() if name != "steps"},

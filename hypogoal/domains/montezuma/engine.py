@@ -75,7 +75,7 @@ class MontezumaEngine(TurnEngine):
 
     def positions(self, ids: Ints) -> Ints:
         facts = self.facts_of(ids)
-        return facts[:, : len(self.position_names)].astype(np.int64)
+        return facts[:, : len(self.position_names)].astype(int)
 
     def labels(self, ids: Ints) -> Bools:
         facts = self.facts_of(ids)

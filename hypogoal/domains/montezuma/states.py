@@ -61,7 +61,7 @@ def states_of(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
     the last frame, and previous_action, that led to the one before.
     """
     stacks, every, actions, previous = zip(*shown, strict=True)
-    facts = np.stack(every).astype(np.int64)
+    facts = np.stack(every).astype(int)
     room, x, y, *_ = facts.T
     group = np.zeros_like(room)
     for number, rooms in enumerate(ROOMS[CLIMB_DOWN.name]["groups"], 1):

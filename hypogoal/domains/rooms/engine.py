@@ -69,23 +69,23 @@ class RoomsEngine(Engine):
         factors = len(config.factors)
         holds = rng.random((DECKS, config.rooms, factors)) < 0.5
         holds[..., config.factors.index(config.truth)] = right
-        before = np.zeros((DECKS, factors), np.bool_)
+        before = np.zeros((DECKS, factors), bool)
         every = np.concatenate([before, holds.reshape(-1, factors)])
         self._pictures = drawn(every, config.factors, rng).observations
-        self._right = np.zeros(self.n_states, np.bool_)
+        self._right = np.zeros(self.n_states, bool)
         self._right[DECKS:] = right.ravel()
         self.observation_shape = self._pictures.shape[1:]
         self.reset()
 
     def reset(self) -> Ints:
         self.ids = np.arange(self.count) % DECKS
-        self.elapsed = np.zeros(self.count, np.int64)
+        self.elapsed = np.zeros(self.count, int)
         return self.ids.copy()
 
     def step(self, actions: Ints) -> Step:
         following = DECKS + self.ids * self.n_actions + actions
         self.ids = (self.ids + self.count) % DECKS
-        over = np.ones(self.count, np.bool_)
+        over = np.ones(self.count, bool)
         rewards = self._right[following].astype(np.float32)
         return Step(following, rewards, over, ~over)
 

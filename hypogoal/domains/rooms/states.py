@@ -83,7 +83,7 @@ def drawn(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
     for name in FACTORS:
         if name not in truth:
             truth[name] = rng.random(count) < 0.5
-    every = np.array([truth[name] for name in FACTORS], np.int64)
+    every = np.array([truth[name] for name in FACTORS], int)
     colour, shape, right, many = every
     rows = np.arange(count)
 

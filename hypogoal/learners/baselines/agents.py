@@ -92,20 +92,21 @@ class Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         episodes = self.env.episodes
+        steps = episodes.steps
         shown = {}
-        if episodes.steps // LOG_INTERVAL > (episodes.steps - self.env.num_envs) // LOG_INTERVAL:
-            check_finite(self.model, episodes.steps)
+        if steps // LOG_INTERVAL > (steps - self.env.num_envs) // LOG_INTERVAL:
+            check_finite(self.model, steps)
             shown = {"success": episodes.recent()["success"] if episodes else 0.0}
             numbers = {name.removeprefix(UPDATED): value for name, value in _updated(self.model).items()}
             if isinstance(self.model, DQN):
                 numbers["epsilon"] = float(self.model.exploration_rate)
             self.log.write(
-                step=episodes.steps,
+                step=steps,
                 episodes=len(episodes),
                 **shown,
                 **numbers,
             )
-        self.progress.update(min(episodes.steps, self.progress.total), **shown)
+        self.progress.update(min(steps, self.progress.total), **shown)
         return True
 
 

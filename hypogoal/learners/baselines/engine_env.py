@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from hypogoal.core.arrays import Bools, Floats, Ints
+from hypogoal.core.arrays import Array, Bools, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.learners.episodes import EpisodeRecorder
@@ -33,7 +32,7 @@ class EngineEnv(VecEnv, Resumable):
         low, high = -math.inf, math.inf
         if first.dtype == PICTURE:
             low, high = 0, 255
-        space: Any = spaces.Box(
+        space = spaces.Box(
             low,
             high,
             first.shape[1:],
@@ -46,7 +45,7 @@ class EngineEnv(VecEnv, Resumable):
             actions,
         )
         self.episodes = EpisodeRecorder(engine.count)
-        self._actions = np.zeros(engine.count, np.int64)
+        self._actions = np.zeros(engine.count, int)
 
     def _observe(self, ids: Ints) -> Observations:
         if self.tiles is not None:
@@ -62,9 +61,9 @@ class EngineEnv(VecEnv, Resumable):
         """Put every environment at the start of an episode."""
         return self._observe(self.engine.reset())
 
-    def step_async(self, actions: NDArray[Any]) -> None:
+    def step_async(self, actions: Array) -> None:
         """Take note of the actions (count,) of the next step."""
-        self._actions = np.asarray(actions, np.int64)
+        self._actions = np.asarray(actions, int)
 
     def step_wait(self) -> tuple[Observations, Floats, Bools, list[dict[str, Any]]]:
         """Step every environment; where an episode ended, the observation is that of the next one's start."""

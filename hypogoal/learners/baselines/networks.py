@@ -29,18 +29,12 @@ class BlockConvolution(nn.Module):
         self.linear = nn.Linear(size * size * channels, out)
 
     def forward(self, inputs: Tensor) -> Tensor:
+        size = self.size
         count, height, width, channels = inputs.shape
-        rows, columns = height // self.size, width // self.size
-        inputs = inputs[:, : rows * self.size, : columns * self.size]
-        blocks = inputs.reshape(
-            count,
-            rows,
-            self.size,
-            columns,
-            self.size,
-            channels,
-        ).transpose(2, 3)
-        return self.linear(blocks.reshape(count, rows, columns, -1))
+        rows, columns = height // size, width // size
+        inputs = inputs[:, : rows * size, : columns * size]
+        blocks = inputs.reshape(count, rows, size, columns, size, channels)
+        return self.linear(blocks.transpose(2, 3).reshape(count, rows, columns, -1))
 
 
 class CellNetwork(BaseFeaturesExtractor):
