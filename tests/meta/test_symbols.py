@@ -191,23 +191,22 @@ def test_a_task_without_end_does_not_hold_a_draw_for_ever() -> None:
     assert total > 150 and chosen[-50:] == [2] * 50
 
 
-def test_it_finds_a_reward_that_was_long_in_coming() -> None:
-    """Eight places in a row with four options each, of which one leads on and the others end the task with nothing.
+@pytest.mark.parametrize("seed", range(3))
+def test_it_finds_a_reward_that_was_long_in_coming(seed: int) -> None:
+    """Eight places in a row with five options each, of which one leads on and the others end the task with nothing.
 
-    Random choice reaches the end in one episode of 65,536.
+    Random choice reaches the end in one episode of 390,625.
     """
     places, right = "abcdefgh", [3, 0, 2, 1, 1, 3, 0, 2]
-    bits = {place: [0, 1, 2, 3, 4 + number] for number, place in enumerate(places)}
-    moves = {}
-    for number, place in enumerate(places):
-        for option in bits[place]:
-            moves[place, option] = sure(0, OVER)
-        following = sure(0, places[number + 1]) if number < 7 else sure(1, OVER)
-        moves[place, right[number]] = following
-    world, chooser = World(bits, moves), chooser_of(12)
+    offered = {place: [0, 1, 2, 3, 4 + number] for number, place in enumerate(places)}
+    moves = {(place, option): sure(0, OVER) for place in places for option in offered[place]}
+    for place, following, option in zip(places, places[1:], right, strict=False):
+        moves[place, option] = sure(0, following)
+    moves["h", right[-1]] = sure(1, OVER)
+    world, chooser = World(offered, moves), chooser_of(12, seed)
     returns = world.episodes(chooser, 120)
     assert sum(returns[:8]) == 0, "or it was luck"
-    assert np.mean(returns[-20:]) >= 0.95
+    assert np.mean(returns[100:]) >= 0.9
     assert world.episode(frozen(chooser)) == (1.0, right)
 
 
