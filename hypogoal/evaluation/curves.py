@@ -234,5 +234,6 @@ def learning_curves(
     axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
     if in_episodes:
         axes.set(xlabel="episodes", xscale="log")
+        axes.xaxis.set_major_formatter("{x:.0f}")
     legend_below(figure, 2)
     return figure

@@ -108,6 +108,7 @@ def test_a_figure_of_lengths_that_are_all_alike_says_nothing() -> None:
         ("environment steps, in thousands", "linear"),
         ("episodes", "log"),
     ]
+    assert axes[1].xaxis.get_major_formatter()(10) == "10"
     scored = row("reward", 7, step=300, **place)
     assert figures(question, results_of(*rows, scored, final, random, **agents))[0].about["dotted"] == ""
 
