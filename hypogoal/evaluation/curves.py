@@ -28,6 +28,10 @@ FIRST = 20  # episodes that a curve begins with: of many parallel ones, the firs
 SOLVED = 0.95  # share of the window's episodes
 WITHIN = {"near": 1.5, "within_2": 2.0}  # times the shortest path
 POINTS = 151  # of a curve
+SHORT = 20  # episodes that curves over episodes are means of, and of which 95 % must be solved
+WINDOWS = ((1, 10), (11, 20), (21, 50), (51, 100))  # the first and the last of the episodes that are counted
+BY_EPISODE = "solved_by_episode"
+MOST = 10_000  # episodes, of its curve
 BY = ["method"]
 QUANTITIES = (
     "success",
@@ -40,10 +44,13 @@ QUANTITIES = (
     "ended",
     "cut",
     "steps_to_95",
+    *(f"solved_{first}_{last}" for first, last in WINDOWS),
+    "episodes_to_95",
 )
 PAIRED = ("success", "length", "near")
 FIGURES = {  # file, label, and what is dotted across
     "reward": ("figure6", "Undiscounted reward per episode", "random_success"),
+    BY_EPISODE: ("figure6-episodes", "Share of episodes solved", "random_success"),
     "solved_length": ("figure6-length", "Length of solved episodes", "shortest_path"),
 }
 
@@ -91,6 +98,29 @@ def curves(episodes: Episodes, grid: Ints) -> pd.DataFrame:
     return means.loc[count[enough] - 1].set_axis(grid[enough]).rename_axis("step")
 
 
+def by_episode(succeeded: Bools) -> pd.DataFrame:
+    """The share solved of the last ``SHORT`` of (n,) episodes, from the tenth on; its index is their number."""
+    solved = pd.Series(succeeded, np.arange(1, len(succeeded) + 1), dtype=float).rename_axis("step")
+    shares = solved.rolling(SHORT, min_periods=1).mean()
+    grid = np.geomspace(10, MOST, POINTS).round().astype(np.int64)
+    shown = np.unique(grid[grid <= len(solved)])
+    return shares[shown].to_frame(BY_EPISODE)
+
+
+def episode_numbers(succeeded: Bools) -> dict[str, float]:
+    """How soon (n,) episodes succeed, counted as they ended: the share of each of ``WINDOWS``, once all of it is there.
+
+    ``episodes_to_95``: how many until 95 % of the last ``SHORT`` had succeeded; NaN: never.
+    """
+    solved = pd.Series(succeeded, np.arange(1, len(succeeded) + 1), dtype=float)
+    numbers = {}
+    for first, last in WINDOWS:
+        means = solved.rolling(last - first + 1).mean()
+        numbers[f"solved_{first}_{last}"] = means.get(last, np.nan)
+    reached = at_least(solved.rolling(SHORT).mean(), SOLVED)
+    return {**numbers, "episodes_to_95": solved.index[reached].min()}
+
+
 def run_numbers(episodes: Episodes, shortest_path: int | None) -> dict[Any, float]:
     """Spec F5: the numbers of one run, over its last ``LAST`` training episodes at most; NaN without episodes.
 
@@ -109,6 +139,7 @@ def run_numbers(episodes: Episodes, shortest_path: int | None) -> dict[Any, floa
         "length_over_shortest": means["length"] / shortest,
         "solved_over_shortest": means["solved_length"] / shortest,
         "steps_to_95": pd.Series(episodes.step)[reached].min(),
+        **episode_numbers(episodes.succeeded),
     }
 
 
@@ -131,6 +162,7 @@ def rows(work):
         numbers = run_numbers(episodes, layout["shortest_path"])
         yield tidy({"steps": steps, "shortest_path": layout["shortest_path"], **numbers}, **place)
         yield melted(curves(episodes, grid[grid <= steps]), **place)
+        yield melted(by_episode(episodes.succeeded), **place)
         random[None if layout.get("layouts") else place["layout"]] = layout["random_success"]
     for seed, success in random.items():
         yield tidy({"random_success": success}, layout=seed)
@@ -178,14 +210,15 @@ def learning_curves(
 ) -> Figure:
     """Figure 6: a quantity of episodes against environment steps, a line per method, a ``reference`` dotted across.
 
-    ``drawn`` are rows of the table of numbers. The mean over layouts, or runs of one layout, and a band of one standard
-    error.
+    ``drawn`` are rows of the table of numbers; those of ``BY_EPISODE`` are drawn against episodes. The mean over
+    layouts, or runs of one layout, and a band of one standard error.
     """
     unit = "layout" if drawn["layout"].nunique() > 1 else "artefact"
     figure, axes = plot(2.9)
+    in_episodes = (drawn["quantity"] == BY_EPISODE).all()
     for method, rows in drawn.groupby("method", sort=False):
         values = rows.pivot_table(index="step", columns=unit, values="value", dropna=False)
-        steps = values.index.astype(float) / 1000
+        steps = values.index.astype(float) / (1 if in_episodes else 1000)
         middle, wide = values.mean(axis=1), values.sem(axis=1)
         [line] = axes.plot(steps, middle, label=method)
         colour = line.get_color()
@@ -199,5 +232,8 @@ def learning_curves(
         )
     axes.axhline(reference, **DOTTED)
     axes.set(xlabel="environment steps, in thousands", ylabel=label.lower())
+    if in_episodes:
+        axes.set(xlabel="episodes", xscale="log")
+        axes.xaxis.set_major_formatter("{x:.0f}")
     legend_below(figure, 2)
     return figure

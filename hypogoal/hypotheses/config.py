@@ -101,8 +101,8 @@ class TrainEnsembleConfig(MembersConfig):
     diversity_weight: float | Literal["auto"] = setting(
         AUTO,
         "weight of the diversity loss (alpha); auto: the largest of 1, 0.3, 0.1, ... at which every member is as right "
-        "about held-out labels as one trained without diversity, within a standard error, and members differ on no more "
-        "than half of the unlabelled states",
+        "about held-out labels as one trained without diversity, within a standard error, and members differ on at "
+        "most half of the unlabelled states",
         source=f"{BEYOND}: docs/concepts.md",
         low=0.0,
         words=[AUTO],

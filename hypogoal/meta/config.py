@@ -41,6 +41,23 @@ class MetaConfig(Config):
     )
 
 
+class SymbolsConfig(Config):
+    """A counted table of symbols: chooser=symbols."""
+
+    history: int = setting(
+        0, "how many of an episode's last options belong to its symbols, beside those offered", low=0, high=2
+    )
+    carried: str = setting(
+        "prior",
+        "what is taken over of the counts of 'agent': nothing, at most one execution of each, or all",
+        choices=("none", "prior", "all"),
+    )
+
+
+class OwnChooserConfig(MetaConfig, SymbolsConfig):
+    """The settings of all choosers, for one of your own."""
+
+
 class PlayConfig(OptionConfig, WorldConfig):
     """Where options are played."""
 
@@ -104,16 +121,18 @@ class TrainOptionsConfig(PracticeConfig):
 class TrainMetaConfig(PlayConfig):
     """How options are learned and chosen, and for how long."""
 
-    PARTS: ClassVar[Any] = OptionConfig.PARTS | {"chooser": {"ppo": MetaConfig, OWN: MetaConfig}}
+    PARTS: ClassVar[Any] = OptionConfig.PARTS | {
+        "chooser": {"ppo": MetaConfig, "symbols": SymbolsConfig, OWN: OwnChooserConfig}
+    }
 
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
     chooser: str = setting(
         "ppo",
-        "the meta-policy, or uniform choice among the options offered",
-        source="ours: a control",
-        choices=("ppo", "random"),
+        "who chooses options: ppo, a network; symbols, a counted table, in tens of episodes; random, uniform",
+        source="paper: ppo",
+        choices=("ppo", "symbols", "random"),
         own=True,
     )
 

@@ -23,6 +23,7 @@ CHOOSERS = {
     "random": f"{__name__}:RandomChooser",
     "even": f"{__name__}:EvenChooser",
     "ppo": "hypogoal.meta.ppo:MetaPolicy",
+    "symbols": "hypogoal.meta.symbols:SymbolsChooser",
 }
 
 Offered = Bools  # (n, O), the options that may be chosen
@@ -74,6 +75,10 @@ class Chooser(Part, ABC):
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Weights of an artefact; by default there are none."""
+
+    def carry(self, state: Mapping[str, Tensor]) -> None:
+        """Go on learning, elsewhere, from weights of an artefact; by default from all of them."""
+        self.load(state)
 
 
 class RandomChooser(Chooser):

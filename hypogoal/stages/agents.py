@@ -28,10 +28,7 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
     source = open_artefact(ensemble, "ensemble")
     held = {}
     if practice:
-        made_from = [entry.sha256 for entry in practice.manifest.inputs if entry.kind == "ensemble"]
-        if sha256_of(source.path) not in made_from:
-            do = f"Train them from {source.path}."
-            raise UserError("these options were trained with another ensemble", practice.path, do)
+        require_ensemble(practice, source.path)
         held = {name: practice.config[name] for name in fixed if name in practice.config}
         if practice.config["layouts"]:  # options of many layouts may be played in any
             held.pop("layout_seed", None)
@@ -49,6 +46,14 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
         call.seed,
         call.device,
     )
+
+
+def require_ensemble(trained: Artefact, ensemble: Path) -> None:
+    """Refuse (``UserError``) options of another ensemble."""
+    made_from = [entry.sha256 for entry in trained.manifest.inputs if entry.kind == "ensemble"]
+    if sha256_of(ensemble) not in made_from:
+        do = f"Train them from {ensemble}."
+        raise UserError("these options were trained with another ensemble", trained.path, do)
 
 
 def description(setup: Setup, **more: Any) -> dict[str, Any]:

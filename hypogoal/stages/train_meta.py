@@ -29,12 +29,15 @@ def train_meta(
     ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
     options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
+    agent: Annotated[Path | None, Option(help="Continue choosing as this agent learned to, elsewhere.")] = None,
 ) -> Done:
     """Learn from the reward which options to choose.
 
-    Options start fresh, or continue as those of an ``options`` artefact.
+    Options start fresh, or continue as those of an ``options`` artefact; so does choosing, as an ``agent`` chose.
     """
+    from hypogoal.core.tensors import load_tensors
     from hypogoal.meta import training
+    from hypogoal.options.choosers import FILE
     from hypogoal.options.tables import Episodes
     from hypogoal.stages import agents
 
@@ -47,7 +50,9 @@ def train_meta(
         if "ended_at" in practice.config:
             spent["options_ended_at"] = practice.config["ended_at"]
     settings = agents.description(setup, **spent)
-    inputs = [ensemble, options] if options else [ensemble]
+    inputs = [each for each in (ensemble, options, agent) if each]
+    if agent:
+        agents.require_ensemble(open_artefact(agent, "meta"), ensemble)
     with call.training("meta", settings, inputs, steps) as work:
         loop = training.assemble(setup)
         if practice:
@@ -57,6 +62,8 @@ def train_meta(
             if all(practice.config[key] == settings[key] for key in WORLD):
                 practised = Episodes.read(practice.path / Episodes.FILE)
                 loop.recorder.episodes.extend(practised.rows())
+        if agent:
+            loop.chooser.carry(load_tensors(agent / FILE))
         agents.learn(work, setup, loop, steps)
     episodes = loop.recorder.episodes
     numbers = episodes.counts() | episodes.recent()

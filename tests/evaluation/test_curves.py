@@ -6,7 +6,7 @@ import numpy as np
 from made_up import LEARNED, figures, results_of, row, shown
 
 from hypogoal.evaluation import curves as question
-from hypogoal.evaluation.curves import curves, run_numbers
+from hypogoal.evaluation.curves import by_episode, curves, run_numbers
 from hypogoal.evaluation.questions import context_of
 from hypogoal.options.tables import Episodes
 
@@ -89,7 +89,7 @@ def test_agents_over_runs() -> None:
 
 
 def test_a_figure_of_lengths_that_are_all_alike_says_nothing() -> None:
-    """Spec F7: Figure 6 is drawn, with random play dotted; the figure of lengths only where they differ."""
+    """Spec F7: Figure 6 is drawn, with random play dotted; of lengths only where they differ; over episodes too."""
     place = {"method": "option agent", "layout": 1, "seed": 0, "artefact": "a"}
     rows = [row("reward", step / 200, step=step, **place) for step in (100, 200)]
     rows += [row("solved_length", 9, step=step, **place) for step in (100, 200)]
@@ -100,5 +100,35 @@ def test_a_figure_of_lengths_that_are_all_alike_says_nothing() -> None:
     drawn = figures(question, results_of(*rows, more, final, random, **agents))
     assert [each.name for each in drawn] == ["figure6", "figure6-length"]
     assert drawn[0].about["dotted"] == "random_success"
+    counted = [row("solved_by_episode", number / 40, step=number, **place) for number in (10, 40)]
+    drawn = figures(question, results_of(*rows, *counted, final, random, **agents))
+    assert [each.name for each in drawn] == ["figure6", "figure6-episodes"]
+    axes = [each.figure.axes[0] for each in drawn]
+    assert [(place.get_xlabel(), place.get_xscale()) for place in axes] == [
+        ("environment steps, in thousands", "linear"),
+        ("episodes", "log"),
+    ]
+    assert axes[1].xaxis.get_major_formatter()(10) == "10"
     scored = row("reward", 7, step=300, **place)
     assert figures(question, results_of(*rows, scored, final, random, **agents))[0].about["dotted"] == ""
+
+
+def test_how_soon_in_episodes():
+    """The shares of episodes 1-10, 11-20, 21-50 and 51-100 by hand; of episodes 36 to 55 all but one are solved."""
+    run = episodes([0] * 10 + [1, 0] * 5 + [0] * 15 + [1] * 15 + [0] + [1] * 49)
+    numbers = run_numbers(run, None)
+    shares = [numbers[f"solved_{window}"] for window in ("1_10", "11_20", "21_50", "51_100")]
+    np.testing.assert_allclose(shares, [0, 0.5, 0.5, 0.98])
+    assert numbers["episodes_to_95"] == 55
+    short = run_numbers(episodes([1] * 19), None)
+    assert short["solved_1_10"] == 1 and np.isnan([short["solved_11_20"], short["episodes_to_95"]]).all()
+    assert run_numbers(episodes([1] * 20), None)["episodes_to_95"] == 20
+    assert np.isnan(run_numbers(episodes([]), None)["episodes_to_95"])
+
+
+def test_curves_over_episodes():
+    """Of the last twenty, from the tenth on; the index is the number of episodes, denser where these are few."""
+    found = by_episode(np.array([False] * 10 + [True] * 30))["solved_by_episode"]
+    assert found.index[0] == 10 and found.index[-1] <= 40 and found.index.is_unique
+    np.testing.assert_allclose([found[10], found[20], found[30]], [0, 0.5, 1])
+    assert by_episode(np.ones(9, np.bool_)).empty

@@ -13,6 +13,7 @@ from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.meta.symbols import SymbolsChooser
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import load_learner
@@ -50,6 +51,7 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "DoorKey, many layouts, random": (partial(many, DOMAIN.make_engine), "light", {}, "random"),
     "Gymnasium, many layouts, random": (partial(many, corridor_env.SWIFT.make_engine), "light", {}, "random"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
+    "light, shared, symbols": (Corridor, "light", {}, "symbols"),
     "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100, "recurrence": 3}, "random"),
     "paper without memory, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
 }
@@ -65,6 +67,8 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     chooser: Chooser = RandomChooser(rng_for(0, "choice"))
     if chooser_name == "even":
         chooser = EvenChooser(rng_for(0, "choice"), 2)
+    elif chooser_name == "symbols":
+        chooser = SymbolsChooser(engine.count, 2, rng_for(0, "choice"), 2, keep=0.99)
     elif chooser_name != "random":
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=8, meta_batch=4)

@@ -34,6 +34,9 @@ HELDOUT_STATES = 40  # of each sub-goal
 EXECUTIONS = {LAYOUT: 160, 102: 40}  # of options that learned on the first layout
 EPISODE = 40  # steps at most, so that episodes end
 CURVE_POINTS = 20  # that are kept of each curve
+NEWER = (  # quantities that release 0.23.0 did not have
+    *("solved_1_10", "solved_11_20", "solved_21_50", "solved_51_100", "episodes_to_95", "solved_by_episode"),
+)
 CLOSE = 1e-4
 # Where pictures are trained on, forty steps part further on a processor that adds up otherwise: by 0.012 at most
 # between an AMD EPYC and an Intel Xeon. Another objective parts by 0.17 at least.
@@ -282,7 +285,7 @@ def evaluated(run: Path) -> Table:
 def numbers_of(path: Path) -> Table:
     rows: Table = []
     curves: dict[str, list[tuple[int, str]]] = {}
-    for row in rows_of(path):
+    for row in recorded_of(path):
         value, step = row.pop("value"), row.pop("step")
         place = " ".join(f"{column}={text}" for column, text in row.items() if text)
         if step:
@@ -295,10 +298,15 @@ def numbers_of(path: Path) -> Table:
     return rows
 
 
+def recorded_of(path: Path) -> list[dict[str, str]]:
+    """The rows of a file but those of ``NEWER``."""
+    return [row for row in rows_of(path) if row.get("quantity") not in NEWER]
+
+
 def table_of(path: Path) -> Table:
     """The numbers of a question's table, each by its row's texts and its column."""
     rows: Table = []
-    for line, row in enumerate(rows_of(path)):
+    for line, row in enumerate(recorded_of(path)):
         for column, text in row.items():
             with contextlib.suppress(ValueError):
                 rows.append((f"tables/{path.name}", f"{line} {column}", number(float(text))))
