@@ -32,7 +32,7 @@ def test_a_program_does_what_commands_do(corridor_run: Path, tmp_path: Path) -> 
     one, other = open_artefact(made.path), open_artefact(corridor_run / "meta")
     assert one.config == other.config and one.manifest.files == other.manifest.files
     assert dir(hypogoal) == sorted(hypogoal.__all__)
-    assert [*inspect.signature(hypogoal.train_meta).parameters][:4] == ["ensemble", "out", "options", "preset"]
+    assert [*inspect.signature(hypogoal.train_meta).parameters][:5] == ["ensemble", "out", "options", "agent", "preset"]
 
 
 def test_what_is_made_is_a_path_with_something_to_show(
