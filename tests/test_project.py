@@ -106,6 +106,11 @@ def test_set_up_names_no_host_and_no_machine_path(name: str) -> None:
     assert not re.findall(r"\w+://\S+|(?<![\w.])/(?:opt|home|root|work|tmp|mnt)/\S*", text_of(name))
 
 
+def test_each_deviation_has_a_number_of_its_own() -> None:
+    numbers = re.findall(r"^\| \*\*(DEV-\d+)\*\*", text_of("docs/deviations.md"), re.M)
+    assert len(numbers) == len({*numbers}) > 30
+
+
 def test_entry_points_load() -> None:
     """Spec B6: the console script and every domain that pyproject.toml announces exist under that name."""
     assert callable(metadata.EntryPoint("hypogoal", PROJECT["scripts"]["hypogoal"], "console_scripts").load())

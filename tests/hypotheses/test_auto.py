@@ -18,7 +18,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.hypotheses import auto
 from hypogoal.hypotheses.auto import WEIGHTS, AutoTraining, held_out, information_of, lowest_kept
 from hypogoal.hypotheses.config import TrainEnsembleConfig
-from hypogoal.hypotheses.scores import idle_members
+from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.views import StateOrigins
 
 AUTO = TrainEnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, restarts=2)
@@ -131,6 +131,18 @@ def test_a_weight_that_makes_members_constant_is_passed_over(monkeypatch: pytest
     monkeypatch.setattr(AutoTraining, "_outcome", outcome)
     first, second = trained().tried
     assert (first.constant, first.kept, second.constant, second.kept) == (True, False, False, True)
+
+
+def test_a_weight_at_which_members_contradict_each_other_is_passed_over() -> None:
+    """Members recognise the labelled place: they keep its labels at any weight and say the contrary elsewhere."""
+    observations, labels, unlabelled = toy()
+    training = AutoTraining(observations, labels, 255 - unlabelled, AUTO, 1)
+    for _ in training.steps():
+        pass
+    first, *_, chosen = training.tried
+    assert first.accuracy >= training.lowest and first.disagreement == 1
+    assert (first.contrary, first.kept, chosen.contrary, chosen.kept) == (True, False, False, True)
+    assert mean_disagreement(training.ensemble.predictions(255 - unlabelled)) <= 0.5
 
 
 def test_the_share_is_what_a_member_without_diversity_predicts() -> None:
