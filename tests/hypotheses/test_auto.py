@@ -214,7 +214,7 @@ def test_a_folder_of_pictures_gets_members_for_both_features(tmp_path: Path) -> 
     checked = run("check", data).out
     assert "ok   hypotheses: door: with diversity_weight=" in checked and "train-ensemble takes some" in checked
     printed, told = run("train-ensemble", data, "--out", ensemble, "--set", "members=2")
-    assert "train-ensemble door: at most 2100 steps, 450 of them when the weight is chosen\n" in told
+    assert "train-ensemble door: at most 7050 steps, 450 of them when the weight is chosen\n" in told
     chosen = Artefact(ensemble).config["chosen"]["door"]
     assert f"door: diversity_weight={chosen['diversity_weight']:g}, by " in printed and "  chosen\n" in printed
     assert json.loads((ensemble / "manifest.json").read_text())["config"]["diversity_weight"] == "auto"
