@@ -91,7 +91,9 @@ def compare_runs(questions: Shared) -> DataFrame:
                 solved = alike.loc[alike["of"] == "success", "value"]
                 if len(solved) and not solved.any():
                     alike = alike[alike["of"] != "length"]  # that of the limit, where nobody solved an episode
-                parts.append(pairs(alike.assign(method=alike["run"])).assign(of=method))
+                both = pairs(alike.assign(method=alike["run"]))
+                if not both.empty:  # some runs share a layout and a seed
+                    parts.append(both.assign(of=method))
     return pd.concat(parts) if parts else DataFrame(columns=["N", "quantity", "first", "second", "of"])
 
 

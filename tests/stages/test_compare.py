@@ -95,6 +95,16 @@ def test_lengths_are_compared_where_somebody_solved_something(tmp_path):
     assert {"success", "length"} <= {*one["quantity"]}
 
 
+def test_runs_of_one_agent_without_a_common_seed_have_no_pairs(tmp_path):
+    """Spec F5: the page has both in its table; nobody wins."""
+    for name, seed in (("one", 0), ("other", 1)):
+        write_baseline(tmp_path / name, "ppo", 100, seed, 40)
+        evaluate(tmp_path / name, quiet=True)
+    made = compare([tmp_path / "one", tmp_path / "other"], tmp_path / "out")
+    assert read_pairs(made.path).empty
+    assert "no two runs share a seed" in run("show", made.path).out
+
+
 def test_methods_side_by_side(runs, tmp_path):
     """Spec F5: runs without a common agent have one table; there are no pairs."""
     write_baseline(tmp_path / "other", "dqn", 100, 0, 30, steps=6_000)
