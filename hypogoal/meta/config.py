@@ -130,7 +130,7 @@ class TrainMetaConfig(PlayConfig):
     )
     chooser: str = setting(
         "ppo",
-        "who chooses options: ppo, a network; symbols, a counted table, in tens of episodes; random, uniform",
+        "who chooses options: ppo, a network; symbols, a counted table; random, uniform",
         source="paper: ppo",
         choices=("ppo", "symbols", "random"),
         own=True,
