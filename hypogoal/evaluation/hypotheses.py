@@ -152,7 +152,13 @@ def chosen_in(results) -> dict[str, Any]:
             place = f"{artefact['path']}, {sub_goal}"
             idle += [f"{place}: {text}" for text in chosen["idle"]]
             for tried in chosen["tried"]:
-                remark = "chosen" if tried["kept"] else "a member is constant" if tried["constant"] else ""
+                remark = ""
+                if tried["kept"]:
+                    remark = "chosen"
+                elif tried["constant"]:
+                    remark = "a member is constant"
+                elif tried.get("contrary"):  # not in manifests made before the limit
+                    remark = "on more than half"
                 disagreement = tried["disagreement"]
                 shown = "–" if disagreement is None else f"{disagreement:.2f}"
                 numbers = f"{tried['weight']:g}", f"{tried['accuracy']:.3f}", f"{chosen['lowest']:.3f}", shown
