@@ -5,14 +5,15 @@ python -m studies.symbols runs/symbols runs/symbols-constants.csv --constants
 python -m studies.symbols --tables runs/symbols.csv
 
 Options are planned, the world is that of ``--preset choosing``. Reported: the ten layouts of the experiment 'choosing',
-each with the D-BAT ensemble (K = 6) of its seed. Constants of the module are chosen on layouts 100 to 119, with one
-ensemble of another seed: the pair with the fewest episodes in the mean, those that never arrive at ``LIMIT``.
+each with the D-BAT ensemble (K = 6) of its seed. Constants, those of ``hypogoal/meta/symbols.py`` and those of Thompson
+sampling, are chosen on layouts 100 to 119, with one ensemble of another seed: the pair with the fewest episodes in the
+mean, where an agent that never arrives counts as ``LIMIT``.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hypogoal
-from hypogoal.core.arrays import Bools, Ints
+from hypogoal.core.arrays import Bools, Doubles, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.curves import episode_numbers
@@ -34,15 +35,16 @@ from studies.cells import Cell, Jobs, Row, parser_of, printed, read_rows, run_ce
 
 PAIRS = dict(zip(SOLVABLE, range(920, 930), strict=True))  # seed of each layout, as in 'choosing'
 TUNED, TUNING_SEED = range(100, 120), 900
-PRIORS, HOPES = (0.01, 0.03, 0.1, 0.3), (0.2, 0.5)
+PRIORS, HOPES = (0.1, 0.3, 1.0), (0.1, 0.2, 0.5)  # the same pairs for both that draw
+JEFFREYS = 1.0, 0.5  # Thompson sampling's, where nothing is chosen
 LIMIT = 5_000  # episodes, for a run that does not arrive
-STEPS = {"symbols": 12_000}  # the others have
-MOST_STEPS = 50_000
+STEPS, STEPS_OF_PPO = 8_000, 80_000
 CHOOSERS = {  # title, the setting, environments
     "symbols": ("symbols", "symbols", 1),
+    "thompson": ("Thompson sampling over options, no symbols", "studies.symbols:Thompson", 1),
+    "rmax": ("R-max over symbols", "studies.symbols:RMax", 1),
     "ppo-16": ("PPO, 16 environments", "ppo", 16),
     "ppo-1": ("PPO, 1 environment", "ppo", 1),
-    "thompson": ("Thompson sampling over options, no symbols", "studies.symbols:Thompson", 1),
     "random": ("uniform random", "random", 1),
 }
 KEYS = ("chooser", "prior", "hope", "layout", "seed")
@@ -57,11 +59,13 @@ class Thompson(Chooser):
     """
 
     CHANGING = ("rng", "counts", "drawn", "used")
+    PRIOR, HOPE = JEFFREYS
 
     def __init__(self, environments: int, options: int, rng: np.random.Generator):
         self.rng = rng
-        self.counts = np.full((2, options), 0.5)  # failures, successes: Jeffreys' prior
-        self.drawn = rng.beta(0.5, 0.5, size=(environments, options))
+        failed, succeeded = self.PRIOR * (1 - self.HOPE), self.PRIOR * self.HOPE
+        self.counts = np.array([[failed] * options, [succeeded] * options])
+        self.drawn = rng.beta(succeeded, failed, size=(environments, options))
         self.used = np.zeros((environments, options), np.bool_)
 
     @classmethod
@@ -86,6 +90,29 @@ class Thompson(Chooser):
         self.used[:] = False
 
 
+class Optimistic(symbols.Model):
+    """What was never tried in some symbols is worth ``best``; what was tried is what it was so far. Ties at random."""
+
+    def qualities(self, draw: Callable[[Doubles], Doubles]) -> Doubles:
+        known = super().qualities(lambda counts: np.where(counts == symbols.PRIOR, 1e-9, counts))
+        return known + 1e-6 * draw(np.ones(known.shape))
+
+    def elsewhere(self, weights: Doubles, draw: Callable[[Doubles], Doubles]) -> tuple[Doubles, Doubles]:
+        size = len(self.symbols) * self.options
+        return np.ones(size), np.zeros(size)
+
+
+class RMax(symbols.SymbolsChooser):
+    """R-max (Brafman and Tennenholtz 2002) over symbols, where one execution is enough to know an outcome."""
+
+    def __init__(self, environments: int, options: int, *arguments: Any):
+        super().__init__(environments, options, *arguments)
+        self.model = Optimistic(options, self.past.shape[1], self.model.keep)
+
+
+HAVE_CONSTANTS: dict[str, Any] = {"symbols": symbols, "thompson": Thompson}
+
+
 def ensemble_at(folder: Path, seed: int) -> Path:
     """The D-BAT ensemble of a seed; trained where it is not there yet."""
     data, ensemble = folder / "data.h5", folder / f"ensemble/seed-{seed}"
@@ -96,22 +123,20 @@ def ensemble_at(folder: Path, seed: int) -> Path:
     return ensemble
 
 
-def played(ensemble: Path, chooser: str, prior: float, hope: float, layout: int, seed: int) -> list[Row]:
-    """One agent: its row, with how soon it succeeds."""
+def played(ensemble: Path, chooser: str, prior: str, hope: str, layout: int, seed: int) -> list[Row]:
+    """One agent: its row, with how soon it succeeds. ``prior`` and ``hope``: constants of the chooser, if it has any."""
     _, setting, environments = CHOOSERS[chooser]
-    steps = STEPS.get(chooser, MOST_STEPS)
+    [steps] = steps_of((chooser,))
     world = {"network": "planned", "layout_seed": layout, "steps": steps, "environments": environments}
-    before = symbols.PRIOR, symbols.HOPE
-    symbols.PRIOR, symbols.HOPE = prior, hope
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "agent"
-            hypogoal.train_meta(ensemble, out, preset="choosing", chooser=setting, seed=seed, quiet=True, **world)
-            episodes = Episodes.read(out / Episodes.FILE)
-    finally:
-        symbols.PRIOR, symbols.HOPE = before
+    if chooser in HAVE_CONSTANTS:
+        holder = HAVE_CONSTANTS[chooser]
+        holder.PRIOR, holder.HOPE = float(prior), float(hope)
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "agent"
+        hypogoal.train_meta(ensemble, out, preset="choosing", chooser=setting, seed=seed, quiet=True, **world)
+        episodes = Episodes.read(out / Episodes.FILE)
     numbers = episode_numbers(episodes.succeeded)
-    row: Row = dict(zip(KEYS, (chooser, str(prior), str(hope), layout, seed), strict=True))
+    row: Row = dict(zip(KEYS, (chooser, prior, hope, layout, seed), strict=True))
     row |= {"step": steps, "episodes": len(episodes)} | {name: numbers[name] for name in QUANTITIES}
     arrived = numbers["episodes_to_95"]
     row["steps_to_95_of_20"] = "" if np.isnan(arrived) else int(episodes.step[int(arrived) - 1])
@@ -119,22 +144,25 @@ def played(ensemble: Path, chooser: str, prior: float, hope: float, layout: int,
 
 
 def jobs_of(folder: Path, layouts: Iterable[int], *, constants: bool) -> Jobs:
-    """A cell an agent: every chooser on the reported layouts, or symbols with every pair of constants."""
-    own = (symbols.PRIOR, symbols.HOPE)
-    kinds = product(CHOOSERS, [own])
-    if constants:
-        kinds = product(["symbols"], [*product(PRIORS, HOPES)])
+    """A cell an agent: every chooser on the reported layouts, or those with constants, with every pair of them."""
+    kinds: list[tuple[str, str, str]] = []
+    for chooser in CHOOSERS:
+        holder = HAVE_CONSTANTS.get(chooser)
+        if constants and holder:
+            kinds += [(chooser, str(prior), str(hope)) for prior, hope in product(PRIORS, HOPES)]
+        elif not constants:
+            kinds.append((chooser, str(holder.PRIOR), str(holder.HOPE)) if holder else (chooser, "", ""))
     jobs: Jobs = {}
-    for layout, (chooser, (prior, hope)) in product(layouts, [*kinds]):
+    for layout, (chooser, prior, hope) in product(layouts, kinds):
         seed = TUNING_SEED if constants else PAIRS[layout]
-        cell = (chooser, str(prior), str(hope), str(layout), str(seed))
+        cell = (chooser, prior, hope, str(layout), str(seed))
         jobs[cell] = partial(played, ensemble_at(folder, seed), chooser, prior, hope, layout, seed)
     return jobs
 
 
 def steps_of(cell: Cell) -> list[int]:
     """The steps that a cell is wanted at."""
-    return [STEPS.get(cell[0], MOST_STEPS)]
+    return [STEPS_OF_PPO if cell[0].startswith("ppo") else STEPS]
 
 
 def episodes_of(rows: Iterable[dict[str, str]]) -> dict[str, float]:
@@ -161,7 +189,7 @@ def tables(path: Path) -> Iterator[str]:
         numbers = episodes_of(own)
         values = np.array([*numbers.values()])
         title, *_ = CHOOSERS[chooser]
-        title = f"{title}, PRIOR {prior}, HOPE {hope}" if several else title
+        title = f"{title}, PRIOR {prior}, HOPE {hope}" if several and prior else title
         ratios = np.array([numbers[layout] / first[layout] for layout in numbers if layout in first])
         each = [f"{numbers[layout]:.0f}" if layout in numbers else "-" for layout in layouts]
         shown.append([title, *_summary(values), f"{np.median(ratios):.1f}", *each])

@@ -4,14 +4,20 @@ The symbols s of a state are which options are offered there and, with ``history
 An execution of option o leads from s to an outcome j = (s', R > 0); s' are the next symbols, or the end of the task.
 n_j executions of o in s ended in j, with means r_j of R and g_j of gamma^tau. Then, with m outcomes known,
 
-    p ~ Dirichlet(n_1, ..., n_m, PRIOR HOPE, PRIOR (1 - HOPE)),
-    Q(s, o) = sum_j p_j (r_j + g_j V(s'_j)) + p_{m+1} best,  V(s) = max of Q(s, o) over options offered,  V(end) = 0.
+    p ~ Dirichlet(n_1, ..., n_m, PRIOR),
+    Q(s, o) = sum_j p_j (r_j + g_j V(s'_j)) + p_{m+1} U(s, o),  V(s) = max of Q(s, o) over options offered,  V(end) = 0.
 
-The last two outcomes are unknown ones: worth ``best``, the highest r of all but at least 1, or 0.
+Outcome m + 1 is unknown. What it is worth is learned from what o did in other symbols, since an option that opens the
+wrong door here will do so there: it was rewarded there in n+ executions, ended the task with nothing in n- and went on
+in n0, so
 
-Posterior sampling: for each episode of each environment one p is drawn, and followed greedily. Where every execution
-ends the task with 1 or 0 there is one s, and Q(o) ~ Beta(n_1 + PRIOR HOPE, n_0 + PRIOR (1 - HOPE)): Thompson sampling.
-Another p is drawn within an episode where s is new, or where executions since have doubled the n of (s, o).
+    q ~ Dirichlet(n+ + PRIOR HOPE, n- + PRIOR (1 - HOPE), n0),  U(s, o) = g_o (q+ best + q0 V(s)).
+
+``best`` is the highest r of all, but at least 1; g_o is the mean of gamma^tau over the executions of o, or 1.
+
+Posterior sampling: for each episode of each environment one p and q are drawn, and followed greedily. If every
+execution ends the task with 1 or 0, there is one s, and Q(o) ~ Beta(n_1 + PRIOR HOPE, n_0 + PRIOR (1 - HOPE)), so this
+is Thompson sampling. They are drawn again in an episode where s is new, or executions have doubled the n of (s, o).
 Value iteration begins at V = 0 and takes at most ``SWEEPS`` sweeps: the value of so many decisions, in bounded time.
 An episode that is cut does not tell what follows: its last execution counts as one that led back to s, so V(s) stays.
 Options that learn drift: with each execution of an option its counts fade, by half in ``HALF_LIFE`` of them.
@@ -36,8 +42,8 @@ from hypogoal.domains.base import Engine
 from hypogoal.meta.config import GAMMA
 from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
 
-PRIOR = 0.03  # executions that unknown outcomes weigh
-HOPE = 0.5  # the good ones' share of these
+PRIOR = 0.3  # executions that an unknown outcome weighs
+HOPE = 0.2  # the share of these that is rewarded
 HALF_LIFE = 50  # executions of an option
 TINY = 1e-300  # no weight, but no division by 0: draws of small weights, and counts that faded, can be 0
 SWEEPS = 100
@@ -85,22 +91,42 @@ class Model(Resumable):
         offered = self.symbols[:, : self.options] > 0
         pair, following = self.pairs(), self.outcomes[:, 2]
         counts, returned, discounts = self.sums.T
-        weights = draw(counts)
-        good = draw(np.full(offered.size, PRIOR * HOPE))
-        bad = draw(np.full(offered.size, PRIOR * (1 - HOPE)))
-        total = TINY + good + bad + np.bincount(pair, weights, offered.size)
-        share = weights / total[pair]
         means = returned / (TINY + counts)
-        rewards = np.bincount(pair, share * means, offered.size) + good / total * means.max(initial=1.0)
+        weights = draw(counts)
+        rewarded, on = self.elsewhere(weights, draw)
+        unknown = draw(np.full(offered.size, PRIOR))
+        total = TINY + unknown + np.bincount(pair, weights, offered.size)
+        share, unknown = weights / total[pair], unknown / total
+        rewards = np.bincount(pair, share * means, offered.size) + unknown * rewarded * means.max(initial=1.0)
         going_on = share * discounts / (TINY + counts) * (following != END)
         values = np.zeros(len(offered))
         for _ in range(SWEEPS):
             later = np.bincount(pair, going_on * values[following], offered.size)
-            qualities = np.where(offered, (rewards + later).reshape(offered.shape), -np.inf)
+            staying = unknown * on * np.repeat(values, self.options)
+            qualities = np.where(offered, (rewards + later + staying).reshape(offered.shape), -np.inf)
             before, values = values, qualities.max(axis=1)
             if np.abs(values - before).max(initial=0.0) < CLOSE:
                 break
         return qualities
+
+    def elsewhere(self, weights: Doubles, draw: Callable[[Doubles], Doubles]) -> tuple[Doubles, Doubles]:
+        """g_o q+ and g_o q0 of each symbols and option, float64 (S * O,), from the drawn weights (M,) of outcomes."""
+        _, option, following, _ = self.outcomes.T
+        rewarded = self.outcomes[:, 3] > 0
+        executions, _, discounts = (np.bincount(option, column, self.options) for column in self.sums.T)
+        discount = np.where(executions > 0, discounts / (TINY + executions), 1.0)
+        ended = following == END
+        good = self._from_others(weights * rewarded) + draw(np.full(self.options, PRIOR * HOPE))
+        bad = self._from_others(weights * (ended & ~rewarded)) + draw(np.full(self.options, PRIOR * (1 - HOPE)))
+        on = self._from_others(weights * (~ended & ~rewarded))
+        scale = discount / (TINY + good + on + bad)
+        return (scale * good).ravel(), (scale * on).ravel()
+
+    def _from_others(self, weights: Doubles) -> Doubles:
+        """By symbols and option (S, O) the sum over the same option's outcomes in all other symbols."""
+        shape = len(self.symbols), self.options
+        own = np.bincount(self.pairs(), weights, shape[0] * shape[1]).reshape(shape)
+        return np.maximum(own.sum(axis=0) - own, 0.0)  # a difference can be a hair below 0
 
 
 class SymbolsChooser(Chooser):

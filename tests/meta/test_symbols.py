@@ -117,10 +117,28 @@ def test_values_are_those_of_the_equations() -> None:
         model.count(np.array([0, 0, 1, 1]), 0.5, 0.9)
     for reward in (1.0, 1.0, 1.0, 0.0):
         model.count(np.array([1, 0, END, reward > 0]), reward, 0.9)
-    hope = symbols.PRIOR * symbols.HOPE
-    second = (3 + hope) / (4 + symbols.PRIOR)
-    first = (2 * (0.5 + 0.9 * second) + hope) / (2 + symbols.PRIOR)
+    weight = symbols.PRIOR
+    good = weight * symbols.HOPE
+    unknown_in_first = 0.9 * (3 + good) / (4 + weight)  # from the second's four executions, three of them rewarded
+    unknown_in_second = 0.9 * (2 + good) / (2 + weight)
+    second = (3 + weight * unknown_in_second) / (4 + weight)
+    first = (2 * (0.5 + 0.9 * second) + weight * unknown_in_first) / (2 + weight)
     np.testing.assert_allclose(model.qualities(np.asarray)[:, 0], [first, second], atol=1e-4)
+
+
+def test_what_an_option_did_elsewhere_tells_what_it_is_worth_here() -> None:
+    """Options 0 to 3 ended with a reward, ended without, went on, or never ran, in the other symbols: U by hand."""
+    model = Model(4, 1, 1.0)
+    model.symbols = np.array([[1, 1, 1, 1, END], [1, 1, 1, 1, 0]])
+    for option, following, reward in ((0, END, 1.0), (1, END, 0.0), (2, 0, 0.0)):
+        for _ in range(5):
+            model.count(np.array([0, option, following, reward > 0]), reward, 0.9)
+    good, bad = symbols.PRIOR * symbols.HOPE, symbols.PRIOR * (1 - symbols.HOPE)
+    all_of_it = 5 + symbols.PRIOR
+    value = model.qualities(np.asarray)[1]
+    expected = [0.9 * (5 + good) / all_of_it, 0.9 * good / all_of_it, 0.0, good / (good + bad)]
+    expected[2] = 0.9 * (good + 5 * expected[0]) / all_of_it  # it goes on from here, where option 0 is best
+    np.testing.assert_allclose(value, expected, atol=1e-4)
 
 
 def test_symbols_that_do_not_offer_an_option_never_choose_it() -> None:
@@ -142,7 +160,7 @@ def test_a_cut_is_not_the_end_of_the_task() -> None:
         ("a", 1): [(0.5, 1.0, OVER), (0.5, 0.0, OVER)],
     }
     world, chooser = World({"a": [0, 1]}, moves), chooser_of(2)
-    for _ in range(20):  # of each option
+    for _ in range(100):  # of each option
         for option in (0, 1):
             _, reward, place = moves["a", option][0 if world.rng.random() < moves["a", option][0][0] else 1]
             following = END if place == OVER else 0
@@ -195,7 +213,7 @@ def test_a_task_without_end_does_not_hold_a_draw_for_ever() -> None:
 def test_it_finds_a_reward_that_was_long_in_coming(seed: int) -> None:
     """Eight places in a row with five options each, of which one leads on and the others end the task with nothing.
 
-    Random choice reaches the end in one episode of 390,625.
+    Random choice reaches the end in one episode of 390,625. What an option did elsewhere misleads, and is outvoted.
     """
     places, right = "abcdefgh", [3, 0, 2, 1, 1, 3, 0, 2]
     offered = {place: [0, 1, 2, 3, 4 + number] for number, place in enumerate(places)}
@@ -204,9 +222,9 @@ def test_it_finds_a_reward_that_was_long_in_coming(seed: int) -> None:
         moves[place, option] = sure(0, following)
     moves["h", right[-1]] = sure(1, OVER)
     world, chooser = World(offered, moves), chooser_of(12, seed)
-    returns = world.episodes(chooser, 120)
+    returns = world.episodes(chooser, 240)
     assert sum(returns[:8]) == 0, "or it was luck"
-    assert np.mean(returns[100:]) >= 0.9
+    assert np.mean(returns[220:]) >= 0.9
     assert world.episode(frozen(chooser)) == (1.0, right)
 
 
@@ -246,7 +264,7 @@ def test_thousands_of_symbols_take_bounded_work(monkeypatch: pytest.MonkeyPatch)
     bincount = np.bincount
     monkeypatch.setattr(np, "bincount", lambda *args: passes.append(len(args[0])) or bincount(*args))
     qualities = model.qualities(np.asarray)
-    assert len(passes) <= symbols.SWEEPS + 2 and max(passes) == 2 * count
+    assert len(passes) <= symbols.SWEEPS + 10 and max(passes) == 2 * count
     near = qualities[-symbols.SWEEPS :, bits:]
     assert (near[:, 0] > near[:, 1]).all(), "it does not go on where the reward is near"
 
