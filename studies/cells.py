@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import csv
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -98,7 +101,16 @@ def run_cells(
                 csv.DictWriter(file, columns, lineterminator="\n").writerows({**row, **_short(row)} for row in new)
             progress.advance()
 
-        in_processes([jobs[cell] for cell in cells], workers, keep)
+        in_processes([_importable(jobs[cell]) for cell in cells], workers, keep)
+
+
+def _importable(job: Callable[[], list[Row]]) -> Callable[[], list[Row]]:
+    """The same job, of the module that a study is, not of ``__main__``, which other processes do not have."""
+    study = sys.modules["__main__"].__spec__
+    if not isinstance(job, partial) or job.func.__module__ != "__main__" or study is None:
+        return job
+    function = getattr(import_module(study.name), job.func.__name__)
+    return partial(function, *job.args, **job.keywords)
 
 
 def _short(row: Row) -> dict[str, str]:

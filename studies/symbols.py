@@ -124,7 +124,7 @@ def ensemble_at(folder: Path, seed: int) -> Path:
 
 
 def played(ensemble: Path, chooser: str, prior: str, hope: str, layout: int, seed: int) -> list[Row]:
-    """One agent: its row, with how soon it succeeds. ``prior`` and ``hope``: constants of the chooser, if it has any."""
+    """One agent: its row, with how soon it succeeds. ``prior`` and ``hope``: constants of a chooser that has them."""
     _, setting, environments = CHOOSERS[chooser]
     [steps] = steps_of((chooser,))
     world = {"network": "planned", "layout_seed": layout, "steps": steps, "environments": environments}
