@@ -1,19 +1,22 @@
-"""How many episodes a chooser needs where a wrong key ends the episode: symbols, PPO, Thompson sampling, random.
+"""How many episodes a chooser needs: symbols, Thompson sampling over options alone, R-max, PPO, random choice.
 
-python -m studies.symbols runs/symbols runs/symbols.csv
-python -m studies.symbols runs/symbols runs/symbols-constants.csv --constants
-python -m studies.symbols --tables runs/symbols.csv
+python -m studies.symbols runs/symbols docs/results/symbols-constants.csv --constants
+python -m studies.symbols runs/symbols docs/results/symbols.csv
+python -m studies.symbols --tables docs/results/symbols.csv
 
-Options are planned, the world is that of ``--preset choosing``. Reported: the ten layouts of the experiment 'choosing',
-each with the D-BAT ensemble (K = 6) of its seed. Constants, those of ``hypogoal/meta/symbols.py`` and those of Thompson
-sampling, are chosen on layouts 100 to 119, with one ensemble of another seed: the pair with the fewest episodes in the
-mean, where an agent that never arrives counts as ``LIMIT``.
+Reported: on the ten layouts of the experiment 'choosing', where a wrong key ends the episode and so do 1.5 shortest
+paths, with planned options and with practised ones; on Figure 6's ten layouts, after practice and from nothing; in
+rooms. Each layout has the D-BAT ensemble of its seed. Constants, those of ``hypogoal/meta/symbols.py`` and those of
+Thompson sampling, are chosen with planned options on layouts 100 to 119 and one ensemble of another seed: the pair with
+the fewest episodes in the mean, where an agent that never arrives counts as ``LIMIT``. Then ``HALF_LIFE`` is chosen from
+nothing, in Figure 6's world: the one with the fewest steps to 95 % in the mean.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -24,32 +27,88 @@ from numpy.typing import NDArray
 
 import hypogoal
 from hypogoal.core.arrays import Bools, Doubles, Ints
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
-from hypogoal.evaluation.curves import episode_numbers
+from hypogoal.evaluation.curves import budget_of, run_numbers
 from hypogoal.experiments.built_in import SOLVABLE
 from hypogoal.meta import symbols
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.tables import Episodes
-from studies.cells import Cell, Jobs, Row, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, parser_of, printed, read_rows, run_cells, table
 
-PAIRS = dict(zip(SOLVABLE, range(920, 930), strict=True))  # seed of each layout, as in 'choosing'
 TUNED, TUNING_SEED = range(100, 120), 900
 PRIORS, HOPES = (0.1, 0.3, 1.0), (0.1, 0.2, 0.5)  # the same pairs for both that draw
-JEFFREYS = 1.0, 0.5  # Thompson sampling's, where nothing is chosen
+HALF_LIVES = (20, 50, 200, 1000)
+JEFFREYS = 1.0, 0.5  # Thompson sampling's constants before they were chosen
 LIMIT = 5_000  # episodes, for a run that does not arrive
-STEPS, STEPS_OF_PPO = 8_000, 80_000
-CHOOSERS = {  # title, the setting, environments
+CHOOSERS = {  # title, the setting, environments; 0: as many as by default
     "symbols": ("symbols", "symbols", 1),
+    "symbols-16": ("symbols, 16 environments", "symbols", 0),
     "thompson": ("Thompson sampling over options, no symbols", "studies.symbols:Thompson", 1),
     "rmax": ("R-max over symbols", "studies.symbols:RMax", 1),
-    "ppo-16": ("PPO, 16 environments", "ppo", 16),
+    "ppo-16": ("PPO, 16 environments", "ppo", 0),
     "ppo-1": ("PPO, 1 environment", "ppo", 1),
     "random": ("uniform random", "random", 1),
 }
-KEYS = ("chooser", "prior", "hope", "layout", "seed")
+KEYS = ("world", "chooser", "prior", "hope", "half_life", "layout", "seed")
 QUANTITIES = ("solved_1_10", "solved_11_20", "solved_21_50", "solved_51_100", "episodes_to_95")
-COLUMNS = (*KEYS, "step", "episodes", *QUANTITIES, "steps_to_95_of_20")
+BY_STEP = ("solved_at_end", "steps_to_95_of_20", "steps_to_95", "practised")
+COLUMNS = (*KEYS, "step", "episodes", *QUANTITIES, *BY_STEP)
+
+
+@dataclass(frozen=True)
+class World:
+    """Where agents play, and what they are made of."""
+
+    title: str
+    agents: Mapping[int, int]  # each layout's seed
+    choosers: tuple[str, ...]
+    settings: Mapping[str, Any]  # of train-meta
+    steps: int
+    steps_of_ppo: int = 0  # if not as many
+    domain: str = "doorkey"
+    members: int = 6
+    practice: Mapping[str, Any] | None = None  # settings of train-options
+
+
+CHOOSING = dict(zip(SOLVABLE, range(920, 930), strict=True))
+FIGURE_6 = dict(zip(range(300, 310), range(3000, 3010), strict=True))
+HARSH = {"preset": "choosing"}
+PLANNED = {"network": "planned"}
+ROOMS = {seed: seed for seed in range(990, 1000)}
+IN_ROOMS = ("symbols", "thompson", "ppo-16", "random")
+LEARNING = ("symbols-16", "ppo-16")
+WORLDS = {
+    "planned": World(
+        "a wrong key ends the episode, planned options", CHOOSING, (*CHOOSERS,), HARSH | PLANNED, 8_000, 80_000
+    ),
+    "practised": World(
+        "the same, options practised where it does not",
+        CHOOSING,
+        ("symbols", "symbols-16", "thompson", "ppo-16", "random"),
+        HARSH,
+        50_000,
+        practice=HARSH,
+    ),
+    "figure-6": World(
+        "Figure 6 after 40,000 steps", FIGURE_6, LEARNING, {}, 160_000, 0, "doorkey", 3, {"steps": 40_000}
+    ),
+    "figure-6-nothing": World("Figure 6 from nothing", FIGURE_6, LEARNING, {}, 200_000, 0, "doorkey", 3),
+    "shape": World("rooms, shape", ROOMS, IN_ROOMS, {"world": ["truth=shape"]}, 5_000, 0, "rooms", 3),
+    "place": World("rooms, place", ROOMS, IN_ROOMS, {"world": ["truth=place"]}, 5_000, 0, "rooms", 3),
+}
+TUNING = {
+    "tuning-planned": replace(
+        WORLDS["planned"], agents=dict.fromkeys(TUNED, TUNING_SEED), choosers=("symbols", "thompson")
+    ),
+    "tuning-nothing": replace(
+        WORLDS["figure-6-nothing"], agents=dict.fromkeys(TUNED[:5], TUNING_SEED), choosers=LEARNING[:1], steps=150_000
+    ),
+}
+
+
+ALL = WORLDS | TUNING
 
 
 class Thompson(Chooser):
@@ -113,56 +172,89 @@ class RMax(symbols.SymbolsChooser):
 HAVE_CONSTANTS: dict[str, Any] = {"symbols": symbols, "thompson": Thompson}
 
 
-def ensemble_at(folder: Path, seed: int) -> Path:
+def ensemble_at(folder: Path, world: World, seed: int) -> Path:
     """The D-BAT ensemble of a seed; trained where it is not there yet."""
-    data, ensemble = folder / "data.h5", folder / f"ensemble/seed-{seed}"
+    in_rooms = world.domain == "rooms"
+    own = f"{world.domain}-{seed}" if in_rooms else world.domain  # each seed of rooms has its own states
+    data, ensemble = folder / f"{own}.h5", folder / f"{world.domain}-members-{world.members}/seed-{seed}"
     if not data.exists():
-        hypogoal.collect("doorkey", data, quiet=True, resume=True)
+        hypogoal.collect(world.domain, data, seed=seed if in_rooms else 0, quiet=True, resume=True)
     if not ensemble.exists():
-        hypogoal.train_ensemble(data, ensemble, diversity="dbat", members=6, seed=seed, quiet=True, resume=True)
+        made = {"diversity": "dbat", "members": world.members, "seed": seed}
+        hypogoal.train_ensemble(data, ensemble, quiet=True, resume=True, **made)
     return ensemble
 
 
-def played(ensemble: Path, chooser: str, prior: str, hope: str, layout: int, seed: int) -> list[Row]:
-    """One agent: its row, with how soon it succeeds. ``prior`` and ``hope``: constants of a chooser that has them."""
+def played(
+    folder: Path, name: str, chooser: str, prior: str, hope: str, half_life: str, layout: int, seed: int
+) -> list[Row]:
+    """One agent: its row, with how soon it succeeds. The three constants are empty if the chooser has none."""
+    world = ALL[name]
     _, setting, environments = CHOOSERS[chooser]
-    [steps] = steps_of((chooser,))
-    world = {"network": "planned", "layout_seed": layout, "steps": steps, "environments": environments}
-    if chooser in HAVE_CONSTANTS:
-        holder = HAVE_CONSTANTS[chooser]
+    steps = steps_of(name, chooser)
+    holder = holder_of(chooser)
+    if holder is not None:
         holder.PRIOR, holder.HOPE = float(prior), float(hope)
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "agent"
-        hypogoal.train_meta(ensemble, out, preset="choosing", chooser=setting, seed=seed, quiet=True, **world)
-        episodes = Episodes.read(out / Episodes.FILE)
-    numbers = episode_numbers(episodes.succeeded)
-    row: Row = dict(zip(KEYS, (chooser, prior, hope, layout, seed), strict=True))
-    row |= {"step": steps, "episodes": len(episodes)} | {name: numbers[name] for name in QUANTITIES}
+    if half_life:
+        symbols.HALF_LIFE = float(half_life)  # type: ignore[assignment]  # a power's divisor
+    ensemble = ensemble_at(folder, world, seed)
+    of_agent = {"layout_seed": layout, "seed": seed, "quiet": True}
+    settings = {**world.settings, **of_agent, "chooser": setting, "steps": steps}
+    if environments:
+        settings["environments"] = environments
+    practised = 0
+    if world.practice is not None:
+        settings["options"] = folder / f"options-{name}/layout-{layout}"
+        if not settings["options"].exists():
+            hypogoal.train_options(ensemble, settings["options"], resume=True, **of_agent, **world.practice)
+        practised = budget_of(open_artefact(settings["options"]).config)
+    with tempfile.TemporaryDirectory() as out:
+        hypogoal.train_meta(ensemble, Path(out) / "agent", **settings)
+        episodes = Episodes.read(Path(out) / "agent" / Episodes.FILE)
+    numbers = run_numbers(episodes, None)
+    row: Row = dict(zip(KEYS, (name, chooser, prior, hope, half_life, layout, seed), strict=True))
+    row |= {"step": steps, "episodes": len(episodes)} | {quantity: numbers[quantity] for quantity in QUANTITIES}
     arrived = numbers["episodes_to_95"]
     row["steps_to_95_of_20"] = "" if np.isnan(arrived) else int(episodes.step[int(arrived) - 1])
+    row["steps_to_95"] = "" if np.isnan(numbers["steps_to_95"]) else int(numbers["steps_to_95"])
+    row |= {"solved_at_end": numbers["success"], "practised": practised}
     return [row]
 
 
-def jobs_of(folder: Path, layouts: Iterable[int], *, constants: bool) -> Jobs:
-    """A cell an agent: every chooser on the reported layouts, or those with constants, with every pair of them."""
-    kinds: list[tuple[str, str, str]] = []
-    for chooser in CHOOSERS:
-        holder = HAVE_CONSTANTS.get(chooser)
-        if constants and holder:
-            kinds += [(chooser, str(prior), str(hope)) for prior, hope in product(PRIORS, HOPES)]
-        elif not constants:
-            kinds.append((chooser, str(holder.PRIOR), str(holder.HOPE)) if holder else (chooser, "", ""))
+def holder_of(chooser: str) -> Any:
+    """Where a chooser's constants ``PRIOR`` and ``HOPE`` are; None if it has none."""
+    return {"symbols": symbols, "symbols-16": symbols, "thompson": Thompson}.get(chooser)
+
+
+def steps_of(name: str, chooser: str) -> int:
+    """The steps that a chooser plays in a world."""
+    world = ALL[name]
+    return world.steps_of_ppo or world.steps if chooser.startswith("ppo") else world.steps
+
+
+def constants_of(chooser: str, name: str) -> list[tuple[str, str, str]]:
+    """The constants that a chooser is played with: its own, or all that are tried."""
+    holder = holder_of(chooser)
+    if holder is None:
+        return [("", "", "")]
+    half_life = str(symbols.HALF_LIFE) if holder is symbols else ""
+    if name == "tuning-planned":
+        return [(str(prior), str(hope), half_life) for prior, hope in product(PRIORS, HOPES)]
+    own = str(holder.PRIOR), str(holder.HOPE)
+    if name == "tuning-nothing":
+        return [(*own, str(tried)) for tried in HALF_LIVES]
+    return [(*own, half_life)]
+
+
+def jobs_of(folder: Path, worlds: Iterable[str]) -> Jobs:
+    """A cell an agent, of every chooser, world and layout."""
     jobs: Jobs = {}
-    for layout, (chooser, prior, hope) in product(layouts, kinds):
-        seed = TUNING_SEED if constants else PAIRS[layout]
-        cell = (chooser, prior, hope, str(layout), str(seed))
-        jobs[cell] = partial(played, ensemble_at(folder, seed), chooser, prior, hope, layout, seed)
+    for name in worlds:
+        for (layout, seed), chooser in product(ALL[name].agents.items(), ALL[name].choosers):
+            for constants in constants_of(chooser, name):
+                cell = (name, chooser, *constants, str(layout), str(seed))
+                jobs[cell] = partial(played, folder, name, chooser, *constants, layout, seed)
     return jobs
-
-
-def steps_of(cell: Cell) -> list[int]:
-    """The steps that a cell is wanted at."""
-    return [STEPS_OF_PPO if cell[0].startswith("ppo") else STEPS]
 
 
 def episodes_of(rows: Iterable[dict[str, str]]) -> dict[str, float]:
@@ -175,25 +267,47 @@ def episodes_of(rows: Iterable[dict[str, str]]) -> dict[str, float]:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """Each chooser's episodes, layout by layout, and their paired ratios to those of symbols; or each constant's."""
-    rows = read_rows(path)
-    layouts = sorted({row["layout"] for row in rows}, key=int)
+    """Of each world how many episodes and steps each chooser needs."""
+    by_world: dict[str, list[dict[str, str]]] = {}
+    for row in read_rows(path):
+        by_world.setdefault(row["world"], []).append(row)
+    for name, rows in by_world.items():
+        yield f"{ALL[name].title}: episodes until 95 % of 20 are solved ({LIMIT}: never); shares solved; steps.\n"
+        yield from _table(rows)
+
+
+def _table(rows: list[dict[str, str]]) -> Iterator[str]:
     by_kind: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for row in rows:
-        by_kind.setdefault((row["chooser"], row["prior"], row["hope"]), []).append(row)
-    several = len({kind[1:] for kind in by_kind}) > 1
+        kind = tuple(row[key] for key in KEYS[1:5])
+        by_kind.setdefault(kind, []).append(row)
+    several = len(by_kind) > len({kind[0] for kind in by_kind})
     first = episodes_of(next(iter(by_kind.values())))
-    yield f"Episodes until 95 % of 20 are solved; {LIMIT} where that was never.\n"
+    layouts = list(first)
     shown = []
-    for (chooser, prior, hope), own in by_kind.items():
+    for (chooser, *constants), own in by_kind.items():
         numbers = episodes_of(own)
         values = np.array([*numbers.values()])
         title, *_ = CHOOSERS[chooser]
-        title = f"{title}, PRIOR {prior}, HOPE {hope}" if several and prior else title
-        ratios = np.array([numbers[layout] / first[layout] for layout in numbers if layout in first])
+        if several:
+            title = f"{title}: {', '.join(filter(None, constants))}"
+        ratios = np.array([numbers[layout] / first[layout] for layout in numbers])
+        shares = [_mean(own, quantity) for quantity in QUANTITIES[:-1]]
         each = [f"{numbers[layout]:.0f}" if layout in numbers else "-" for layout in layouts]
-        shown.append([title, *_summary(values), f"{np.median(ratios):.1f}", *each])
-    yield from table(["", "arrived", "median", "mean", "most", "ratio, median", *layouts], shown)
+        shown.append([title, *_summary(values), f"{np.median(ratios):.1f}", *shares, _steps(own), ", ".join(each)])
+    titles = ["", "arrived", "median", "mean", "most", "ratio, median", "1-10", "11-20", "21-50", "51-100"]
+    yield from table([*titles, "steps, median", "each"], shown)
+
+
+def _mean(rows: list[dict[str, str]], quantity: str) -> str:
+    values = np.array([float(row[quantity] or "nan") for row in rows])
+    return "-" if np.isnan(values).all() else f"{np.nanmean(values):.2f}"
+
+
+def _steps(rows: list[dict[str, str]]) -> str:
+    """The median steps to 95 of 100 episodes, practice included; inf where most do not arrive."""
+    values = [float(row["steps_to_95"] or "inf") + float(row["practised"]) for row in rows]
+    return f"{np.median(values):,.0f}"
 
 
 def _summary(values: NDArray[np.float64]) -> list[str]:
@@ -203,18 +317,18 @@ def _summary(values: NDArray[np.float64]) -> list[str]:
 
 def main() -> None:
     """Play what is missing, then print the tables."""
-    parser = parser_of(__doc__, run="the folder of data and ensembles; made where there is none")
+    parser = parser_of(__doc__, run="the folder of data, ensembles and options; made where there is none")
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--constants", action="store_true", help="symbols alone, with pairs of constants")
-    parser.add_argument("--layouts", help="some of the layouts alone, 70100,70101")
+    parser.add_argument("--constants", action="store_true", help="those that are tried, on the layouts for that")
+    parser.add_argument("--worlds", help=f"some alone: {','.join(ALL)}")
     arguments = parser.parse_args()
     if printed(arguments, tables):
         return
-    layouts = [*(TUNED if arguments.constants else PAIRS)]
-    if arguments.layouts:
-        layouts = [int(layout) for layout in arguments.layouts.split(",")]
-    jobs = jobs_of(arguments.run, layouts, constants=arguments.constants)
-    run_cells(arguments.csv, COLUMNS, KEYS, jobs, steps_of, arguments.workers)
+    worlds = [*(TUNING if arguments.constants else WORLDS)]
+    if arguments.worlds:
+        worlds = arguments.worlds.split(",")
+    jobs = jobs_of(arguments.run, worlds)
+    run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda cell: [steps_of(*cell[:2])], arguments.workers)
     print("\n".join(tables(arguments.csv)))
 
 
