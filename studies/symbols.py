@@ -8,7 +8,7 @@ Reported: on the ten layouts of the experiment 'choosing', where a wrong key end
 paths, with planned options and with practised ones; on Figure 6's ten layouts, after practice and from nothing; in
 rooms. Each layout has the D-BAT ensemble of its seed. Constants, those of ``hypogoal/meta/symbols.py`` and those of
 Thompson sampling, are chosen with planned options on layouts 100 to 119 and one ensemble of another seed: the pair with
-the fewest episodes in the mean, where an agent that never arrives counts as ``LIMIT``. Then ``HALF_LIFE`` is chosen from
+the fewest episodes in the mean, where one that never arrives counts as ``LIMIT``. Then ``HALF_LIFE`` is chosen from
 nothing, in Figure 6's world: the one with the fewest steps to 95 % in the mean.
 """
 
