@@ -33,6 +33,7 @@ from hypogoal.evaluation import (
     rooms,
     saliency,
     selection,
+    undecided,
     verdict,
     zero_shot,
 )
@@ -104,6 +105,7 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
         "missing": missing + selection.missing(work),
         **curves.facts(work),
         **verdict.facts(work),
+        **undecided.facts(work),
         **work.facts,
     }
     return Results(house.joined(parts), facts)

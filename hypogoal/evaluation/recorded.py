@@ -64,18 +64,14 @@ def findings_of(
     known_scores = classifier.predict(known.observations)
     scores = classifier.predict(unlabelled)
 
-    compared = spread_rows(len(unlabelled), COMPARED)
-    sketches = sketches_of(unlabelled[compared])
-    disputed = disagreement(scores[compared], thresholds)
-    proposed = to_label(disputed * density_of(sketches), sketches, NEXT)
-    rows = compared[proposed]
+    rows, disputed = next_to_label(unlabelled, scores, thresholds, NEXT)
     failures = []
     negatives = np.flatnonzero(~known.labels)
     for of_member in known_scores[negatives].T:
         worst = negatives[np.argsort(-of_member, kind="stable")][:FAILURES]
         failures.append((known.observations[worst], known_scores[worst]))
 
-    positive = scores[compared] > thresholds
+    positive = scores[spread_rows(len(unlabelled), COMPARED)] > thresholds
     disagree = positive.any(axis=1) != positive.all(axis=1)
     numbers = {
         "sub_goal": sub_goal,
@@ -89,7 +85,7 @@ def findings_of(
         "numbers": numbers,
         "thresholds": thresholds,
         "rows": rows,
-        "disputed": disputed[proposed],
+        "disputed": disputed,
         "states": unlabelled[rows],
         "scores": scores[rows],
         "failures": failures,
@@ -110,6 +106,18 @@ def write_next(folder: Path, findings: Mapping[str, Any]) -> None:
         lines.append([name, "", row, digest(state).hex(), disputed])
     table = pd.DataFrame(lines, columns=COLUMNS)
     table.round(4).to_csv(folder / TO_FILL_IN, index=False)
+
+
+def next_to_label(states: Observations, scores: Floats, thresholds: Doubles, count: int) -> tuple[Ints, Doubles]:
+    """Which of unlabelled states (N, *obs) to label next, best first, and how much members differ there.
+
+    Those where ``scores`` (N, K) differ much, that are common and unlike those before; among ``COMPARED`` at most.
+    """
+    compared = spread_rows(len(states), COMPARED)
+    sketches = sketches_of(states[compared])
+    disputed = disagreement(scores[compared], thresholds)
+    proposed = to_label(disputed * density_of(sketches), sketches, count)
+    return compared[proposed], disputed[proposed]
 
 
 def sketches_of(observations: Observations) -> Doubles:

@@ -114,6 +114,7 @@ def context(results):
     return {
         "results": results,
         "findings": findings(results),
+        "undecided": results.facts.get("undecided", []),
         "agents": agents,
         "ladders": (results.numbers["ladder"] != "").any(),
         "solved": final.groupby("method", sort=False)["value"].mean().to_dict(),

@@ -1,0 +1,84 @@
+"""Where rewards have not told which member of a sub-goal to take, and which states' labels would.
+
+Of agents that count (``chooser=symbols``), whose posterior says how sure they are.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hypogoal.core.arrays import Doubles
+from hypogoal.core.artefacts import Artefact
+from hypogoal.evaluation.curves import SHORT, SOLVED
+from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.verdict import UNDECIDED, outcome_of
+from hypogoal.options.tables import Episodes
+
+EPISODES = 50  # before which nobody can be sure
+DRAWS = 400  # of the posterior
+NAMED = 8  # states to label
+
+
+def facts(work: Work) -> dict[str, Any]:
+    """``undecided``: of each agent that still fails the sub-goals whose two best members it cannot tell apart."""
+    found = []
+    for artefact in work.contents.agents:
+        if artefact.config.get("chooser") == "symbols":
+            found += [{"agent": work.place(artefact)["method"], **each} for each in of_agent(work, artefact)]
+    return {"undecided": found}
+
+
+def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
+    """Nothing before ``EPISODES`` episodes, and of an agent that solves its task.
+
+    Members are compared where their sub-goal was pursued most: by their options' values in these symbols, whose
+    difference has a 95 % interval over draws of the posterior.
+    """
+    from hypogoal.core.tensors import load_tensors
+    from hypogoal.meta.symbols import Model
+    from hypogoal.options.choosers import FILE
+
+    succeeded = Episodes.read(artefact.path / Episodes.FILE).succeeded
+    if len(succeeded) < EPISODES or succeeded[-SHORT:].mean() >= SOLVED:
+        return []
+    config = artefact.config
+    members, sub_goals = config["members"], config["sub_goals"]
+    options = members * len(sub_goals)
+    model = Model(options, config["history"], 1.0)
+    model.restore({name: values.numpy() for name, values in load_tensors(artefact.path / FILE).items()})
+    executions = np.bincount(model.pairs(), model.sums[:, 0], len(model.symbols) * options).reshape(-1, options)
+    draw = np.random.default_rng(0).standard_gamma
+    drawn = np.stack([model.qualities(draw) for _ in range(DRAWS)])
+    found = []
+    for goal, sub_goal in enumerate(sub_goals):
+        own = slice(goal * members, (goal + 1) * members)
+        place = executions[:, own].sum(axis=1).argmax()
+        tried = np.flatnonzero(executions[place, own])
+        if len(tried) < 2:
+            continue
+        values = drawn[:, place, own][:, tried]
+        second, best = values.mean(axis=0).argsort()[-2:]
+        difference = values[:, best] - values[:, second]
+        low, high = np.percentile(difference, (2.5, 97.5))
+        if outcome_of(difference.mean(), low, high) != UNDECIDED:
+            continue
+        pair = sorted([int(tried[best]), int(tried[second])])
+        numbers = {"difference": difference.mean(), "low": low, "high": high, "episodes": len(succeeded)}
+        states = to_label(work, artefact, sub_goal, pair)
+        found.append({"sub_goal": sub_goal, "members": pair, **numbers, **states})
+    return found
+
+
+def to_label(work: Work, artefact: Artefact, sub_goal: str, pair: list[int]) -> dict[str, Any]:
+    """``data``, the ensemble's file, and ``states``: the unlabelled ones of it on which two members differ most."""
+    from hypogoal.data import open_dataset
+    from hypogoal.evaluation.recorded import next_to_label
+    from hypogoal.hypotheses.ensemble import read_ensemble
+
+    source = next(each for each in work.contents.ensembles if each.path.samefile(artefact.input("ensemble")))
+    data = work.contents.data_of[source.path]
+    ensemble = read_ensemble(source.path, source.config, sub_goal)
+    unlabelled = open_dataset(data).unlabelled()
+    thresholds: Doubles = np.array(ensemble.thresholds.tolist())[pair]
+    rows, _ = next_to_label(unlabelled, ensemble.predict(unlabelled)[:, pair], thresholds, NAMED)
+    return {"data": str(data), "states": rows.tolist()}
