@@ -41,7 +41,6 @@ TUNED = (*range(100, 114), 115, 118, 119)  # 114, 116 and 117 have a wrong key i
 TUNING_SEED = 900
 PRIORS, HOPES = (0.1, 0.3, 1.0), (0.1, 0.2, 0.5)  # the same pairs for both that draw
 HALF_LIVES = (20, 50, 200, 1000)
-JEFFREYS = 1.0, 0.5  # Thompson sampling's constants before they were chosen
 LIMIT = 5_000  # episodes, for a run that does not arrive
 CHOOSERS = {  # title, the setting, environments; 0: as many as by default
     "symbols": ("symbols", "symbols", 1),
@@ -119,7 +118,7 @@ class Thompson(Chooser):
     """
 
     CHANGING = ("rng", "counts", "drawn", "used")
-    PRIOR, HOPE = JEFFREYS
+    PRIOR, HOPE = 1.0, 0.1  # chosen as those of symbols
 
     def __init__(self, environments: int, options: int, rng: np.random.Generator):
         self.rng = rng

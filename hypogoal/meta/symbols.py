@@ -42,7 +42,7 @@ from hypogoal.domains.base import Engine
 from hypogoal.meta.config import GAMMA
 from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
 
-PRIOR = 0.3  # executions that an unknown outcome weighs
+PRIOR = 0.1  # executions that an unknown outcome weighs
 HOPE = 0.2  # the share of these that is rewarded
 HALF_LIFE = 50  # executions of an option
 TINY = 1e-300  # no weight, but no division by 0: draws of small weights, and counts that faded, can be 0
