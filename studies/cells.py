@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from hypogoal.domains.base import Domain
 from hypogoal.evaluation.house import BOOTSTRAP_FROM, RESAMPLES, student_interval
 from hypogoal.stages.collect import collect
 
+T = TypeVar("T")
 Row = dict[str, Any]
 Cell = tuple[str, ...]
 Jobs: TypeAlias = dict[Cell, Callable[[], list[Row]]]  # what makes a cell's rows
@@ -101,10 +102,10 @@ def run_cells(
                 csv.DictWriter(file, columns, lineterminator="\n").writerows({**row, **_short(row)} for row in new)
             progress.advance()
 
-        in_processes([_importable(jobs[cell]) for cell in cells], workers, keep)
+        in_processes([importable(jobs[cell]) for cell in cells], workers, keep)
 
 
-def _importable(job: Callable[[], list[Row]]) -> Callable[[], list[Row]]:
+def importable(job: Callable[[], T]) -> Callable[[], T]:
     """The same job, of the module that a study is, not of ``__main__``, which other processes do not have."""
     study = sys.modules["__main__"].__spec__
     if not isinstance(job, partial) or job.func.__module__ != "__main__" or study is None:

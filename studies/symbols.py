@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 import hypogoal
 from hypogoal.core.arrays import Bools, Doubles, Ints
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.processes import in_processes
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.curves import budget_of, run_numbers
@@ -35,7 +36,7 @@ from hypogoal.experiments.built_in import SOLVABLE
 from hypogoal.meta import symbols
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.tables import Episodes
-from studies.cells import Jobs, Row, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, importable, parser_of, printed, read_rows, run_cells, table
 
 TUNED = (*range(100, 114), 115, 118, 119)  # 114, 116 and 117 have a wrong key in the way
 TUNING_SEED = 900
@@ -172,17 +173,52 @@ class RMax(symbols.SymbolsChooser):
 HAVE_CONSTANTS: dict[str, Any] = {"symbols": symbols, "thompson": Thompson}
 
 
+def data_at(folder: Path, world: World, seed: int) -> Path:
+    """The data of a seed, in rooms, or of all seeds."""
+    return folder / (f"rooms-{seed}.h5" if world.domain == "rooms" else f"{world.domain}.h5")
+
+
 def ensemble_at(folder: Path, world: World, seed: int) -> Path:
-    """The D-BAT ensemble of a seed; trained where it is not there yet."""
-    in_rooms = world.domain == "rooms"
-    own = f"{world.domain}-{seed}" if in_rooms else world.domain  # each seed of rooms has its own states
-    data, ensemble = folder / f"{own}.h5", folder / f"{world.domain}-members-{world.members}/seed-{seed}"
-    if not data.exists():
-        hypogoal.collect(world.domain, data, seed=seed if in_rooms else 0, quiet=True, resume=True)
-    if not ensemble.exists():
-        made = {"diversity": "dbat", "members": world.members, "seed": seed}
-        hypogoal.train_ensemble(data, ensemble, quiet=True, resume=True, **made)
-    return ensemble
+    """The D-BAT ensemble of a seed."""
+    return folder / f"{world.domain}-members-{world.members}/seed-{seed}"
+
+
+def options_at(folder: Path, name: str, layout: int) -> Path:
+    """The options that practised on a layout."""
+    return folder / f"options-{name}/layout-{layout}"
+
+
+def train_ensemble(folder: Path, world: World, seed: int) -> None:
+    """Train an ensemble."""
+    made = {"diversity": "dbat", "members": world.members, "seed": seed}
+    place = ensemble_at(folder, world, seed)
+    hypogoal.train_ensemble(data_at(folder, world, seed), place, quiet=True, resume=True, **made)
+
+
+def practise(folder: Path, name: str, layout: int, seed: int) -> None:
+    """Have the options of an agent practise."""
+    world = ALL[name]
+    of_agent = {"layout_seed": layout, "seed": seed, "quiet": True, "resume": True}
+    source = ensemble_at(folder, world, seed)
+    hypogoal.train_options(source, options_at(folder, name, layout), **of_agent, **(world.practice or {}))
+
+
+def prepare(folder: Path, worlds: Iterable[str], workers: int) -> None:
+    """Make the data, ensembles and practised options that are not there yet, each once, for all their agents."""
+    ensembles: dict[Path, Callable[[], None]] = {}
+    options: dict[Path, Callable[[], None]] = {}
+    for name in worlds:
+        world = ALL[name]
+        for layout, seed in world.agents.items():
+            data = data_at(folder, world, seed)
+            if not data.exists():
+                hypogoal.collect(world.domain, data, seed=seed if world.domain == "rooms" else 0, quiet=True)
+            ensembles[ensemble_at(folder, world, seed)] = partial(train_ensemble, folder, world, seed)
+            if world.practice is not None:
+                options[options_at(folder, name, layout)] = partial(practise, folder, name, layout, seed)
+    for made in (ensembles, options):
+        missing = [importable(job) for place, job in made.items() if not place.exists()]
+        in_processes(missing, workers, lambda number, _: None)
 
 
 def played(
@@ -197,19 +233,16 @@ def played(
         holder.PRIOR, holder.HOPE = float(prior), float(hope)
     if half_life:
         symbols.HALF_LIFE = float(half_life)  # type: ignore[assignment]  # a power's divisor
-    ensemble = ensemble_at(folder, world, seed)
     of_agent = {"layout_seed": layout, "seed": seed, "quiet": True}
     settings = {**world.settings, **of_agent, "chooser": setting, "steps": steps}
     if environments:
         settings["environments"] = environments
     practised = 0
     if world.practice is not None:
-        settings["options"] = folder / f"options-{name}/layout-{layout}"
-        if not settings["options"].exists():
-            hypogoal.train_options(ensemble, settings["options"], resume=True, **of_agent, **world.practice)
+        settings["options"] = options_at(folder, name, layout)
         practised = budget_of(open_artefact(settings["options"]).config)
     with tempfile.TemporaryDirectory() as out:
-        hypogoal.train_meta(ensemble, Path(out) / "agent", **settings)
+        hypogoal.train_meta(ensemble_at(folder, world, seed), Path(out) / "agent", **settings)
         episodes = Episodes.read(Path(out) / "agent" / Episodes.FILE)
     numbers = run_numbers(episodes, None)
     row: Row = dict(zip(KEYS, (name, chooser, prior, hope, half_life, layout, seed), strict=True))
@@ -327,6 +360,7 @@ def main() -> None:
     worlds = [*(TUNING if arguments.constants else WORLDS)]
     if arguments.worlds:
         worlds = arguments.worlds.split(",")
+    prepare(arguments.run, worlds, arguments.workers)
     jobs = jobs_of(arguments.run, worlds)
     run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda cell: [steps_of(*cell[:2])], arguments.workers)
     print("\n".join(tables(arguments.csv)))
