@@ -79,7 +79,8 @@ HARSH = {"preset": "choosing"}
 PLANNED = {"network": "planned"}
 ROOMS = {seed: seed for seed in range(990, 1000)}
 IN_ROOMS = ("symbols", "thompson", "ppo-16", "random")
-LEARNING = ("symbols-16", "ppo-16")
+LEARNING = ("symbols-16",)  # Figure 6 has PPO's
+PUBLISHED = {"epsilon_steps": 8_000, "update_interval": 16}  # Figure 6's settings
 WORLDS = {
     "planned": World(
         "a wrong key ends the episode, planned options", CHOOSING, (*CHOOSERS,), HARSH | PLANNED, 8_000, 80_000
@@ -87,15 +88,22 @@ WORLDS = {
     "practised": World(
         "the same, options practised where it does not",
         CHOOSING,
-        ("symbols", "symbols-16", "thompson", "ppo-16", "random"),
+        ("symbols", "symbols-16", "thompson", "ppo-16"),
         HARSH,
+        16_000,
         50_000,
         practice=HARSH,
     ),
     "figure-6": World(
-        "Figure 6 after 40,000 steps", FIGURE_6, LEARNING, {}, 160_000, 0, "doorkey", 3, {"steps": 40_000}
+        "Figure 6 after 40,000 steps",
+        FIGURE_6,
+        LEARNING,
+        PUBLISHED,
+        120_000,
+        members=3,
+        practice=PUBLISHED | {"steps": 40_000},
     ),
-    "figure-6-nothing": World("Figure 6 from nothing", FIGURE_6, LEARNING, {}, 200_000, 0, "doorkey", 3),
+    "figure-6-nothing": World("Figure 6 from nothing", FIGURE_6, LEARNING, PUBLISHED, 160_000, members=3),
     "shape": World("rooms, shape", ROOMS, IN_ROOMS, {"world": ["truth=shape"]}, 5_000, 0, "rooms", 3),
     "place": World("rooms, place", ROOMS, IN_ROOMS, {"world": ["truth=place"]}, 5_000, 0, "rooms", 3),
 }
@@ -103,9 +111,7 @@ TUNING = {
     "tuning-planned": replace(
         WORLDS["planned"], agents=dict.fromkeys(TUNED, TUNING_SEED), choosers=("symbols", "thompson")
     ),
-    "tuning-nothing": replace(
-        WORLDS["figure-6-nothing"], agents=dict.fromkeys(TUNED[:5], TUNING_SEED), choosers=LEARNING[:1], steps=150_000
-    ),
+    "tuning-nothing": replace(WORLDS["figure-6-nothing"], agents=dict.fromkeys(TUNED[:3], TUNING_SEED), steps=120_000),
 }
 
 

@@ -35,6 +35,7 @@ RANDOM = "random choice"
 PRETRAINING = "random choice while options learn"
 ORACLE_AGENT = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
+BUILT_IN = ("symbols", "ppo")  # choosers that learn; both in a run, their names are told apart as any setting's
 UNIFORM = "uniform-random choice among its own options"
 METHODS = ("D-BAT", "DivDis", "no diversity", ONE)  # of ensembles
 ORDER = (*METHODS, LEARNED, RANDOM, PRETRAINING, ORACLE_AGENT, ORACLE_RANDOM)  # in tables and figures
@@ -58,7 +59,7 @@ def agent_title(kind: str, config: Values) -> str:
     if config["chooser"] == "random":
         return ORACLE_RANDOM if oracle else RANDOM
     title = ORACLE_AGENT if oracle else LEARNED
-    return title if config["chooser"] == "ppo" else f"{title}, chooser={config['chooser']}"
+    return title if config["chooser"] in BUILT_IN else f"{title}, chooser={config['chooser']}"
 
 
 def rank(name: str) -> int:

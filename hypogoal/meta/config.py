@@ -122,17 +122,17 @@ class TrainMetaConfig(PlayConfig):
     """How options are learned and chosen, and for how long."""
 
     PARTS: ClassVar[Any] = OptionConfig.PARTS | {
-        "chooser": {"ppo": MetaConfig, "symbols": SymbolsConfig, OWN: OwnChooserConfig}
+        "chooser": {"symbols": SymbolsConfig, "ppo": MetaConfig, OWN: OwnChooserConfig}
     }
 
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
     chooser: str = setting(
-        "ppo",
-        "who chooses options: ppo, a network; symbols, a counted table; random, uniform",
-        source="paper: ppo",
-        choices=("ppo", "symbols", "random"),
+        "symbols",
+        "who chooses options: symbols, a counted table; ppo, a network; random, uniform",
+        source="ours (DEV-54); paper: ppo",
+        choices=("symbols", "ppo", "random"),
         own=True,
     )
 

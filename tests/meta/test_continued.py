@@ -138,7 +138,7 @@ def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:
 
 def test_an_engine_remembers_what_the_meta_policy_looks_back_at() -> None:
     """Spec E2: states where all decisions of an update began, each of which may have taken an option's whole time."""
-    config = TrainMetaConfig.of(replay=100, environments=4, decisions=64, option_timeout=200)
+    config = TrainMetaConfig.of(chooser="ppo", replay=100, environments=4, decisions=64, option_timeout=200)
     assert frames_kept(config, GOALS) >= 64 * 200
-    config = TrainMetaConfig.of(replay=100_000, environments=4, decisions=64)
+    config = TrainMetaConfig.of(chooser="ppo", replay=100_000, environments=4, decisions=64)
     assert frames_kept(config, GOALS) == LightLearner.reach(config, GOALS)

@@ -85,8 +85,10 @@ class DoorKeyDomain(Domain):
     engine_settings = ("door_label", "wrong_key")
     env_id = "hypogoal.envs:hypogoal/DoorKey-8x8-v0"
     many_layouts = True
-    sources = MappingProxyType({"train-ensemble": "paper, Table 3, Eq. (1)"})
-    defaults = MappingProxyType({"train-ensemble": {"diversity_weight": 1e-4, **EQUATION_1}})
+    sources = MappingProxyType({"train-ensemble": "paper, Table 3, Eq. (1)", "train-meta": "paper"})
+    defaults = MappingProxyType(
+        {"train-ensemble": {"diversity_weight": 1e-4, **EQUATION_1}, "train-meta": {"chooser": "ppo"}}
+    )
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """Spec B3: labelled, unlabelled and held-out states, each with its origin.

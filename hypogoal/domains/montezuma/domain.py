@@ -156,7 +156,7 @@ class MontezumaDomain(Domain):
         {
             "train-ensemble": TABLE_1 | EQUATION_1,
             "train-options": ALONE,
-            "train-meta": LEARNING,
+            "train-meta": LEARNING | {"chooser": "ppo"},
             "audit": {name: value for name, value in ALONE.items() if name != "steps"},
         }
     )
