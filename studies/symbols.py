@@ -47,11 +47,13 @@ CHOOSERS = {  # title, the setting, environments; 0: as many as by default
     "symbols": ("symbols", "symbols", 1),
     "symbols-16": ("symbols, 16 environments", "symbols", 0),
     "thompson": ("Thompson sampling over options, no symbols", "studies.symbols:Thompson", 1),
+    "unshared": ("symbols that learn nothing from each other", "studies.symbols:Unshared", 1),
     "rmax": ("R-max over symbols", "studies.symbols:RMax", 1),
     "ppo-16": ("PPO, 16 environments", "ppo", 0),
     "ppo-1": ("PPO, 1 environment", "ppo", 1),
     "random": ("uniform random", "random", 1),
 }
+OF_SYMBOLS = ("symbols", "symbols-16", "unshared")  # which have that module's constants
 KEYS = ("world", "chooser", "prior", "hope", "half_life", "layout", "seed")
 QUANTITIES = ("solved_1_10", "solved_11_20", "solved_21_50", "solved_51_100", "episodes_to_95")
 BY_STEP = ("solved_at_end", "steps_to_95_of_20", "steps_to_95", "practised")
@@ -154,6 +156,21 @@ class Thompson(Chooser):
 
     def begin_anew(self) -> None:
         self.used[:] = False
+
+
+class Alone(symbols.Model):
+    """What is unknown in some symbols is worth the same whatever its option did in others."""
+
+    def _from_others(self, weights: Doubles) -> Doubles:
+        return np.zeros((len(self.symbols), self.options))
+
+
+class Unshared(symbols.SymbolsChooser):
+    """Symbols that learn nothing from each other: the control of what that is worth."""
+
+    def __init__(self, environments: int, options: int, *arguments: Any):
+        super().__init__(environments, options, *arguments)
+        self.model = Alone(options, self.past.shape[1], self.model.keep)
 
 
 class Optimistic(symbols.Model):
@@ -262,7 +279,7 @@ def played(
 
 def holder_of(chooser: str) -> Any:
     """Where a chooser's constants ``PRIOR`` and ``HOPE`` are; None if it has none."""
-    return {"symbols": symbols, "symbols-16": symbols, "thompson": Thompson}.get(chooser)
+    return {"thompson": Thompson}.get(chooser, symbols if chooser in OF_SYMBOLS else None)
 
 
 def steps_of(name: str, chooser: str) -> int:
