@@ -8,8 +8,8 @@ Reported: on the ten layouts of the experiment 'choosing', where a wrong key end
 paths, with planned options and with practised ones; on Figure 6's ten layouts, after practice and from nothing; in
 rooms. Each layout has the D-BAT ensemble of its seed. Constants, those of ``hypogoal/meta/symbols.py`` and those of
 Thompson sampling, are chosen with planned options on layouts 100 to 119 and one ensemble of another seed: the pair with
-the fewest episodes in the mean, where one that never arrives counts as ``LIMIT``. Then ``HALF_LIFE`` is chosen from
-nothing, in Figure 6's world: the one with the fewest steps to 95 % in the mean.
+the fewest episodes in the mean, where one that never arrives counts as ``LIMIT``. Then ``HALF_LIFE`` is chosen by the
+same rule, with practised options on the first three of these layouts.
 """
 
 from __future__ import annotations
@@ -113,7 +113,9 @@ TUNING = {
     "tuning-planned": replace(
         WORLDS["planned"], agents=dict.fromkeys(TUNED, TUNING_SEED), choosers=("symbols", "thompson")
     ),
-    "tuning-nothing": replace(WORLDS["figure-6-nothing"], agents=dict.fromkeys(TUNED[:3], TUNING_SEED), steps=120_000),
+    "tuning-practised": replace(
+        WORLDS["practised"], agents=dict.fromkeys(TUNED[:3], TUNING_SEED), choosers=("symbols-16",)
+    ),
 }
 
 
@@ -297,7 +299,7 @@ def constants_of(chooser: str, name: str) -> list[tuple[str, str, str]]:
     if name == "tuning-planned":
         return [(str(prior), str(hope), half_life) for prior, hope in product(PRIORS, HOPES)]
     own = str(holder.PRIOR), str(holder.HOPE)
-    if name == "tuning-nothing":
+    if name == "tuning-practised":
         return [(*own, str(tried)) for tried in HALF_LIVES]
     return [(*own, half_life)]
 
