@@ -96,6 +96,7 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
         work.progress.advance()
     for rows in ROWS:
         parts += rows(work)
+    numbers = house.joined(parts)
     missing = [] if work.contents.ensembles else ["no ensemble"]
     facts = {
         "format": FORMAT,
@@ -105,10 +106,10 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
         "missing": missing + selection.missing(work),
         **curves.facts(work),
         **verdict.facts(work),
-        **undecided.facts(work),
+        **undecided.facts(work, numbers),
         **work.facts,
     }
-    return Results(house.joined(parts), facts)
+    return Results(numbers, facts)
 
 
 def write(folder: Path, results: Results, every: list[Context]) -> None:

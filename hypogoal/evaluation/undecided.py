@@ -6,11 +6,14 @@ Of agents that count (``chooser=symbols``), whose posterior says how sure they a
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hypogoal.core.arrays import Doubles
 from hypogoal.core.artefacts import Artefact
+from hypogoal.evaluation.choosing import FROZEN
 from hypogoal.evaluation.curves import SHORT, SOLVED
 from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.names import UNIFORM
 from hypogoal.evaluation.verdict import UNDECIDED, outcome_of
 from hypogoal.options.tables import Episodes
 
@@ -19,17 +22,30 @@ DRAWS = 400  # of the posterior
 NAMED = 8  # states to label
 
 
-def facts(work: Work) -> dict[str, Any]:
-    """``undecided``: of each agent that still fails the sub-goals whose two best members it cannot tell apart."""
+def facts(work: Work, numbers: pd.DataFrame) -> dict[str, Any]:
+    """``undecided``: of each agent that still fails the sub-goals whose two best members it cannot tell apart.
+
+    It fails if it solves less than 95 % of the episodes that it plays after training; if it played none, of the last.
+    """
     found = []
+    played = numbers[(numbers["scope"] == FROZEN) & (numbers["quantity"] == "success") & (numbers["method"] != UNIFORM)]
     for artefact in work.contents.agents:
-        if artefact.config.get("chooser") == "symbols":
-            found += [{"agent": work.place(artefact)["method"], **each} for each in of_agent(work, artefact)]
+        if artefact.config.get("chooser") != "symbols":
+            continue
+        place = work.place(artefact)
+        succeeded = Episodes.read(artefact.path / Episodes.FILE).succeeded
+        solved = succeeded[-SHORT:].mean() if len(succeeded) else 0.0
+        frozen = played[played["artefact"] == place["artefact"]]["value"]
+        if len(frozen):
+            solved = frozen.mean()
+        if len(succeeded) >= EPISODES and solved < SOLVED:
+            about = {"agent": place["method"], "episodes": len(succeeded)}
+            found += [{**about, **each} for each in of_agent(work, artefact)]
     return {"undecided": found}
 
 
 def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
-    """Nothing before ``EPISODES`` episodes, and of an agent that solves its task.
+    """Each sub-goal's two best members that differ, or do not, by an interval that leaves it open.
 
     Members are compared where their sub-goal was pursued most: by their options' values in these symbols, whose
     difference has a 95 % interval over draws of the posterior.
@@ -38,9 +54,6 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
     from hypogoal.meta.symbols import Model
     from hypogoal.options.choosers import FILE
 
-    succeeded = Episodes.read(artefact.path / Episodes.FILE).succeeded
-    if len(succeeded) < EPISODES or succeeded[-SHORT:].mean() >= SOLVED:
-        return []
     config = artefact.config
     members, sub_goals = config["members"], config["sub_goals"]
     options = members * len(sub_goals)
@@ -63,7 +76,7 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
         if outcome_of(difference.mean(), low, high) != UNDECIDED:
             continue
         pair = sorted([int(tried[best]), int(tried[second])])
-        numbers = {"difference": difference.mean(), "low": low, "high": high, "episodes": len(succeeded)}
+        numbers = {"difference": difference.mean(), "low": low, "high": high}
         states = to_label(work, artefact, sub_goal, pair)
         found.append({"sub_goal": sub_goal, "members": pair, **numbers, **states})
     return found

@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from command_line import run, settings
 
-from hypogoal.core.artefacts import Artefact
 from hypogoal.core.progress import Progress
 from hypogoal.core.tensors import save_tensors
 from hypogoal.data import open_dataset
@@ -33,7 +33,12 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def told(
-    rooms: Path, succeeded: list[int], failed: list[int], episodes: int = 60, solved: float = 0.5
+    rooms: Path,
+    succeeded: list[int],
+    failed: list[int],
+    episodes: int = 60,
+    solved: float = 0.5,
+    frozen: float | None = None,
 ) -> list[dict[str, Any]]:
     """What is said of counts (3,) of the three members' options, and of so many episodes."""
     count = len(succeeded) * 2
@@ -48,7 +53,10 @@ def told(
     successes = numbers % 10 < 10 * solved
     Episodes.cast(numbers + 1, np.ones(episodes), successes, np.ones(episodes), successes).write(rooms / "meta")
     work = Work(find(rooms), None, Progress("", 0, quiet=True))
-    return undecided.of_agent(work, Artefact(rooms / "meta"))
+    numbers = pd.DataFrame(columns=["scope", "quantity", "method", "artefact", "value"])
+    if frozen is not None:
+        numbers.loc[0] = ["frozen", "success", "option agent", "meta", frozen]
+    return undecided.facts(work, numbers)["undecided"]
 
 
 def test_two_members_whose_rewards_are_alike_are_undecided(rooms: Path) -> None:
@@ -74,6 +82,13 @@ def test_nothing_is_said_where_it_is_decided(
     rooms: Path, succeeded: list[int], failed: list[int], episodes: int, solved: float
 ) -> None:
     assert told(rooms, succeeded, failed, episodes, solved) == []
+
+
+def test_what_it_plays_after_training_counts_before_its_training(rooms: Path) -> None:
+    """While options learn they also explore, so training fails at times where the agent would not."""
+    counts = [7, 0, 6], [5, 30, 6]
+    assert told(rooms, *counts, solved=0.5, frozen=1.0) == []
+    assert len(told(rooms, *counts, solved=1.0, frozen=0.5)) == 1
 
 
 def test_it_is_a_sentence_below_the_verdict() -> None:
