@@ -213,8 +213,9 @@ def options_at(folder: Path, name: str, layout: int) -> Path:
     return folder / f"options-{name}/layout-{layout}"
 
 
-def train_ensemble(folder: Path, world: World, seed: int) -> None:
-    """Train an ensemble."""
+def train_ensemble(folder: Path, name: str, seed: int) -> None:
+    """Train the ensemble of a world's seed."""
+    world = ALL[name]
     made = {"diversity": "dbat", "members": world.members, "seed": seed}
     place = ensemble_at(folder, world, seed)
     hypogoal.train_ensemble(data_at(folder, world, seed), place, quiet=True, resume=True, **made)
@@ -238,7 +239,7 @@ def prepare(folder: Path, worlds: Iterable[str], workers: int) -> None:
             data = data_at(folder, world, seed)
             if not data.exists():
                 hypogoal.collect(world.domain, data, seed=seed if world.domain == "rooms" else 0, quiet=True)
-            ensembles[ensemble_at(folder, world, seed)] = partial(train_ensemble, folder, world, seed)
+            ensembles[ensemble_at(folder, world, seed)] = partial(train_ensemble, folder, name, seed)
             if world.practice is not None:
                 options[options_at(folder, name, layout)] = partial(practise, folder, name, layout, seed)
     for made in (ensembles, options):
