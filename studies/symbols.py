@@ -9,7 +9,7 @@ paths, with planned options and with practised ones; on Figure 6's ten layouts, 
 rooms. Each layout has the D-BAT ensemble of its seed. Constants, those of ``hypogoal/meta/symbols.py`` and those of
 Thompson sampling, are chosen with planned options on layouts 100 to 119 and one ensemble of another seed: the pair with
 the fewest episodes in the mean, where one that never arrives counts as ``LIMIT``. Then ``HALF_LIFE`` is chosen by the
-same rule, with practised options on the first three of these layouts.
+same rule, with practised options on the first ten of these layouts.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ TUNING = {
         WORLDS["planned"], agents=dict.fromkeys(TUNED, TUNING_SEED), choosers=("symbols", "thompson")
     ),
     "tuning-practised": replace(
-        WORLDS["practised"], agents=dict.fromkeys(TUNED[:3], TUNING_SEED), choosers=("symbols-16",)
+        WORLDS["practised"], agents=dict.fromkeys(TUNED[:10], TUNING_SEED), choosers=("symbols-16",)
     ),
 }
 

@@ -161,7 +161,7 @@ def test_an_environment_that_does_not_repeat_itself_is_not_gone_on_with() -> Non
 
 def test_an_engine_that_forgets_too_soon_is_refused() -> None:
     """Before training: 40 decisions of 60 steps look further back than 300 states."""
-    config = TrainMetaConfig.of(option_timeout=60, decisions=40, replay=100, environments=1)
+    config = TrainMetaConfig.of(chooser="ppo", option_timeout=60, decisions=40, replay=100, environments=1)
     with pytest.raises(UserError, match=r"looks back over \d+ states, the engine remembers 300: option_timeout=60"):
         require_memory(engine_of(1, memory=300), config, 2)
     require_memory(engine_of(1, memory=10_000), config, 2)

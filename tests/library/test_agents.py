@@ -177,7 +177,7 @@ def test_options_end_by_the_rule_they_were_trained_with(made: Path) -> None:
         before = [hypogoal.load_ensemble(ensemble, goal).thresholds_as_log_odds() for goal in ("left-end", "right-end")]
         assert (lowered <= np.concatenate(before)).all() and (lowered < np.concatenate(before)).any()
         agent = ["train-meta", ensemble, "--options", str(out), "--out", str(meta), "-q", *play]
-        agent += settings("decisions=16")
+        agent += settings("chooser=ppo", "decisions=16")
         assert main([*agent, *ends, *settings("steps=40", f"termination={__name__}:Falling:1000")]) == 2  # another rule
         run(*agent, *ends, *settings("steps=40"))
         later = load_tensors(meta / "options.safetensors")["thresholds"].numpy()
