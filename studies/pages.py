@@ -24,6 +24,7 @@ from studies import (
     ladder_stops,
     ladders,
     one_room,
+    symbols,
     weight,
     weight_elsewhere,
 )
@@ -44,6 +45,8 @@ TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "options-that-hold": one_room.tables,
     "preference-doorkey": choosing.tables,
     "rooms": choosing.rooms,
+    "symbols": symbols.tables,
+    "symbols-constants": symbols.tables,
     "weight": weight.tables,
     "weight-elsewhere": weight_elsewhere.tables,
 }

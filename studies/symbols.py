@@ -336,8 +336,9 @@ def tables(path: Path) -> Iterator[str]:
 
 
 def _table(rows: list[dict[str, str]]) -> Iterator[str]:
+    order = [*CHOOSERS]
     by_kind: dict[tuple[str, ...], list[dict[str, str]]] = {}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: order.index(row["chooser"])):
         kind = tuple(row[key] for key in KEYS[1:5])
         by_kind.setdefault(kind, []).append(row)
     several = len(by_kind) > len({kind[0] for kind in by_kind})

@@ -173,6 +173,6 @@ def rooms(
         yield Command(f"ensemble/method-{method}-seed-{seed}", words, {"method": method, "seed": seed})
     for method, truth, seed in product(methods, truths, seeds):
         words = f"train-meta @ensemble/method-{method}-seed-{seed} --seed {seed} --layout-seed {seed}"
-        words = f"{words} --set world=truth={truth} --set steps=5000"
+        words = f"{words} --set world=truth={truth} --set steps=1000"
         place = f"agent/method-{method}-truth-{truth}-seed-{seed}"
         yield Command(place, words, {"method": method, "truth": truth, "seed": seed})

@@ -42,7 +42,7 @@ def weights(folder: Path) -> dict[str, bytes]:
 def train(data: Path, folder: Path) -> dict[str, bytes]:
     """A few steps of an ensemble, of its options and of an agent; the weights."""
     ensemble = hypogoal.train_ensemble(data, folder / "ensemble", steps=3, workers=1, members=2, quiet=True)
-    few = {"steps": 64, "environments": 4, "warm_up": 16, "decisions": 8}
+    few = {"chooser": "ppo", "steps": 64, "environments": 4, "warm_up": 16, "decisions": 8}
     hypogoal.train_meta(ensemble, folder / "meta", **few, quiet=True)
     return weights(folder)
 
