@@ -44,7 +44,7 @@ from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
 
 PRIOR = 0.1  # executions that an unknown outcome weighs
 HOPE = 0.2  # the share of these that is rewarded
-HALF_LIFE = 50  # executions of an option
+HALF_LIFE = 200  # executions of an option
 TINY = 1e-300  # no weight, but no division by 0: draws of small weights, and counts that faded, can be 0
 SWEEPS = 100
 CLOSE = 1e-4  # the largest change of a value at which sweeps end
