@@ -296,7 +296,8 @@ def constants_of(chooser: str, name: str) -> list[tuple[str, str, str]]:
     holder = holder_of(chooser)
     if holder is None:
         return [("", "", "")]
-    half_life = str(symbols.HALF_LIFE) if holder is symbols else ""
+    learned = ALL[name].settings.get("network") != "planned" and ALL[name].domain != "rooms"
+    half_life = str(symbols.HALF_LIFE) if holder is symbols and learned else ""  # plans do not change
     if name == "tuning-planned":
         return [(str(prior), str(hope), half_life) for prior, hope in product(PRIORS, HOPES)]
     own = str(holder.PRIOR), str(holder.HOPE)
