@@ -344,7 +344,6 @@ def _table(rows: list[dict[str, str]]) -> Iterator[str]:
         by_kind.setdefault(kind, []).append(row)
     several = len(by_kind) > len({kind[0] for kind in by_kind})
     first = episodes_of(next(iter(by_kind.values())))
-    layouts = list(first)
     shown = []
     for (chooser, *constants), own in by_kind.items():
         numbers = episodes_of(own)
@@ -354,10 +353,9 @@ def _table(rows: list[dict[str, str]]) -> Iterator[str]:
             title = f"{title}: {', '.join(filter(None, constants))}"
         ratios = np.array([numbers[layout] / first[layout] for layout in numbers])
         shares = [_mean(own, quantity) for quantity in QUANTITIES[:-1]]
-        each = [f"{numbers[layout]:.0f}" if layout in numbers else "-" for layout in layouts]
-        shown.append([title, *_summary(values), f"{np.median(ratios):.1f}", *shares, _steps(own), ", ".join(each)])
+        shown.append([title, *_summary(values), f"{np.median(ratios):.1f}", *shares, _steps(own)])
     titles = ["", "arrived", "median", "mean", "most", "ratio, median", "1-10", "11-20", "21-50", "51-100"]
-    yield from table([*titles, "steps, median", "each"], shown)
+    yield from table([*titles, "steps, median"], shown)
 
 
 def _mean(rows: list[dict[str, str]], quantity: str) -> str:
