@@ -88,10 +88,19 @@ WORLDS = {
         "a wrong key ends the episode, planned options", CHOOSING, (*CHOOSERS,), HARSH | PLANNED, 8_000, 80_000
     ),
     "practised": World(
-        "the same, options practised where it does not",
+        "the same, options practised where it does not, which explore no longer",
         CHOOSING,
         ("symbols", "symbols-16", "thompson", "ppo-16"),
         HARSH,
+        16_000,
+        50_000,
+        practice=HARSH,
+    ),
+    "exploring": World(
+        "the same, options that go on exploring",
+        CHOOSING,
+        ("symbols", "symbols-16", "thompson", "ppo-16"),
+        HARSH | {"epsilon_steps": 8_000, "epsilon_final": 0.05},
         16_000,
         50_000,
         practice=HARSH,
@@ -114,7 +123,7 @@ TUNING = {
         WORLDS["planned"], agents=dict.fromkeys(TUNED, TUNING_SEED), choosers=("symbols", "thompson")
     ),
     "tuning-practised": replace(
-        WORLDS["practised"], agents=dict.fromkeys(TUNED[:10], TUNING_SEED), choosers=("symbols-16",)
+        WORLDS["exploring"], agents=dict.fromkeys(TUNED[:10], TUNING_SEED), choosers=("symbols-16",)
     ),
 }
 
@@ -210,6 +219,7 @@ def ensemble_at(folder: Path, world: World, seed: int) -> Path:
 
 def options_at(folder: Path, name: str, layout: int) -> Path:
     """The options that practised on a layout."""
+    name = "practised" if name == "exploring" else name
     return folder / f"options-{name}/layout-{layout}"
 
 
