@@ -46,7 +46,6 @@ TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "preference-doorkey": choosing.tables,
     "rooms": choosing.rooms,
     "symbols": symbols.tables,
-    "symbols-constants": symbols.tables,
     "weight": weight.tables,
     "weight-elsewhere": weight_elsewhere.tables,
 }
