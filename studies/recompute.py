@@ -1,16 +1,11 @@
 """Compute each bold number of the results pages, and README's table and picture, a second way: from the cells alone.
 
-    python -m studies.recompute
-
-It reads the cells with pandas, takes nothing from the package or from other studies, and prints one line for each
-number that is off by more than its last digit. The numbers of a page are in the order in which they stand there.
+It takes nothing from the package or other studies; it prints a line for each number off by more than its last digit.
 """
-
-from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,140 +15,245 @@ from PIL import Image
 from scipy import stats
 
 ROOT = Path(__file__).resolve().parents[1]
-CELLS = ROOT / "docs/results"
-RESAMPLES = 40_000
+# What the pages show, in their order: names of what ``recomputed`` returns, and numbers that are no results.
+SHOWN = {
+    "hypotheses": """dbat control pairing green-behind red 0.5 accuracy attention attention-none attention-apart
+        ladders-cnn ladders-dbat-unpaired won-ladders-dbat-unpaired ladders-none won-ladders-none mean-behind""",
+    "options": """stop-none stop-cnn stop-true 1 100 at-base 15 ends 8 each-ladder picked 0.7 picked-apart
+        planned-apart""",
+    "agents": """95 ppo dqn later paid prefer-planned 32 0.5 prefer-learned planned-agent-dbat planned-uniform-dbat
+        0.02 learned-agent-dbat learned-agent-one 70100 one-layout 200 100 many many-uniform solvable many-harsh
+        many-harsh-uniform""",
+    "rooms": """both-dbat both-none both-one shape-lead won-shape-lead place-behind auto-shape auto-place gain-unpaired
+        won-gain-unpaired""",
+    "index": """accuracy-apart won-accuracy-apart pairing won-pairing attention-apart everywhere won-everywhere
+        ladders-dbat-unpaired won-ladders-dbat-unpaired owned-auto owned-none stop-none stop-cnn 10 10 ppo 10 10 10 dqn
+        10 later gain-none gain-one prefer-planned prefer-learned picked picked-none many many-uniform many-harsh
+        many-harsh-uniform joint-shape joint-place""",
+    "README": """auto-shape none-shape one-shape planned-agent-dbat planned-agent-none planned-agent-one
+        learned-agent-dbat learned-agent-none learned-agent-one learned-uniform-dbat learned-uniform-none
+        learned-uniform-one""",
+}
+# The first number of each, the mean, is in README's picture.
+PICTURE = (
+    "auto-shape none-shape one-shape learned-agent-dbat learned-uniform-dbat learned-agent-one learned-uniform-one"
+)
+LADDERS = "1L 1M 1R 2-6 3-9 14-22 0-4 5-11 7-13 4-10 11-19 13-21"
 BOLD = re.compile(r"\*\*(.+?)\*\*", re.DOTALL)
-NO_NUMBER = re.compile(r"`[^`]*`|\]\([^)]*\)|\b\d+-\d+\b")  # code, links, ladders
+NO_NUMBER = re.compile(r"`[^`]*`|\]\([^)]*\)|\b\d+-\d+\b|\*\*")  # code, links, ladders
 NUMBER = re.compile(r"(?<![\w.-])-?(?:\d[\d,]*(?:\.\d+)?|\.\d+)|never(?=\])")
-ELSEWHERE = "## How many episodes choosing takes"  # this section's numbers are counts of its table
-Found = list[float]
+COUNTED = re.compile(r"## How many episodes choosing takes.*?\n(?=## )", re.DOTALL)  # counts of the table below it
+METHODS = {"auto": "auto", "none": "no diversity", "one": "one classifier", "unpaired": "auto, unpaired"}
 
 
-def score(values: Any) -> Found:
-    """The mean and the bootstrap's interval of Student's t."""
+Found = dict[str, Any]
+
+
+def score(values: Any) -> list[float]:
+    """The mean, and the bootstrap's interval of Student's t by the published resamples."""
     numbers = np.asarray(values, float)
-    n, mean, error = len(numbers), numbers.mean(), stats.sem(numbers)
-    drawn = np.random.default_rng(1).choice(numbers, (RESAMPLES, n))
-    errors = stats.sem(drawn, axis=1)
-    ratios = ((drawn.mean(axis=1) - mean) / np.where(errors > 1e-9, errors, np.nan)) * error
+    drawn = numbers[np.random.default_rng(0).integers(len(numbers), size=(20_000, len(numbers)))]
+    ratios = (drawn.mean(axis=1) - numbers.mean()) / np.where(
+        np.ptp(drawn, axis=1) > 0, stats.sem(drawn, axis=1), np.nan
+    )
     low, high = np.nanpercentile(ratios, [2.5, 97.5])
-    return [mean, mean - high, mean - low]
+    return [numbers.mean(), numbers.mean() - high * stats.sem(numbers), numbers.mean() - low * stats.sem(numbers)]
 
 
-def share(values: Any) -> Found:
+def share(values: Any) -> list[float]:
     """The mean and Gaffke's bounds, by the gaps between sorted even numbers."""
     numbers = np.sort(np.asarray(values, float))
-    even = np.sort(np.random.default_rng(1).random((RESAMPLES, len(numbers))), axis=1)
+    even = np.sort(np.random.default_rng(1).random((100_000, len(numbers))), axis=1)
     gaps = np.diff(even, axis=1, prepend=0, append=1)
     low = np.percentile(gaps[:, 1:] @ numbers, 2.5)
-    high = np.percentile(gaps @ np.append(numbers, 1), 97.5)
-    return [numbers.mean(), low, high]
+    return [numbers.mean(), low, np.percentile(gaps @ np.append(numbers, 1), 97.5)]
 
 
-def median(values: Any) -> Found:
+def median(values: Any) -> list[float]:
     """The median, and the two values between which it lies in 95 of 100 cases."""
     numbers = sorted(values)
-    n = len(numbers)
-    cut = max(k for k in range(n // 2) if k == 0 or stats.binom.cdf(k - 1, n, 0.5) < 0.025)
-    return [float(np.median(numbers)), numbers[cut - 1], numbers[n - cut]]
+    cut = max(k for k in range(len(numbers) // 2) if stats.binom.cdf(k - 1, len(numbers), 0.5) < 0.025)
+    return [float(np.median(numbers)), numbers[cut - 1], numbers[-cut]]
 
 
-def spread(values: Any) -> Found:
+def spread(values: Any) -> list[float]:
     """The mean, the lowest and the highest."""
-    numbers = np.asarray(values, float)
-    return [numbers.mean(), numbers.min(), numbers.max()]
+    return [np.mean(values), np.min(values), np.max(values)]
 
 
-def cells(name: str) -> pd.DataFrame:
-    """The rows of a CSV."""
-    return pd.read_csv(CELLS / f"{name}.csv")
+def won(apart: Any) -> list[float]:
+    """Of how many units a difference is above 0, and how many there are."""
+    return [(np.asarray(apart, float) > 1e-9).sum(), len(apart)]
 
 
-def by_unit(rows: pd.DataFrame, unit: str, value: str = "value", method: str = "method") -> pd.DataFrame:
-    """A row for each seed or layout, a column for each method."""
-    return rows.pivot(index=unit, columns=method, values=value)
+def compare(found: Found, name: str, apart: Any, bounds: Any = score) -> None:
+    """Keep what pairs say: a middle with its interval, and the count of those above 0."""
+    found[name], found[f"won-{name}"] = bounds(apart), won(apart)
 
 
-def crossed(members: pd.DataFrame, name: str, pick: str) -> float:
-    """The mean over both halves of the member that is best on the other half."""
-    on_second = members[f"{name}_second"].iloc[members[f"{pick}_first"].argmax()]
-    on_first = members[f"{name}_first"].iloc[members[f"{pick}_second"].argmax()]
-    return float(on_first + on_second) / 2
-
-
-def doorkey() -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rankings and accuracies of the cross-fitted member, a row for each seed and sub-goal."""
-    rows = cells("hypotheses-doorkey")
-    lengths = {"dbat": 150, "none": 300, "dbat-unpaired": 100, "cnn": 300}
-    rows = rows[(rows["layouts"] == "test") & (rows["step"] == rows["method"].map(lengths))]
-    grouped = rows.groupby(["method", "seed", "sub_goal"])
-    rankings = grouped.apply(crossed, "ranking", "ranking")
-    accuracies = grouped.apply(crossed, "balanced_accuracy", "balanced_accuracy")
-    return rankings.unstack("method"), accuracies.unstack("method")
-
-
-def ladders() -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """From one group, by seed: the picked member's ranking, the mean member's, the best accuracy in all rooms."""
-    rows = cells("figure3-ladders")
-    rows = rows[rows["groups"] == 1]
-    picked, mean, best = {}, {}, {}
-    for method, own in rows.groupby("method"):
-        at = {half: _length(own, half) for half in ("first", "second")}
-        for seed, looks in own.groupby("seed"):
-            scores, means, accuracies = [], [], []
-            for pick, judge in (("first", "second"), ("second", "first")):
-                members = looks[looks["step"] == at[pick]]
-                scores.append(members[f"ranking_{judge}"].iloc[members[f"ranking_{pick}"].argmax()])
-                means.append(members[f"ranking_{judge}"].mean())
-                accuracies.append(members["balanced_accuracy_all"].max())
-            place = (seed, method)
-            picked[place], mean[place], best[place] = np.mean(scores), np.mean(means), np.mean(accuracies)
-    by_seed = [pd.Series(numbers).unstack() for numbers in (picked, mean, best)]
-    return by_seed[0], by_seed[1], by_seed[2]
-
-
-def _length(own: pd.DataFrame, half: str) -> Any:
-    of_seeds = own.groupby(["step", "seed"])[f"ranking_{half}"].max()
-    return of_seeds.groupby("step").mean().idxmax()
-
-
-def nearer(measure: str) -> pd.DataFrame:
-    """How much farther others stop than D-BAT, from one group, by ensemble: the best member, mean over ladders."""
-    rows = cells("figure4-ladders")
-    new = ("2-6", "3-9", "14-22", "0-4", "5-11", "7-13")
-    rows = rows[(rows["groups"] == 1) & rows["ladder"].isin(new)].dropna(subset=[measure])
-    best = rows.groupby(["seed", "ladder", "method"])[measure].min().unstack()
-    means = best.groupby("seed").mean()
-    return means.rsub(means["dbat"], axis=0) * -1
-
-
-def zero_shot(method: str) -> pd.Series:
-    """By seed the share within twice the shortest path on new layouts, of the member that is best where it learned."""
-    rows = cells("distilled")
-    rows = rows[(rows["method"] == method) & (rows["step"] == 1)]
-    shares = rows.pivot(index=["seed", "sub_goal", "member"], columns="layouts", values="within_2")
-    best = shares.groupby(["seed", "sub_goal"])["trained"].idxmax()
-    return shares.loc[best, "new"].groupby("seed").mean()
+def cells(name: str, **wanted: Any) -> pd.DataFrame:
+    """The rows of a CSV that have these values."""
+    rows = pd.read_csv(ROOT / f"docs/results/{name}.csv")
+    return rows[np.logical_and.reduce([rows[key] == value for key, value in wanted.items()] or [rows.index >= 0])]
 
 
 def played(name: str, chooser: str = "agent", quantity: str = "success", **wanted: str) -> pd.DataFrame:
-    """A number of agents, a row for each layout."""
-    rows = cells(name)
-    rows = rows[(rows["chooser"] == chooser) & (rows["quantity"] == quantity)]
-    for column, value in wanted.items():
-        rows = rows[rows[column] == value]
-    return by_unit(rows, "layout")
+    """A number of agents: a row for each layout, a column for each method."""
+    rows = cells(name, chooser=chooser, quantity=quantity, **wanted)
+    return rows.pivot(index="layout", columns="method", values="value")
 
 
-def in_rooms(truth: str) -> pd.DataFrame:
-    """What agents solve in the four runs, a row for each of forty seeds."""
-    runs = [played(f"rooms{run}") for run in ("-joint", "", "-second", "-first")]
-    both = pd.concat(runs, keys=range(len(runs)))
-    of_truth = both.filter(like=truth)
-    return of_truth.rename(columns=lambda name: name.removesuffix(f"-truth-{truth}"))
+def crossed(members: pd.DataFrame, name: str) -> float:
+    """The mean over both halves of the member that is best on the other."""
+    on_second = members[f"{name}_second"].iloc[members[f"{name}_first"].argmax()]
+    return (on_second + members[f"{name}_first"].iloc[members[f"{name}_second"].argmax()]) / 2
 
 
-def within_2(world: str, column: str = "within_2") -> pd.Series:
-    """Of agents over distilled options, by seed."""
-    rows = cells("distilled-agents")
-    return rows[(rows["world"] == world) & (rows["options"] == "distilled")][column].dropna()
+def of_hypotheses(found: Found) -> None:
+    """What members know."""
+    lengths = {"dbat": 150, "none": 300, "dbat-unpaired": 100, "cnn": 300}
+    rows = cells("hypotheses-doorkey", layouts="test")
+    of_goal = rows[rows["step"] == rows["method"].map(lengths)].groupby(["method", "sub_goal", "seed"])
+    ranking = of_goal.apply(crossed, "ranking").unstack()
+    accuracy = of_goal.apply(crossed, "balanced_accuracy").groupby(["method", "seed"]).mean()
+    apart = ranking.loc["dbat"] - ranking.loc["dbat-unpaired"]
+    found["dbat"], found["control"] = ranking.loc["dbat"].mean().mean(), ranking.loc["dbat-unpaired"].mean().mean()
+    compare(found, "pairing", apart.mean())
+    found["green-behind"] = np.abs(score(apart.loc["collect-green-key"]))[[0, 2, 1]]
+    found["red"] = score(apart.loc["collect-red-key"])
+    found["accuracy"] = accuracy["dbat"].mean()
+    compare(found, "accuracy-apart", accuracy["dbat"] - accuracy["cnn"])
+    common = cells("figure2-ladders", step=300).groupby(["method", "seed"])["common"].mean()
+    found["attention"], found["attention-none"] = common["dbat"].mean(), common["none"].mean()
+    compare(found, "attention-apart", common["dbat"] - common["none"])
+    ladders: dict[str, list[Any]] = {}
+    for method, looks in cells("figure3-ladders", groups=1).groupby("method"):
+        halves = []
+        for pick, judge in (("first", "second"), ("second", "first")):
+            best = looks.groupby(["step", "seed"])[f"ranking_{pick}"].max().groupby("step").mean()
+            own = looks[looks["step"] == best.idxmax()]
+            picked = own.loc[own.groupby("seed")[f"ranking_{pick}"].idxmax()].set_index("seed")[f"ranking_{judge}"]
+            of_seed = own.groupby("seed")
+            halves.append([picked, of_seed[f"ranking_{judge}"].mean(), of_seed["balanced_accuracy_all"].max()])
+        ladders[method] = [(first + second) / 2 for first, second in zip(*halves, strict=True)]
+    for other in ("cnn", "dbat-unpaired", "none"):
+        compare(found, f"ladders-{other}", ladders["dbat"][0] - ladders[other][0])
+    compare(found, "mean-behind", ladders["dbat-unpaired"][1] - ladders["dbat"][1])
+    compare(found, "everywhere", ladders["dbat"][2] - ladders["cnn"][2])
+
+
+def of_options(found: Found) -> None:
+    """Where options stop."""
+    rows = cells("figure4-ladders", groups=1)
+    new = rows[rows["ladder"].isin(["2-6", "3-9", "14-22", "0-4", "5-11", "7-13"])]
+    best = new.groupby(["method", "seed", "ladder"])[["distance", "stop_distance"]].min()
+    stops = best.groupby(["method", "seed"]).mean()
+    apart = {other: stops.loc[other] - stops.loc["dbat"] for other in ("none", "cnn")}
+    found["stop-none"], found["stop-cnn"] = spread(apart["none"]["distance"]), spread(apart["cnn"]["distance"])
+    found["stop-true"] = apart["none"]["stop_distance"].mean()
+    found["at-base"] = cells("figure5-ladders", fate=2, method="none").groupby("seed")["count"].sum().max()
+    means = cells("options-that-hold").groupby(["method", "seed", "ladder"], sort=False)["distance"].mean()
+    ends = means["holds-dbat"].unstack().drop(columns=["0-4", "5-11", "7-13"])
+    found["ends"] = spread(ends.dropna().mean(axis=1))
+    table = means.groupby(["ladder", "method"], sort=False).mean().unstack()
+    found["each-ladder"] = np.ravel(table.loc[LADDERS.split(), ["holds-dbat", "holds-none", "oracle"]])
+    picked = {}
+    for method in ("dbat", "none", "planned", "none-planned"):
+        own = cells("distilled", method=method, step=1)
+        shares = own.pivot(index=["seed", "sub_goal", "member"], columns="layouts", values="within_2")
+        at_best = shares.groupby(["seed", "sub_goal"])["trained"].idxmax()
+        picked[method] = shares.loc[at_best, "new"].groupby("seed").mean()
+    found["picked"], found["picked-none"] = score(picked["dbat"]), score(picked["none"])
+    found["picked-apart"] = score(picked["dbat"] - picked["none"])
+    found["planned-apart"] = score(picked["planned"] - picked["none-planned"])
+
+
+def of_agents(found: Found) -> None:
+    """What agents solve on DoorKey."""
+    steps = played("figure6-doorkey", quantity="steps_to_95")
+    for name, method in {"ppo": "ppo-tuned", "dqn": "dqn-tuned", "paid": "ppo-bonus"}.items():
+        found[name] = np.isfinite(steps[method]).sum()
+    found["later"] = median(steps["dqn-tuned"] / steps["dbat-k3"])
+    for policy in ("planned", "learned"):
+        better = played("preference-doorkey", quantity="pair", policy=policy)["dbat-k3"]
+        found[f"prefer-{policy}"] = share(better.dropna())
+        for chooser in ("agent", "uniform"):
+            solved = played("choosing-doorkey", chooser, policy=policy)
+            for method in ("dbat", "none", "one"):
+                found[f"{policy}-{chooser}-{method}"] = share(solved[method])
+    found["one-layout"] = played("choosing-doorkey", policy="learned").loc[70100, ["dbat", "one"]]
+    for world in ("many", "many-harsh"):
+        rows = cells("distilled-agents", world=world, options="distilled")
+        found[world], found[f"{world}-uniform"] = spread(rows["within_2"]), rows["within_2_uniform"].mean()
+        found["solvable"] = rows["solvable"].max()
+
+
+def of_rooms(found: Found) -> None:
+    """What agents solve in rooms."""
+    runs = pd.concat([played(f"rooms{run}") for run in ("-joint", "", "-second", "-first")])
+    for method in ("dbat", "none", "one"):
+        found[f"both-{method}"] = share((runs[f"{method}-truth-shape"] + runs[f"{method}-truth-place"]) / 2)
+    lead = runs["dbat-truth-shape"] - runs["none-truth-shape"]
+    compare(found, "shape-lead", lead, np.mean)
+    found["place-behind"] = (runs["none-truth-place"] - runs["dbat-truth-place"]).mean()
+    for truth in ("shape", "place"):
+        joint = played("rooms-joint")
+        found[f"joint-{truth}"] = median(joint[f"joint-truth-{truth}"] - joint[f"dbat-truth-{truth}"])
+    weight = cells("weight").pivot(index="seed", columns="method")
+    owned = (weight["owned_shape"] >= 0.9) & (weight["owned_place"] >= 0.9)
+    solved = (weight["solved_shape"] + weight["solved_place"]) / 2
+    found["auto-place"] = share(weight["solved_place"]["auto"])
+    for name, method in METHODS.items():
+        found[f"owned-{name}"] = won(owned[method])
+        compare(found, f"gain-{name}", solved["auto"] - solved[method], median)
+        found[f"{name}-shape"] = share(weight["solved_shape"][method])
+
+
+def numbers_in(text: str) -> list[str]:
+    """The numbers in a text, without code and addresses."""
+    return NUMBER.findall(NO_NUMBER.sub(" ", text))
+
+
+def shown_in(root: Path, where: str) -> list[str]:
+    """The numbers of README's table, or those in bold on a page."""
+    if where == "README":
+        rows = re.findall(r"^\| [^|]*\|(.*)$", (root / "README.md").read_text("utf-8"), re.MULTILINE)
+        return numbers_in(" ".join(rows))
+    page = COUNTED.sub("", (root / f"docs/results/{where}.md").read_text("utf-8"))
+    return numbers_in(" ; ".join(BOLD.findall(page)))
+
+
+def recomputed() -> Found:
+    """All numbers, by name."""
+    found: Found = {}
+    for part in (of_hypotheses, of_options, of_agents, of_rooms):
+        part(found)
+    return found
+
+
+def differences(where: str, shown: list[str], known: list[tuple[str, float]]) -> Iterator[str]:
+    """A line for each number that is off by more than its last digit."""
+    if len(shown) != len(known):
+        yield f"{where}: {len(shown)} numbers are shown, {len(known)} are recomputed"
+    for text, (name, value) in zip(shown, known, strict=False):
+        digit = 10.0 ** -len(text.partition(".")[2])
+        number = np.inf if text == "never" else float(text.replace(",", ""))
+        if number != value and not abs(number - value) <= 1.001 * digit:
+            yield f"{where}, {name}: {text} is shown, {value:.5g} is recomputed"
+
+
+def all_differences(root: Path = ROOT) -> Iterator[str]:
+    """The differences on the pages, README and its picture, under a folder."""
+    found = recomputed()
+    for where, names in SHOWN.items():
+        known = [(name, float(value)) for name in names.split() for value in np.ravel(found.get(name, name))]
+        yield from differences(where, shown_in(root, where), [pair for pair in known if pair[1] == pair[1]])
+    with Image.open(root / "docs/results.png") as picture:
+        means = [(name, found[name][0]) for name in PICTURE.split()]
+        yield from differences("README's picture", str(picture.info["Description"]).split(), means)
+
+
+if __name__ == "__main__":
+    lines = [*all_differences()]
+    print("\n".join(lines) or "No number is off by more than its last digit.")
+    sys.exit(bool(lines))
