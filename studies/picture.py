@@ -71,7 +71,7 @@ def main() -> None:
         ],
     )
     right.set_title("A wrong key ends the episode:\nchoosing decides; the ensemble is undecided", fontsize=10)
-    shown = [values for values in (*rooms.values(), *(values for _, _, values in pairs))]
+    shown = [*rooms.values(), *(values for _, _, values in pairs)]
     means = " ".join(f"{np.mean(values):.2f}" for values in shown)
     figure.savefig(parser.parse_args().out, dpi=150, metadata={"Description": means})
 

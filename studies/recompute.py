@@ -1,6 +1,7 @@
 """Compute each bold number of the results pages, and README's table and picture, a second way: from the cells alone.
 
-It takes nothing from the package or other studies; it prints a line for each number off by more than its last digit.
+It takes nothing from the package or other studies; it exits with a line for each number off by more than its last digit.
+``recomputed.csv`` has what a page shows, in its order: names of numbers below, and numbers that are no results.
 """
 
 import re
@@ -15,37 +16,13 @@ from PIL import Image
 from scipy import stats
 
 ROOT = Path(__file__).resolve().parents[1]
-# What the pages show, in their order: names of what ``recomputed`` returns, and numbers that are no results.
-SHOWN = {
-    "hypotheses": """dbat control pairing green-behind red 0.5 accuracy attention attention-none attention-apart
-        ladders-cnn ladders-dbat-unpaired won-ladders-dbat-unpaired ladders-none won-ladders-none mean-behind""",
-    "options": """stop-none stop-cnn stop-true 1 100 at-base 15 ends 8 each-ladder picked 0.7 picked-apart
-        planned-apart""",
-    "agents": """95 ppo dqn later paid prefer-planned 32 0.5 prefer-learned planned-agent-dbat planned-uniform-dbat
-        0.02 learned-agent-dbat learned-agent-one 70100 one-layout 200 100 many many-uniform solvable many-harsh
-        many-harsh-uniform""",
-    "rooms": """both-dbat both-none both-one shape-lead won-shape-lead place-behind auto-shape auto-place gain-unpaired
-        won-gain-unpaired""",
-    "index": """accuracy-apart won-accuracy-apart pairing won-pairing attention-apart everywhere won-everywhere
-        ladders-dbat-unpaired won-ladders-dbat-unpaired owned-auto owned-none stop-none stop-cnn 10 10 ppo 10 10 10 dqn
-        10 later gain-none gain-one prefer-planned prefer-learned picked picked-none many many-uniform many-harsh
-        many-harsh-uniform joint-shape joint-place""",
-    "README": """auto-shape none-shape one-shape planned-agent-dbat planned-agent-none planned-agent-one
-        learned-agent-dbat learned-agent-none learned-agent-one learned-uniform-dbat learned-uniform-none
-        learned-uniform-one""",
-}
-# The first number of each, the mean, is in README's picture.
-PICTURE = (
-    "auto-shape none-shape one-shape learned-agent-dbat learned-uniform-dbat learned-agent-one learned-uniform-one"
-)
-LADDERS = "1L 1M 1R 2-6 3-9 14-22 0-4 5-11 7-13 4-10 11-19 13-21"
 BOLD = re.compile(r"\*\*(.+?)\*\*", re.DOTALL)
+ROW = re.compile(r"^\| [^|]*\|(.*)$", re.MULTILINE)
 NO_NUMBER = re.compile(r"`[^`]*`|\]\([^)]*\)|\b\d+-\d+\b|\*\*")  # code, links, ladders
 NUMBER = re.compile(r"(?<![\w.-])-?(?:\d[\d,]*(?:\.\d+)?|\.\d+)|never(?=\])")
 COUNTED = re.compile(r"## How many episodes choosing takes.*?\n(?=## )", re.DOTALL)  # counts of the table below it
+ENDS = ["mean", "min", "max"]
 METHODS = {"auto": "auto", "none": "no diversity", "one": "one classifier", "unpaired": "auto, unpaired"}
-
-
 Found = dict[str, Any]
 
 
@@ -53,10 +30,8 @@ def score(values: Any) -> list[float]:
     """The mean, and the bootstrap's interval of Student's t by the published resamples."""
     numbers = np.asarray(values, float)
     drawn = numbers[np.random.default_rng(0).integers(len(numbers), size=(20_000, len(numbers)))]
-    ratios = (drawn.mean(axis=1) - numbers.mean()) / np.where(
-        np.ptp(drawn, axis=1) > 0, stats.sem(drawn, axis=1), np.nan
-    )
-    low, high = np.nanpercentile(ratios, [2.5, 97.5])
+    differ = drawn[np.ptp(drawn, axis=1) > 0]
+    low, high = np.percentile((differ.mean(axis=1) - numbers.mean()) / stats.sem(differ, axis=1), [2.5, 97.5])
     return [numbers.mean(), numbers.mean() - high * stats.sem(numbers), numbers.mean() - low * stats.sem(numbers)]
 
 
@@ -65,8 +40,8 @@ def share(values: Any) -> list[float]:
     numbers = np.sort(np.asarray(values, float))
     even = np.sort(np.random.default_rng(1).random((100_000, len(numbers))), axis=1)
     gaps = np.diff(even, axis=1, prepend=0, append=1)
-    low = np.percentile(gaps[:, 1:] @ numbers, 2.5)
-    return [numbers.mean(), low, np.percentile(gaps @ np.append(numbers, 1), 97.5)]
+    low, high = gaps[:, 1:] @ numbers, gaps @ np.append(numbers, 1)
+    return [numbers.mean(), np.percentile(low, 2.5), np.percentile(high, 97.5)]
 
 
 def median(values: Any) -> list[float]:
@@ -76,19 +51,9 @@ def median(values: Any) -> list[float]:
     return [float(np.median(numbers)), numbers[cut - 1], numbers[-cut]]
 
 
-def spread(values: Any) -> list[float]:
-    """The mean, the lowest and the highest."""
-    return [np.mean(values), np.min(values), np.max(values)]
-
-
-def won(apart: Any) -> list[float]:
-    """Of how many units a difference is above 0, and how many there are."""
-    return [(np.asarray(apart, float) > 1e-9).sum(), len(apart)]
-
-
 def compare(found: Found, name: str, apart: Any, bounds: Any = score) -> None:
     """Keep what pairs say: a middle with its interval, and the count of those above 0."""
-    found[name], found[f"won-{name}"] = bounds(apart), won(apart)
+    found[name], found[f"won-{name}"] = bounds(apart), [(apart > 1e-9).sum(), len(apart)]
 
 
 def cells(name: str, **wanted: Any) -> pd.DataFrame:
@@ -111,9 +76,7 @@ def crossed(members: pd.DataFrame, name: str) -> float:
 
 def of_hypotheses(found: Found) -> None:
     """What members know."""
-    lengths = {"dbat": 150, "none": 300, "dbat-unpaired": 100, "cnn": 300}
-    rows = cells("hypotheses-doorkey", layouts="test")
-    of_goal = rows[rows["step"] == rows["method"].map(lengths)].groupby(["method", "sub_goal", "seed"])
+    of_goal = cells("hypotheses-doorkey", layouts="test").groupby(["method", "sub_goal", "seed"])
     ranking = of_goal.apply(crossed, "ranking").unstack()
     accuracy = of_goal.apply(crossed, "balanced_accuracy").groupby(["method", "seed"]).mean()
     apart = ranking.loc["dbat"] - ranking.loc["dbat-unpaired"]
@@ -148,15 +111,15 @@ def of_options(found: Found) -> None:
     new = rows[rows["ladder"].isin(["2-6", "3-9", "14-22", "0-4", "5-11", "7-13"])]
     best = new.groupby(["method", "seed", "ladder"])[["distance", "stop_distance"]].min()
     stops = best.groupby(["method", "seed"]).mean()
-    apart = {other: stops.loc[other] - stops.loc["dbat"] for other in ("none", "cnn")}
-    found["stop-none"], found["stop-cnn"] = spread(apart["none"]["distance"]), spread(apart["cnn"]["distance"])
-    found["stop-true"] = apart["none"]["stop_distance"].mean()
+    for other in ("none", "cnn"):
+        apart = stops.loc[other] - stops.loc["dbat"]
+        found[f"stop-{other}"], found[f"true-{other}"] = apart["distance"].agg(ENDS), apart["stop_distance"].mean()
     found["at-base"] = cells("figure5-ladders", fate=2, method="none").groupby("seed")["count"].sum().max()
     means = cells("options-that-hold").groupby(["method", "seed", "ladder"], sort=False)["distance"].mean()
-    ends = means["holds-dbat"].unstack().drop(columns=["0-4", "5-11", "7-13"])
-    found["ends"] = spread(ends.dropna().mean(axis=1))
-    table = means.groupby(["ladder", "method"], sort=False).mean().unstack()
-    found["each-ladder"] = np.ravel(table.loc[LADDERS.split(), ["holds-dbat", "holds-none", "oracle"]])
+    found["ends"] = means["holds-dbat"].unstack().drop(columns=["0-4", "5-11", "7-13"]).dropna().mean(axis=1).agg(ENDS)
+    in_order = means.groupby(["ladder", "method"]).mean().unstack()[["holds-dbat", "holds-none", "oracle"]]
+    table = in_order.loc["1L 1M 1R 2-6 3-9 14-22 0-4 5-11 7-13 4-10 11-19 13-21".split()]  # noqa: SIM905
+    found["each-ladder"] = table.stack().dropna()
     picked = {}
     for method in ("dbat", "none", "planned", "none-planned"):
         own = cells("distilled", method=method, step=1)
@@ -164,27 +127,26 @@ def of_options(found: Found) -> None:
         at_best = shares.groupby(["seed", "sub_goal"])["trained"].idxmax()
         picked[method] = shares.loc[at_best, "new"].groupby("seed").mean()
     found["picked"], found["picked-none"] = score(picked["dbat"]), score(picked["none"])
-    found["picked-apart"] = score(picked["dbat"] - picked["none"])
-    found["planned-apart"] = score(picked["planned"] - picked["none-planned"])
+    for name, other in (("dbat", "none"), ("planned", "none-planned")):
+        found[f"{name}-picked-apart"] = score(picked[name] - picked[other])
 
 
 def of_agents(found: Found) -> None:
     """What agents solve on DoorKey."""
     steps = played("figure6-doorkey", quantity="steps_to_95")
-    for name, method in {"ppo": "ppo-tuned", "dqn": "dqn-tuned", "paid": "ppo-bonus"}.items():
-        found[name] = np.isfinite(steps[method]).sum()
+    found |= np.isfinite(steps).sum().to_dict()
     found["later"] = median(steps["dqn-tuned"] / steps["dbat-k3"])
     for policy in ("planned", "learned"):
-        better = played("preference-doorkey", quantity="pair", policy=policy)["dbat-k3"]
-        found[f"prefer-{policy}"] = share(better.dropna())
+        found[f"prefer-{policy}"] = share(
+            played("preference-doorkey", quantity="pair", policy=policy)["dbat-k3"].dropna()
+        )
         for chooser in ("agent", "uniform"):
             solved = played("choosing-doorkey", chooser, policy=policy)
-            for method in ("dbat", "none", "one"):
-                found[f"{policy}-{chooser}-{method}"] = share(solved[method])
+            found |= {f"{policy}-{chooser}-{method}": share(solved[method]) for method in ("dbat", "none", "one")}
     found["one-layout"] = played("choosing-doorkey", policy="learned").loc[70100, ["dbat", "one"]]
     for world in ("many", "many-harsh"):
         rows = cells("distilled-agents", world=world, options="distilled")
-        found[world], found[f"{world}-uniform"] = spread(rows["within_2"]), rows["within_2_uniform"].mean()
+        found[world], found[f"{world}-uniform"] = rows["within_2"].agg(ENDS), rows["within_2_uniform"].mean()
         found["solvable"] = rows["solvable"].max()
 
 
@@ -193,8 +155,7 @@ def of_rooms(found: Found) -> None:
     runs = pd.concat([played(f"rooms{run}") for run in ("-joint", "", "-second", "-first")])
     for method in ("dbat", "none", "one"):
         found[f"both-{method}"] = share((runs[f"{method}-truth-shape"] + runs[f"{method}-truth-place"]) / 2)
-    lead = runs["dbat-truth-shape"] - runs["none-truth-shape"]
-    compare(found, "shape-lead", lead, np.mean)
+    compare(found, "shape-lead", runs["dbat-truth-shape"] - runs["none-truth-shape"], np.mean)
     found["place-behind"] = (runs["none-truth-place"] - runs["dbat-truth-place"]).mean()
     for truth in ("shape", "place"):
         joint = played("rooms-joint")
@@ -204,56 +165,36 @@ def of_rooms(found: Found) -> None:
     solved = (weight["solved_shape"] + weight["solved_place"]) / 2
     found["auto-place"] = share(weight["solved_place"]["auto"])
     for name, method in METHODS.items():
-        found[f"owned-{name}"] = won(owned[method])
+        compare(found, f"owned-{name}", owned[method].astype(int), np.mean)
         compare(found, f"gain-{name}", solved["auto"] - solved[method], median)
         found[f"{name}-shape"] = share(weight["solved_shape"][method])
 
 
-def numbers_in(text: str) -> list[str]:
-    """The numbers in a text, without code and addresses."""
-    return NUMBER.findall(NO_NUMBER.sub(" ", text))
-
-
 def shown_in(root: Path, where: str) -> list[str]:
-    """The numbers of README's table, or those in bold on a page."""
-    if where == "README":
-        rows = re.findall(r"^\| [^|]*\|(.*)$", (root / "README.md").read_text("utf-8"), re.MULTILINE)
-        return numbers_in(" ".join(rows))
-    page = COUNTED.sub("", (root / f"docs/results/{where}.md").read_text("utf-8"))
-    return numbers_in(" ; ".join(BOLD.findall(page)))
+    """The numbers of README's table and picture, or those in bold on a page, without code and addresses."""
+    path = root / ("README.md" if where == "README" else f"docs/results/{where}.md")
+    page = COUNTED.sub("", path.read_text("utf-8"))
+    parts = ROW.findall(page) if where == "README" else BOLD.findall(page)
+    shown = NUMBER.findall(NO_NUMBER.sub(" ", " ; ".join(parts)))
+    return shown + (Image.open(root / "docs/results.png").text["Description"].split() if where == "README" else [])
 
 
-def recomputed() -> Found:
-    """All numbers, by name."""
+def differences(root: Path = ROOT) -> Iterator[str]:
+    """A line for each number under a folder that is off by more than its last digit."""
     found: Found = {}
     for part in (of_hypotheses, of_options, of_agents, of_rooms):
         part(found)
-    return found
-
-
-def differences(where: str, shown: list[str], known: list[tuple[str, float]]) -> Iterator[str]:
-    """A line for each number that is off by more than its last digit."""
-    if len(shown) != len(known):
-        yield f"{where}: {len(shown)} numbers are shown, {len(known)} are recomputed"
-    for text, (name, value) in zip(shown, known, strict=False):
-        digit = 10.0 ** -len(text.partition(".")[2])
-        number = np.inf if text == "never" else float(text.replace(",", ""))
-        if number != value and not abs(number - value) <= 1.001 * digit:
-            yield f"{where}, {name}: {text} is shown, {value:.5g} is recomputed"
-
-
-def all_differences(root: Path = ROOT) -> Iterator[str]:
-    """The differences on the pages, README and its picture, under a folder."""
-    found = recomputed()
-    for where, names in SHOWN.items():
+    found |= {f"mean-{name}": np.ravel(value)[0] for name, value in found.items()}
+    for where, names in cells("recomputed").to_numpy():
+        shown = shown_in(root, where)
         known = [(name, float(value)) for name in names.split() for value in np.ravel(found.get(name, name))]
-        yield from differences(where, shown_in(root, where), [pair for pair in known if pair[1] == pair[1]])
-    with Image.open(root / "docs/results.png") as picture:
-        means = [(name, found[name][0]) for name in PICTURE.split()]
-        yield from differences("README's picture", str(picture.info["Description"]).split(), means)
+        if len(shown) != len(known):
+            yield f"{where}: {len(shown)} numbers are shown, {len(known)} are recomputed"
+        for text, (name, value) in zip(shown, known, strict=False):
+            number = np.inf if text == "never" else float(text.replace(",", ""))
+            if number != value and not abs(number - value) <= 1.001 * 10.0 ** -len(text.partition(".")[2]):
+                yield f"{where}, {name}: {text} is shown, {value:.5g} is recomputed"
 
 
 if __name__ == "__main__":
-    lines = [*all_differences()]
-    print("\n".join(lines) or "No number is off by more than its last digit.")
-    sys.exit(bool(lines))
+    sys.exit("\n".join(differences()) or None)
