@@ -1,6 +1,6 @@
 """Compute each bold number of the results pages, and README's table and picture, a second way: from the cells alone.
 
-It takes nothing from the package or other studies; it exits with a line for each number off by more than its last digit.
+It takes nothing from the package or other studies, and ends with a line for each number off by more than a last digit.
 ``recomputed.csv`` has what a page shows, in its order: names of numbers below, and numbers that are no results.
 """
 
