@@ -56,19 +56,19 @@ def compare(found: Found, name: str, apart: Any, bounds: Any = score) -> None:
     found[name], found[f"won-{name}"] = bounds(apart), [(apart > 1e-9).sum(), len(apart)]
 
 
-def cells(name: str, **wanted: Any) -> pd.DataFrame:
+def cells(name: str, **wanted: Any) -> Any:
     """The rows of a CSV that have these values."""
     rows = pd.read_csv(ROOT / f"docs/results/{name}.csv")
     return rows[np.logical_and.reduce([rows[key] == value for key, value in wanted.items()] or [rows.index >= 0])]
 
 
-def played(name: str, chooser: str = "agent", quantity: str = "success", **wanted: str) -> pd.DataFrame:
+def played(name: str, chooser: str = "agent", quantity: str = "success", **wanted: str) -> Any:
     """A number of agents: a row for each layout, a column for each method."""
     rows = cells(name, chooser=chooser, quantity=quantity, **wanted)
     return rows.pivot(index="layout", columns="method", values="value")
 
 
-def crossed(members: pd.DataFrame, name: str) -> float:
+def crossed(members: Any, name: str) -> Any:
     """The mean over both halves of the member that is best on the other."""
     on_second = members[f"{name}_second"].iloc[members[f"{name}_first"].argmax()]
     return (on_second + members[f"{name}_first"].iloc[members[f"{name}_second"].argmax()]) / 2
@@ -89,7 +89,7 @@ def of_hypotheses(found: Found) -> None:
     common = cells("figure2-ladders", step=300).groupby(["method", "seed"])["common"].mean()
     found["attention"], found["attention-none"] = common["dbat"].mean(), common["none"].mean()
     compare(found, "attention-apart", common["dbat"] - common["none"])
-    ladders: dict[str, list[Any]] = {}
+    ladders: dict[str, Any] = {}
     for method, looks in cells("figure3-ladders", groups=1).groupby("method"):
         halves = []
         for pick, judge in (("first", "second"), ("second", "first")):
@@ -176,7 +176,7 @@ def shown_in(root: Path, where: str) -> list[str]:
     page = COUNTED.sub("", path.read_text("utf-8"))
     parts = ROW.findall(page) if where == "README" else BOLD.findall(page)
     shown = NUMBER.findall(NO_NUMBER.sub(" ", " ; ".join(parts)))
-    return shown + (Image.open(root / "docs/results.png").text["Description"].split() if where == "README" else [])
+    return shown + (Image.open(root / "docs/results.png").info["Description"].split() if where == "README" else [])
 
 
 def differences(root: Path = ROOT) -> Iterator[str]:
