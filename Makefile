@@ -80,12 +80,13 @@ newest: ## the tests on the newest versions that pip finds, in .venv-newest
 slurm: $(STAMP) ## the test of sweeps on a real Slurm, where there is one (some minutes)
 	$(BIN)/python -m pytest -m slurm tests/experiments/test_slurm.py
 
-check: $(STAMP) ## linter, formatter, types, import contracts, vague names
+check: $(STAMP) ## linter, formatter, types, import contracts, vague names, published numbers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.vague_names
+	$(BIN)/python -m studies.recompute
 
 bench: $(STAMP) ## what is faster than what, in ratios (BENCH=--short for a quick look, ONLY="doorkey loop")
 	for name in $(ONLY); do $(BIN)/python -m benchmarks.$$name $(BENCH) || exit 1; done

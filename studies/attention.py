@@ -31,7 +31,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import EnsembleTraining
 from hypogoal.observations import spread_rows
-from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table
 from studies.ladders import METHODS as OF_LADDERS
 from studies.ladders import states_of
 
@@ -158,7 +158,7 @@ def tables(path: Path) -> Iterator[str]:
         numbers = [method, str(step)]
         for name in ("common", "signed"):
             own, dbats = (_over(cell, shared, partial(_mean, name=name)) for cell in (seeds, of_dbat))
-            numbers += [interval(own), "-" if method == "dbat" else difference(dbats - own)]
+            numbers += [interval(own), "-" if method == "dbat" else interval(dbats - own)]
         for of_members in (_least_near, _most_near, _ranking_of_nearest, partial(_mean, name="ranking_unseen")):
             numbers.append(interval(_over(seeds, shared, of_members)))
         rows.append(numbers)

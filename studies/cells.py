@@ -14,18 +14,25 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binom
 
 from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
 from hypogoal.domains.base import Domain
-from hypogoal.evaluation.house import BOOTSTRAP_FROM, RESAMPLES, student_interval
+from hypogoal.evaluation.house import ROUNDING, sign_test
 from hypogoal.stages.collect import collect
 
 T = TypeVar("T")
 Row = dict[str, Any]
+Floats: TypeAlias = NDArray[np.float64]
+Bounds: TypeAlias = Callable[[Floats], tuple[float, float]]
 Cell = tuple[str, ...]
 Jobs: TypeAlias = dict[Cell, Callable[[], list[Row]]]  # what makes a cell's rows
+# How many values an interval takes: ``studies.coverage`` chose method and number for each kind of value.
+SCORES_FROM, SHARES_FROM, AMOUNTS_FROM = 4, 3, 6
+RESAMPLES = 20_000
+TAILS = (0.025, 0.975)
 
 
 def parser_of(doc: str | None, seeds: str = "", *, run: str = "") -> argparse.ArgumentParser:
@@ -118,26 +125,86 @@ def _short(row: Row) -> dict[str, str]:
     return {name: f"{value:.4f}" for name, value in row.items() if isinstance(value, float)}
 
 
-def interval(values: NDArray[np.float64], digits: int = 3) -> str:
-    """A mean with a bootstrap's 95 % interval over seeds or layouts; of fewer than eight with the lowest and highest.
+def interval(values: Floats, digits: int = 3) -> str:
+    """Write the mean of scores, or of differences of scores, with the interval of :func:`bootstrap_t`."""
+    return _shown(values, digits, np.mean, bootstrap_t, SCORES_FROM)
 
-    A percentile bootstrap of the mean stays within what the values can be, a share's within 0 and 1.
+
+def share(values: Floats, digits: int = 2, least: float = 0.0) -> str:
+    """Write the mean of what lies between ``least`` and 1 and may lie there, with the interval of :func:`bounded`."""
+    return _shown(values, digits, np.mean, partial(bounded, least=least), SHARES_FROM)
+
+
+def amount(values: Floats, digits: int = 2) -> str:
+    """Write the median of amounts, or of differences of shares, with the interval of :func:`median_bounds`."""
+    return _shown(values, digits, np.median, median_bounds, AMOUNTS_FROM)
+
+
+def _shown(values: Floats, digits: int, middle: Any, bounds: Bounds, least: int) -> str:
+    """Write a middle with its interval; the mean with the lowest and the highest value below ``least`` values."""
+    if not len(values):
+        return "-"
+    if len(values) == 1:
+        return _number(values[0], digits)
+    if len(values) < least:
+        low, high = _number(values.min(), digits), _number(values.max(), digits)
+        return f"{_number(values.mean(), digits)} ({low} to {high})"
+    low, high = (_number(bound, digits) for bound in bounds(values))
+    return f"{_number(middle(values), digits)} [{low}, {high}]"
+
+
+def _number(value: float, digits: int) -> str:
+    text = f"{value:.{digits}f}"
+    return "never" if np.isinf(value) else text
+
+
+def won(values: Floats) -> str:
+    """Write how many of n differences are above 0, with the sign test's p, ties left out."""
+    above = int((values > ROUNDING).sum())
+    below = int((values < -ROUNDING).sum())
+    p = sign_test(above, below)
+    return f"{above} of {len(values)}" + ("" if np.isnan(p) else f", p = {p:.3f}")
+
+
+def bootstrap_t(values: Floats) -> tuple[float, float]:
+    """Bound the mean of (n,) values: the bootstrap's 95 % interval of Student's t (Efron 1981).
+
+    Resamples whose values are all alike have no t and are left out.
     """
-    if len(values) < 2:
-        return f"{values.mean():.{digits}f}" if len(values) else "-"
-    if len(values) < BOOTSTRAP_FROM:
-        return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
-    drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
-    low, high = np.percentile(values[drawn].mean(axis=1), (2.5, 97.5))
-    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    n = len(values)
+    mean, error = values.mean(), values.std(ddof=1) / np.sqrt(n)
+    resamples = values[np.random.default_rng(0).integers(n, size=(RESAMPLES, n))]
+    errors = resamples.std(axis=1, ddof=1) / np.sqrt(n)
+    differ = errors > ROUNDING
+    if not differ.any():
+        return mean, mean
+    ratios = (resamples.mean(axis=1)[differ] - mean) / errors[differ]
+    low, high = np.quantile(ratios, TAILS)
+    return float(mean - high * error), float(mean - low * error)
 
 
-def difference(values: NDArray[np.float64], digits: int = 3) -> str:
-    """A mean difference, which may have any sign, with Student's 95 % interval over seeds or layouts."""
-    if len(values) < 2:
-        return f"{values.mean():.{digits}f}" if len(values) else "-"
-    low, high = student_interval(values)
-    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+def bounded(values: Floats, least: float = 0.0) -> tuple[float, float]:
+    """Bound the mean of (n,) values between ``least`` and 1: Gaffke's 95 % interval (2005).
+
+    Each value, and a bound that was not seen, weighs as much as the gaps between n even numbers say: the lower end has
+    ``least`` as the unseen one, the upper end 1. Of zeros and ones it is Clopper and Pearson's interval.
+    """
+    weights = np.random.default_rng(0).dirichlet(np.ones(len(values) + 1), RESAMPLES)
+    known = weights[:, 1:] @ np.sort(values)
+    low = np.quantile(known + weights[:, 0] * least, TAILS[0])
+    high = np.quantile(known + weights[:, 0], TAILS[1])
+    return float(low), float(high)
+
+
+def median_bounds(values: Floats) -> tuple[float, float]:
+    """Bound the median of (n,) values: the widest pair of them outside of which few enough are expected.
+
+    At n = 10 these are the second and the ninth, since at most one of ten lies below the median in 1 % of cases.
+    Without ties it excludes 0 where the sign test does (p < .05).
+    """
+    ordered = np.sort(values)
+    outside = int(binom.ppf(TAILS[0], len(values), 0.5))
+    return float(ordered[outside - 1]), float(ordered[-outside])
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

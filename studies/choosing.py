@@ -28,7 +28,7 @@ from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, play_agent
 from hypogoal.evaluation.names import LEARNED, UNIFORM
 from hypogoal.evaluation.run import find_artefacts
-from studies.cells import difference, interval, parser_of, read_rows, table, write_rows
+from studies.cells import amount, parser_of, read_rows, share, table, won, write_rows
 
 ENSEMBLES = {
     "joint": "joint, K = 2",
@@ -62,9 +62,12 @@ ROOMS = {  # columns, by what their files' names end in
     "second setting": "-second",
     "first setting": "-first",
 }
+Agent = tuple[str, str]  # method, policy
+ValuesOf = Callable[[Agent, str, str], NDArray[np.float64]]  # of an agent by chooser and quantity
 COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
 HIGH = 0.9
 SHARES = "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
+LEAST = {"within_rho": -1.0}  # of all others 0
 SHOWN = {"success": "solved", "within_rho": "within-rho", "pair": "better of two"}
 
 
@@ -156,18 +159,30 @@ def tables(path: Path) -> Iterator[str]:
             [
                 title,
                 _mean(values_of(agent, "uniform", "success")) if agent in optioned else "-",
-                *(_mean(values_of(agent, "agent", quantity)) for quantity in SHOWN),
+                *(_mean(values_of(agent, "agent", name), LEAST.get(name, 0.0)) for name in SHOWN),
                 _reached(values_of(agent, "agent", "success")),
             ]
             for agent, title in agents.items()
         ),
     )
+    yield "Episodes solved, layout by layout: the median of D-BAT minus the other, and where D-BAT is above.\n"
+    yield from table(["", "D-BAT minus it", "layouts"], _apart(agents, values_of))
     if len(layouts) <= MOST_LAYOUTS:
         yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
         yield from by_layout(shares, optioned)
     if practised := [agent for agent in optioned if not np.isnan(values_of(agent, "agent", PRACTICE)).all()]:
         yield "Practice by uniform-random choice, thousands of steps until 95 of 100 were solved, or the limit."
         yield from by_layout(practice, practised)
+
+
+def _apart(agents: dict[Agent, str], values_of: ValuesOf) -> Iterator[list[str]]:
+    """Rows of what an ensemble of D-BAT's solves more than others with the same kind of options."""
+    for method, policy in agents:
+        dbat = next((name for name, other in agents if name.startswith("dbat") and other == policy), None)
+        if dbat and method != dbat:
+            gaps = values_of((dbat, policy), "agent", "success") - values_of((method, policy), "agent", "success")
+            defined = gaps[~np.isnan(gaps)]
+            yield [agents[method, policy], amount(defined), won(defined)]
 
 
 def solved_by(rows: list[dict[str, str]], method: str, chooser: str) -> NDArray[np.float64]:
@@ -178,7 +193,7 @@ def solved_by(rows: list[dict[str, str]], method: str, chooser: str) -> NDArray[
 
 def _shown(rows: list[dict[str, str]], method: str) -> str:
     solved, uniform = (solved_by(rows, method, chooser) for chooser in ("agent", "uniform"))
-    return f"{interval(solved, 2)} ({(solved >= HIGH).sum()}) / {uniform.mean():.2f}" if len(solved) else "-"
+    return f"{share(solved)} ({(solved >= HIGH).sum()}) / {uniform.mean():.2f}" if len(solved) else "-"
 
 
 def rooms(path: Path) -> Iterator[str]:
@@ -192,21 +207,38 @@ def rooms(path: Path) -> Iterator[str]:
     for method, title in ENSEMBLES.items():
         if method != "joint" and len(solved_by(newest, f"{method}-truth-shape", "agent")):
             rows.append([title, *(_joint_minus(newest, method, truth) for truth in TRUTHS)])
-    yield "Joint minus the other, seed by seed, with Student's interval.\n"
+    yield "Joint minus the other, seed by seed: median of the differences.\n"
     yield from table(["", *TRUTHS], rows)
+    yield "All four runs, forty seeds: D-BAT minus the other.\n"
+    yield from table(["", *TRUTHS, "both"], (_over_runs([*settings.values()], method) for method in ("none", "one")))
+
+
+def _over_runs(runs: list[list[dict[str, str]]], method: str) -> list[str]:
+    """What D-BAT solves more than another method, over the seeds of all runs: by truth, and the mean of both."""
+    gaps = []
+    for truth in TRUTHS:
+        of_dbat = np.concatenate([solved_by(rows, f"dbat-truth-{truth}", "agent") for rows in runs])
+        of_other = np.concatenate([solved_by(rows, f"{method}-truth-{truth}", "agent") for rows in runs])
+        gaps.append(of_dbat - of_other)
+    gaps.append(np.mean(gaps, axis=0))
+    return [ENSEMBLES[method], *map(_gap, gaps)]
+
+
+def _gap(values: NDArray[np.float64]) -> str:
+    return f"mean {values.mean():.3f}, median {amount(values)}, above in {won(values)}"
 
 
 def _joint_minus(rows: list[dict[str, str]], method: str, truth: str) -> str:
     joint, other = (solved_by(rows, f"{name}-truth-{truth}", "agent") for name in ("joint", method))
-    return difference(joint - other, 2)
+    return amount(joint - other)
 
 
-def _mean(values: NDArray[np.float64]) -> str:
+def _mean(values: NDArray[np.float64], least: float = 0.0) -> str:
     defined = values[~np.isnan(values)]
     if not len(defined):
         return "-"
     few = f" (n = {len(defined)})" if len(defined) < len(values) else ""
-    return f"{interval(defined, 2)}{few}"
+    return f"{share(defined, least=least)}{few}"
 
 
 def _reached(shares: NDArray[np.float64]) -> str:

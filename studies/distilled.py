@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.domains.doorkey.domain import DOMAIN
-from studies.cells import difference, interval, parser_of, read_rows, table
+from studies.cells import interval, parser_of, read_rows, table
 
 METHODS = {
     "grid": "D-BAT, distilled, grid, 200 layouts",
@@ -125,7 +125,7 @@ def _contrast(within: Found, methods: tuple[str, ...]) -> list[str]:
         for sign, method in zip(SIGNS, methods, strict=False):
             by_seed = of_members(within, method)
             total += sign * np.array([by_seed[seed] for seed in seeds])
-        cells.append(difference(total, 3))
+        cells.append(interval(total, 3))
     return [*cells, str(len(seeds))]
 
 

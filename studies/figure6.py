@@ -35,7 +35,7 @@ from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.tables import Episodes
-from studies.cells import interval, parser_of, read_rows, table, write_rows
+from studies.cells import amount, parser_of, read_rows, share, table, won, write_rows
 
 METHODS = {
     "dbat-k3": "D-BAT, K = 3",
@@ -66,6 +66,7 @@ LINES = {  # colour, dashes
 }
 
 
+REFERENCE = "dbat-k3"
 UNIFORM = "uniform among its own options"  # in the CSV
 
 
@@ -171,6 +172,16 @@ def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: f
     return float(recent[step[LAST - 1 :] >= since].min())
 
 
+def later(reached: NDArray[np.float64], of_reference: NDArray[np.float64]) -> str:
+    """Write how many times the reference's steps agents took on the same layouts: the median of the ratios.
+
+    What was never reached took longer than all else. In brackets the layouts on which it took longer.
+    """
+    both = ~np.isnan(reached) & ~np.isnan(of_reference)
+    ratios = reached[both] / of_reference[both]
+    return f"{amount(ratios)} ({won(ratios - 1)})"
+
+
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
     rows = read_rows(path)
@@ -191,19 +202,27 @@ def tables(path: Path) -> Iterator[str]:
     def training(method: str) -> list[str]:
         reached = values_of(method, "steps_to_95")
         ran = int((~np.isnan(reached)).sum())
-        soon = np.sort(reached[~np.isnan(reached)])[ran // 2]
+        soon = float(np.median(reached[~np.isnan(reached)]))
         lowest = finite(values_of(method, "lowest_after"))
         return [
             METHODS[method],
             f"{np.isfinite(finite(reached)).sum()} of {ran}",
             f"{soon:,.0f}" if np.isfinite(soon) else "never",
-            interval(finite(values_of(method, "success")), 2),
-            interval(finite(values_of(method, "length_over_shortest")), 2),
+            "-" if method == REFERENCE else later(reached, values_of(REFERENCE, "steps_to_95")),
+            share(finite(values_of(method, "success"))),
+            amount(finite(values_of(method, "length_over_shortest"))),
             f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
         ]
 
-    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts with a 95 % interval.\n"
-    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest"]
+    yield f"Training, {len(layouts)} layouts; of the last 100 episodes over layouts.\n"
+    titles = [
+        "",
+        "reached 95 %",
+        "95 % at, median",
+        "its steps / D-BAT's, median",
+        "solved",
+        "length / shortest, median",
+    ]
     yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
     frozen = [method for method in methods if len(finite(values_of(method, "success", "frozen")))]
     yield "Without further training: the agent / uniform-random choice among its own options.\n"
@@ -212,7 +231,8 @@ def tables(path: Path) -> Iterator[str]:
         cells = [METHODS[method]]
         for quantity in ("success", "length_over_shortest", "near"):
             both = [finite(values_of(method, quantity, who)) for who in ("frozen", UNIFORM)]
-            cells.append(" / ".join(interval(values, 2) for values in both))
+            shown = amount if quantity == "length_over_shortest" else share
+            cells.append(" / ".join(shown(values) for values in both))
         rows_of_play.append([*cells, str(len(finite(values_of(method, "success", "frozen"))))])
     yield from table(["", "solved", "length / shortest", "within 1.5 shortest paths", "layouts"], rows_of_play)
     yield "95 % at, in thousands of steps, layout by layout.\n"

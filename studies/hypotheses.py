@@ -38,7 +38,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import EnsembleTraining
-from studies.cells import Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Row, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -211,7 +211,7 @@ def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -
         cells = []
         for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
             dbat, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
-            cells.append(f"{difference(dbat - other)} ({above(dbat, other).sum()})" if len(dbat) == len(other) else "-")
+            cells.append(f"{interval(dbat - other)} ({above(dbat, other).sum()})" if len(dbat) == len(other) else "-")
         if method != "dbat":
             yield [method, *cells]
 

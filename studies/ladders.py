@@ -29,12 +29,11 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
 from hypogoal.domains.montezuma.domain import DOMAIN, SEEN_NOWHERE, TABLE_1, MontezumaConfig
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
-from hypogoal.evaluation.house import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
 from hypogoal.hypotheses.training import EnsembleTraining
-from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table, won
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -168,7 +167,7 @@ def _tables_of_all_rooms(groups: int, numbers: Numbers) -> Iterator[str]:
 def _at_others_length(groups: int, numbers: Numbers, method: str) -> list[str]:
     names = ("ranking", "balanced_accuracy", "accuracy")
     scores, dbat = ({name: best_at_others_length(numbers[each], name) for name in names} for each in (method, "dbat"))
-    versus = "-" if method == "dbat" else difference(dbat["balanced_accuracy"] - scores["balanced_accuracy"])
+    versus = "-" if method == "dbat" else interval(dbat["balanced_accuracy"] - scores["balanced_accuracy"])
     return [method, *(interval(scores[name]) for name in names), versus, _of_authors(groups, method)]
 
 
@@ -190,11 +189,7 @@ def _cross_fitted(numbers: Numbers, method: str) -> list[str]:
     seeds = numbers[method]
     rankings, dbat = crossed(seeds, "ranking"), crossed(numbers["dbat"], "ranking")
     steps = f"{picked(seeds, 'first')}, {picked(seeds, 'second')}"
-    versus = (
-        ["-", "-"]
-        if method == "dbat"
-        else [difference(dbat - rankings), f"{above(dbat, rankings).sum()} of {len(rankings)}"]
-    )
+    versus = ["-", "-"] if method == "dbat" else [interval(dbat - rankings), won(dbat - rankings)]
     return [method, steps, interval(rankings), interval(crossed(seeds, "balanced_accuracy")), *versus]
 
 

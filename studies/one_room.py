@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.cells import difference, interval, parser_of, table
+from studies.cells import amount, parser_of, table
 from studies.ladder_options import LADDERS, Distances, best_mean_worst, read
 
 METHODS = {"holds-dbat": "D-BAT", "holds-none": "no diversity", "oracle": "true sub-goal"}
@@ -46,7 +46,7 @@ def tables(path: Path) -> Iterator[str]:
     yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders.\n"
     rows = []
     for method, title in METHODS.items():
-        rows.append([title, *(interval(_values(_of_group(distances, method, each)), 1) for each in GROUPS.values())])
+        rows.append([title, *(amount(_values(_of_group(distances, method, each)), 1) for each in GROUPS.values())])
     rows.append(["no diversity minus D-BAT, same seeds", *(_gap(distances, each) for each in GROUPS.values())])
     yield from table(["", *GROUPS], rows)
     yield "Each part left out: best / **mean** / worst member, mean over the same seeds.\n"
@@ -82,7 +82,7 @@ def _of_group(distances: Distances, method: str, ladders: tuple[str, ...]) -> di
 def _gap(distances: Distances, ladders: tuple[str, ...]) -> str:
     with_dbat = _of_group(distances, "holds-dbat", ladders)
     without = _of_group(distances, "holds-none", ladders)
-    return difference(np.array([without[seed] - with_dbat[seed] for seed in without if seed in with_dbat]), 1)
+    return amount(np.array([without[seed] - with_dbat[seed] for seed in without if seed in with_dbat]), 1)
 
 
 def _values(by_seed: dict[int, float]) -> NDArray[np.float64]:

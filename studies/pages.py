@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from studies import (
     attention,
     audits,
     choosing,
+    coverage,
     distilled,
     figure6,
     hypotheses,
@@ -34,6 +36,7 @@ PAGES = [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "audit.md"]
 TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "audit-planted": audits.tables,
     "choosing-doorkey": choosing.tables,
+    "coverage": coverage.tables,
     "distilled": distilled.tables,
     "distilled-agents": distilled.tables_of_agents,
     "figure2-ladders": attention.tables,
@@ -58,12 +61,18 @@ def tables_in(lines: Iterable[str]) -> list[list[str]]:
     return [list(block) for is_table, block in blocks if is_table]
 
 
+@cache
+def tables_of(name: str) -> list[list[str]]:
+    """The tables that the study of a CSV prints."""
+    return tables_in(TABLES[name](RESULTS / f"{name}.csv"))
+
+
 def drawn(page: str) -> str:
     """A page with its tables as the cells have them."""
 
     def with_table(mark: re.Match[str]) -> str:
         name, number = mark.groups()
-        tables = tables_in(TABLES[name](RESULTS / f"{name}.csv"))
+        tables = tables_of(name)
         return "\n".join([f"<!-- {name} {number} -->", *tables[int(number)], ""])
 
     return MARKED.sub(with_table, page)

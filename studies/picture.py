@@ -70,8 +70,10 @@ def main() -> None:
             for chooser, method, values in pairs
         ],
     )
-    right.set_title("A wrong key ends the episode:\nchoosing decides, the ensemble does not", fontsize=10)
-    figure.savefig(parser.parse_args().out, dpi=150)
+    right.set_title("A wrong key ends the episode:\nchoosing decides; the ensemble is undecided", fontsize=10)
+    shown = [*rooms.values(), *(values for _, _, values in pairs)]
+    means = " ".join(f"{np.mean(values):.2f}" for values in shown)
+    figure.savefig(parser.parse_args().out, dpi=150, metadata={"Description": means})
 
 
 if __name__ == "__main__":

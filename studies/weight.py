@@ -24,7 +24,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.rooms.states import crossed_states
 from hypogoal.evaluation.choosing import play_agent
 from hypogoal.hypotheses.scores import member_scores
-from studies.cells import Jobs, Row, difference, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, amount, parser_of, printed, read_rows, run_cells, share, table, won
 
 METHODS: dict[str, dict[str, Any]] = {
     "auto": {},
@@ -89,9 +89,11 @@ def tables(path: Path) -> Iterator[str]:
         mean_of[method] = np.mean(solved, axis=0)
         weights = ", ".join(f"{weight:g}" for weight in np.unique(values_of(method, "weight")))
         both = f"{int(np.logical_and(*owned).sum())} of {len(seeds)}"
-        lines.append([method, weights, both, *map(interval, solved), interval(mean_of[method])])
-        lines[-1].append(difference(mean_of["auto"] - mean_of[method]) if method != "auto" else "-")
-    names = ["", "weight", "both owned", *(f"solved, {feature}" for feature in FEATURES), "both", "auto minus it"]
+        lines.append([method, weights, both, *map(share, solved), share(mean_of[method])])
+        apart = mean_of["auto"] - mean_of[method]
+        lines[-1] += [amount(apart), won(apart)] if method != "auto" else ["-", "-"]
+    solved_by = [f"solved, {feature}" for feature in FEATURES]
+    names = ["", "weight", "both owned", *solved_by, "both", "auto minus it, median", "seeds"]
     yield ""
     yield from table(names, lines)
 

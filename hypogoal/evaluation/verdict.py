@@ -80,6 +80,7 @@ def findings(results: Results) -> list[dict[str, Any]]:
             continue
         training, frozen = _of(name, trained), _of(name, played)
         of_choosing = finding(CHOOSING, frozen, _of(UNIFORM, played), ["artefact", "layout"])
+        of_choosing = [each | among_members(name, results) for each in of_choosing]
         # random choice while learning has other options
         result += of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
         for other, single in learned.items():
@@ -90,6 +91,14 @@ def findings(results: Results) -> list[dict[str, Any]]:
                 both = training, _of(other, trained)
             result += finding(HYPOTHESES, *both, ["layout", "seed"])
     return [*result, *_of_ladders(results)]
+
+
+def among_members(agent: str, results: Results) -> dict[str, float]:
+    """How often an agent takes the better of two members of a sub-goal, and uniform-random choice; NaN if unknown."""
+    taken = per_run(results.of(quantity="pair"), "pair", scope=FROZEN)
+    own, random = _of(agent, taken), _of(UNIFORM, taken)
+    random = random[random["artefact"].isin(own["artefact"])]
+    return {"better": own["value"].mean(), "better_at_random": random["value"].mean()}
 
 
 def _of(method, numbers):
@@ -113,6 +122,7 @@ def context(results):
     final = per_run(results.of(method=[*agents]), "success")
     return {
         "results": results,
+        "margin": MARGIN,
         "findings": findings(results),
         "undecided": results.facts.get("undecided", []),
         "agents": agents,

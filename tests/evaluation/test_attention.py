@@ -70,7 +70,7 @@ def test_the_table_pairs_seeds(tmp_path: Path) -> None:
     ]
     write_rows(tmp_path / "cells.csv", COLUMNS, rows)
     lines = [line for line in tables(tmp_path / "cells.csv") if line]
-    assert "| -0.200 [-1.471, 1.071] | -0.600 (-0.600 to -0.600) | 0.200 [-1.071, 1.471] |" in lines[-1]
+    assert "| -0.200 (-0.300 to -0.100) | -0.600 (-0.600 to -0.600) | 0.200 (0.100 to 0.300) |" in lines[-1]
     assert lines[-2].split(" | ")[6:] == [
         "0.200 (0.200 to 0.200)",
         "0.300 (0.300 to 0.300)",

@@ -76,6 +76,21 @@ def test_seeds_are_the_units_of_a_single_layout() -> None:
     assert one[1] == "One run is not evidence: train more layouts or seeds."
 
 
+@pytest.mark.parametrize(
+    ("better", "said"), [(0.55, "it chose sub-goals, not hypotheses."), (0.9, "it chose among hypotheses, too.")]
+)
+def test_choosing_sub_goals_is_told_from_choosing_among_members(better: float, said: str) -> None:
+    """By how often the better of two members is taken, against uniform-random choice among the same options."""
+    rows = [row("success", 1.0, method=SEVERAL, layout=7, seed=0, artefact="own")]
+    for method, solved, share in ((SEVERAL, 1.0, better), (UNIFORM, 0.27, 0.48)):
+        place = {"method": method, "scope": FROZEN, "layout": 7, "seed": 0, "artefact": "own"}
+        rows += [row("success", solved, **place), row("pair", share, **place)]
+    first, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
+    shares = f"takes the better one in {better:.0%} of the cases, uniform-random choice in 48%".replace("%", " %")
+    assert first.startswith("Choosing mattered on this layout: the agent solves 100 %") and first.endswith(said)
+    assert shares in first
+
+
 def test_without_frozen_play_an_agent_is_compared_with_one_that_chose_at_random() -> None:
     """At the end of training, run by run; frozen play of the agent alone does not replace that."""
     (found,) = findings(run_of({SEVERAL: [0.2, 0.1, 0.3], RANDOM: [1.0, 0.9, 1.0]}, {SEVERAL: [1.0, 1.0, 1.0]}))
