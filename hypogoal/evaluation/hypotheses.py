@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
+from hypogoal.data import PLANTED
 from hypogoal.evaluation import plots
 from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
 from hypogoal.evaluation.judging import Judged
@@ -25,7 +26,6 @@ HELDOUT = "heldout"
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
 VALIDATED = "validated_member"  # the quantity that is its number
-PLANTED = "planted_"  # begins the names of origins that say whether a state has a planted feature
 OWNED_FROM, IGNORED_TO = 0.95, 0.6  # areas under the ROC curve
 BY = ["method", "sub_goal"]
 WHICH = ("best", "mean", "worst")
