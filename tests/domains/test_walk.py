@@ -145,7 +145,7 @@ def test_no_plan_unless_asked_for() -> None:
 def test_what_is_not_determined_is_not_planned(make: Any) -> None:
     """Views that look alike in two places, and steps that are drawn."""
     goals = {"holds": holds} if make is fetch else SUB_GOALS
-    with pytest.raises(UserError, match="led from the same state to another one.*layout_seed=0, action=.*Give plan=f"):
+    with pytest.raises(UserError, match=r"led from the same state to another one.*layout_seed=0, action=.*Give plan=f"):
         engine_of(GymnasiumDomain(make, goals, plan=True)).plan()
 
 
@@ -184,7 +184,9 @@ def test_environments_differ_by_split() -> None:
             return image, reward, over, cut or self.cell == 1, info
 
     makes = {"training": CorridorEnv, "labelled": Short}
-    domain = GymnasiumDomain(makes, {"right-end": corridor_env.at_right}, features={"left": corridor_env.at_left})
+    domain = GymnasiumDomain(
+        makes, {"right-end": corridor_env.at_right}, origins={"planted_left": corridor_env.at_left}
+    )
     config = GymnasiumConfig(heldout_seeds=(4, 5), unlabelled_seeds=(1,), steps=200, states=3)
     found = domain.collect(config, 0, Progress("collect", 1, quiet=True))
     cells = found.labelled.observations[:, 0, ::8, 0].argmax(1)
@@ -198,5 +200,5 @@ def test_environments_differ_by_split() -> None:
 
 @pytest.mark.parametrize("makes", [{"labelled": CorridorEnv}, {"training": CorridorEnv, "tests": CorridorEnv}])
 def test_unknown_splits_are_refused(makes: Any) -> None:
-    with pytest.raises(UserError, match="make is of unknown splits: .*Give training, and any of labelled"):
+    with pytest.raises(UserError, match=r"make is of unknown splits: .*Give training, and any of labelled"):
         GymnasiumDomain(makes, SUB_GOALS)

@@ -49,9 +49,9 @@ class GymnasiumDomain(Domain):
     Args:
         make: makes an environment; or functions that do, by split: ``training``, and any of ``labelled``,
             ``unlabelled`` and ``heldout`` that differs from it. Observations are pictures, uint8 (H, W, C) or (H, W),
-            or numbers, a ``Box`` of any shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of ``reset``
-            sets the layout: the same seed and actions give the same episode. Its arguments are the domain's own
-            settings, see ``config_class``.
+            or numbers, a ``Box`` of any shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of
+            ``reset`` sets the layout: the same seed and actions give the same episode. Arguments of ``make`` are the
+            domain's own settings, see ``config_class``.
         sub_goals: by name, a function of the environment that returns whether the sub-goal holds in its current state,
             whatever came before.
         success: called at the end of each training episode, returns whether it was a success: a function of the
@@ -59,8 +59,9 @@ class GymnasiumDomain(Domain):
             succeeds when it terminates with a sum above 0.
         policy: plays ``1 - explore`` of the steps to collect states; None: random play. Policies by sub-goal, for
             example one that reaches each rare sub-goal, share the steps evenly.
-        features: by name, functions like those of sub-goals, of what else labels may fit. Labelled and held-out states
-            are drawn evenly over their combinations, too, and evaluation says whether members found them.
+        origins: by name, functions of the environment that return numbers to keep beside each state. A name that begins
+            with ``planted_`` is of a feature, which holds or not: evaluation says whether members found it, and
+            labelled and held-out states are drawn evenly over combinations of features, too.
         plan: options can be planned (``network=planned``): every layout is walked through before. True: observations
             and labels identify a state of a layout; or a function of the environment that returns what they hide, such
             as the agent's place. The environment must be deterministic, with at most some 50,000 states.
@@ -85,7 +86,7 @@ class GymnasiumDomain(Domain):
         *,
         success: Success | None = None,
         policy: Policy | Mapping[str, Policy | None] | None = None,
-        features: Mapping[str, Label] | None = None,
+        origins: Mapping[str, Callable[[gymnasium.Env], int]] | None = None,
         plan: bool | Callable[[gymnasium.Env], Any] = False,
         defaults: Mapping[str, Values] | None = None,
         memory: int = MEMORY,
@@ -97,7 +98,7 @@ class GymnasiumDomain(Domain):
             names = ", ".join(map(str, self.makes))
             raise UserError("make is of unknown splits", names, f"Give {TRAINING}, and any of {', '.join(SPLITS)}.")
         self.success, self.memory, self.name = success, memory, name
-        self.features, self.plan = features or {}, plan
+        self.origins, self.plan = origins or {}, plan
         self.label_functions, self.sub_goals = sub_goals, tuple(sub_goals)
         self.defaults = defaults or {}
         self.config_class = config_class

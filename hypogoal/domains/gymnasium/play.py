@@ -34,7 +34,7 @@ class Met(NamedTuple):
 
     observation: Observations
     labels: Bools
-    origin: tuple[int, ...]  # by ``ORIGINS``, then the domain's features
+    origin: tuple[int, ...]  # by ``ORIGINS``, then the domain's own
 
 
 def played(
@@ -106,11 +106,12 @@ def sampled(
         if changed.any():
             names = ", ".join(np.array(domain.sub_goals)[changed])
             raise UserError("a label differs when it is asked for again", names, "Have it keep nothing.")
-        features = labels_of(env, domain.features)
-        state = Met(values, labels, (*origin, *features))
+        kept_beside = {name: int(function(env)) for name, function in domain.origins.items()}
+        state = Met(values, labels, (*origin, *kept_beside.values()))
         combination = labels.tobytes()
         if by_features:
-            combination += features.tobytes()
+            features = [number for name, number in kept_beside.items() if name.startswith(PLANTED)]
+            combination += bytes(features)
         sample = kept.setdefault(combination, [])
         offered[combination] += 1
         if len(sample) < config.states:
@@ -138,12 +139,12 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
     """Labelled, unlabelled and held-out states reached in play on each layout, each picture once.
 
     Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
-    and ``step``, counted from 0, and features. Raises ``Unmet`` if the labelled states have one class only, or if
-    there are no unlabelled or no held-out states.
+    and ``step``, counted from 0, and the domain's own. Raises ``Unmet`` if the labelled states have one class
+    only, or if there are no unlabelled or no held-out states.
     """
     world = domain.world(config.model_dump())
     reader = domain.reader
-    names = *ORIGINS, *(PLANTED + name for name in domain.features)
+    names = *ORIGINS, *domain.origins
     seeds_of_sets = [getattr(config, name) for name in SEEDS]
     progress.total = sum(map(len, seeds_of_sets))
     training: set[bytes] = set()  # digests of labelled and unlabelled states
