@@ -67,11 +67,9 @@ class Levels(gymnasium.Wrapper):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         if seed is None:
             seed = int(self.np_random.integers(ROOM))
-        begin = self.seeds.get(seed, seed * ROOM)
-        for number in range(begin, seed * ROOM + ROOM):
+        for number in range(self.seeds.get(seed, seed * ROOM), seed * ROOM + ROOM):
             result = self.env.reset(seed=number, options=options)
-            world = self.env.unwrapped
-            if self.kind in ("", kind_of(world, self.target(world))):
+            if self.kind in ("", kind_of(self.unwrapped, self.target(self.unwrapped))):
                 self.seeds[seed], self.layout_seed = number, seed
                 return result
         raise LookupError(f"no level is of the kind {self.kind}: layout_seed={seed}")

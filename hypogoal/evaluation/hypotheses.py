@@ -47,7 +47,10 @@ def look(work, judgement):
 
 
 def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
-    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room."""
+    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room.
+
+    Planted features are scopes, too, in which they are the truth.
+    """
     labels, origins = judged.labels, judged.origins
     numbers = {
         "layouts": len(np.unique(origins.get("layout_seed", []))),
@@ -56,6 +59,8 @@ def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
     planted = {name: values for name, values in origins.items() if name.startswith(PLANTED)}
     if planted:
         numbers["coverage"] = coverage(judged.probabilities, planted)
+    for name, values in planted.items():
+        yield melted(scores.member_scores(judged.predictions, values > 0), scope=name)
     positive = pd.DataFrame(judged.unlabelled).mean()
     yield melted({"threshold": judged.thresholds, "positive_unlabelled": positive}, scope=HELDOUT)
     yield tidy(numbers, scope=HELDOUT)

@@ -60,7 +60,7 @@ class GymnasiumDomain(Domain):
         policy: plays ``1 - explore`` of the steps to collect states; None: random play. Policies by sub-goal, for
             example one that reaches each rare sub-goal, share the steps evenly.
         origins: by name, functions of the environment that return numbers to keep beside each state. A name that begins
-            with ``planted_`` is of a feature, which holds or not: evaluation says whether members found it, and
+            with ``planted_`` is of a feature, which holds or not: evaluation says how well members tell it, and
             labelled and held-out states are drawn evenly over combinations of features, too.
         plan: options can be planned (``network=planned``): every layout is walked through before. True: observations
             and labels identify a state of a layout; or a function of the environment that returns what they hide, such
