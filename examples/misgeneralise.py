@@ -32,8 +32,8 @@ from hypogoal.domains.gymnasium.engine import Label
 from hypogoal.experiments.experiment import Command, experiment
 
 TASKS = ("colour", "shape")
-METHODS = {"divdis": "", "one": "--diversity none --members 1"}
-MEMBERS = {"network": "misgeneralise:shallow", "diversity": "divdis", "learning_rate": 1e-3, "steps": 500}
+METHODS = {"divdis": "--set share=0.33", "one": "--diversity none --members 1"}
+MEMBERS = {"network": "misgeneralise:shallow", "diversity": "divdis", "learning_rate": 1e-3, "steps": 1_000}
 PLANNED = {"network": "planned", "chooser": "symbols", "option_timeout": 100}
 AGENT = {**PLANNED, "environments": 1, "max_episode_steps": 100, "steps": 3_000}
 ROOM = 1_000  # of the environment's seeds for each layout seed: the first whose level is of the kind

@@ -58,7 +58,7 @@ def test_four_rooms_from_the_page_to_a_report(tmp_path: Path, monkeypatch: pytes
         "--out",
         folder / "meta",
         "-q",
-        *settings("network=planned", "steps=300", "layout_seed=4"),
+        *settings("network=planned", "steps=300", "layout_seed=4", "max_episode_steps=20"),
     )
     run("evaluate", folder, "-q")
     run("report", folder)
