@@ -43,6 +43,7 @@ RECOLLECT = "Collect it again."
 ANEW = "Bring all files that it is made of, or write it again, whole."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
 GROUP = "group"  # an origin: states of a group are held out together, to choose a weight by
+PLANTED = "planted_"  # begins the names of origins that say whether a state has a feature
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
 COLUMN_CHUNK = 1 << 16  # values of a label or origin

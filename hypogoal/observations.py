@@ -27,14 +27,15 @@ Observations = NDArray[Any]  # (N, *shape), of any of these types
 Fields = dict[str, tuple[DType, Shape]]  # by key
 Floats = NDArray[np.float32]
 Standard = tuple[Floats, Floats]  # mean and deviation of numbers
+DIGEST = 16  # bytes
 DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
 MOST_ROWS = 20_000  # states from which mean and deviation are computed
 
 
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
-    """16 bytes that identify an observation among those of its shape and type, together with its labels."""
+    """Bytes (``DIGEST``) that identify an observation among those of its shape and type, together with its labels."""
     content = observation.tobytes() + labels
-    return blake2b(content, digest_size=16).digest()
+    return blake2b(content, digest_size=DIGEST).digest()
 
 
 def fields_of(shape: Shape, dtype: DType) -> Fields:

@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
+from hypogoal.data import PLANTED
 from hypogoal.evaluation import plots
 from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
 from hypogoal.evaluation.judging import Judged
@@ -25,7 +26,6 @@ HELDOUT = "heldout"
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
 VALIDATED = "validated_member"  # the quantity that is its number
-PLANTED = "planted_"  # begins the names of origins that say whether a state has a planted feature
 OWNED_FROM, IGNORED_TO = 0.95, 0.6  # areas under the ROC curve
 BY = ["method", "sub_goal"]
 WHICH = ("best", "mean", "worst")
@@ -47,7 +47,10 @@ def look(work, judgement):
 
 
 def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
-    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room."""
+    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room.
+
+    Planted features are scopes, too, in which they are the truth.
+    """
     labels, origins = judged.labels, judged.origins
     numbers = {
         "layouts": len(np.unique(origins.get("layout_seed", []))),
@@ -56,6 +59,8 @@ def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
     planted = {name: values for name, values in origins.items() if name.startswith(PLANTED)}
     if planted:
         numbers["coverage"] = coverage(judged.probabilities, planted)
+    for name, values in planted.items():
+        yield melted(scores.member_scores(judged.predictions, values > 0), scope=name)
     positive = pd.DataFrame(judged.unlabelled).mean()
     yield melted({"threshold": judged.thresholds, "positive_unlabelled": positive}, scope=HELDOUT)
     yield tidy(numbers, scope=HELDOUT)

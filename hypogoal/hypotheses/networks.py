@@ -174,7 +174,7 @@ def _layers(name: str, network: Any) -> Parts:
     try:
         layers, hidden = network
         widths = tuple(map(int, hidden))
-        proper = min(widths) > 0 and all(isinstance(layer, nn.Module) for layer in layers)
+        proper = min(widths, default=1) > 0 and all(isinstance(layer, nn.Module) for layer in layers)
     except (TypeError, ValueError):
         proper = False
     if not proper:

@@ -131,3 +131,16 @@ def test_as_input_scales_and_turns() -> None:
     assert inputs.shape == (2, 3, 4, 5)
     assert inputs[1, 0, 2, 3] == 1.0
     assert inputs.sum() == 1.0
+
+
+def shallow(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    """Features of 8x8 patches, without a hidden layer behind them."""
+    return [nn.Conv2d(channels, 4, kernel_size=8, stride=8), nn.ReLU()], ()
+
+
+def test_a_network_may_have_no_hidden_layer(trusted: None) -> None:
+    """Spec C5: the last layer reads its features, 4 of 2x3 patches."""
+    network = build_network(f"{__name__}:shallow", (16, 24, 3), torch.Generator().manual_seed(0))
+    *_, flatten, last = network
+    assert isinstance(flatten, nn.Flatten) and isinstance(last, nn.Linear)
+    assert (last.in_features, last.out_features) == (24, 2)

@@ -11,9 +11,13 @@ from hypogoal.core.config import Config, Values, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium.engine import MEMORY, GymnasiumEngine, Label, Success
-from hypogoal.domains.gymnasium.play import Policy, collect
+from hypogoal.domains.gymnasium.play import SEEDS, Policy, collect
 from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.observations import DType, Shape
+
+Make = Callable[..., gymnasium.Env]
+TRAINING = "training"  # the split that is played after collection
+SPLITS = tuple(name.removesuffix("_seeds") for name in SEEDS)
 
 
 class GymnasiumConfig(Config):
@@ -43,9 +47,11 @@ class GymnasiumDomain(Domain):
     """Spec B6: all that hypogoal needs to know about a problem, from a Gymnasium environment.
 
     Args:
-        make: makes an environment. Observations are pictures, uint8 (H, W, C) or (H, W), or numbers, a ``Box`` of any
-            shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of ``reset`` sets the layout: the same
-            seed and actions give the same episode. Its arguments are the domain's own settings, see ``config_class``.
+        make: makes an environment; or functions that do, by split: ``training``, and any of ``labelled``,
+            ``unlabelled`` and ``heldout`` that differs from it. Observations are pictures, uint8 (H, W, C) or (H, W),
+            or numbers, a ``Box`` of any shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of
+            ``reset`` sets the layout: the same seed and actions give the same episode. Arguments of ``make`` are the
+            domain's own settings, see ``config_class``.
         sub_goals: by name, a function of the environment that returns whether the sub-goal holds in its current state,
             whatever came before.
         success: called at the end of each training episode, returns whether it was a success: a function of the
@@ -53,6 +59,12 @@ class GymnasiumDomain(Domain):
             succeeds when it terminates with a sum above 0.
         policy: plays ``1 - explore`` of the steps to collect states; None: random play. Policies by sub-goal, for
             example one that reaches each rare sub-goal, share the steps evenly.
+        origins: by name, functions of the environment that return numbers to keep beside each state. A name that begins
+            with ``planted_`` is of a feature, which holds or not: evaluation says how well members tell it, and
+            labelled and held-out states are drawn evenly over combinations of features, too.
+        plan: options can be planned (``network=planned``): every layout is walked through before. True: observations
+            and labels identify a state of a layout; or a function of the environment that returns what they hide, such
+            as the agent's place. The environment must be deterministic, with at most some 50,000 states.
         defaults: by stage, settings that suit this domain: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: the number of distinct states whose observations training keeps, see ``GymnasiumEngine``.
         name: for messages; artefacts use the name that the user passed to ``collect``.
@@ -69,17 +81,24 @@ class GymnasiumDomain(Domain):
 
     def __init__(
         self,
-        make: Callable[..., gymnasium.Env],
+        make: Make | Mapping[str, Make],
         sub_goals: Mapping[str, Label],
         *,
         success: Success | None = None,
         policy: Policy | Mapping[str, Policy | None] | None = None,
+        origins: Mapping[str, Callable[[gymnasium.Env], int]] | None = None,
+        plan: bool | Callable[[gymnasium.Env], Any] = False,
         defaults: Mapping[str, Values] | None = None,
         memory: int = MEMORY,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
-        self.make, self.success, self.memory, self.name = make, success, memory, name
+        self.makes = make if isinstance(make, Mapping) else {TRAINING: make}
+        if TRAINING not in self.makes or not {*self.makes} <= {TRAINING, *SPLITS}:
+            names = ", ".join(map(str, self.makes))
+            raise UserError("make is of unknown splits", names, f"Give {TRAINING}, and any of {', '.join(SPLITS)}.")
+        self.success, self.memory, self.name = success, memory, name
+        self.origins, self.plan = origins or {}, plan
         self.label_functions, self.sub_goals = sub_goals, tuple(sub_goals)
         self.defaults = defaults or {}
         self.config_class = config_class
@@ -103,14 +122,15 @@ class GymnasiumDomain(Domain):
     def observation_dtype(self) -> DType:
         return self.reader.dtype
 
-    def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """An environment; ``arguments``: the domain's own settings, defaults for those left out.
+    def make_env(self, split: str = TRAINING, **arguments: Any) -> gymnasium.Env[Any, Any]:
+        """An environment of a split; ``arguments``: the domain's own settings, defaults for those left out.
 
         One whose actions are not ``Discrete`` is a ``UserError``.
         """
         fields = self.config_class.model_fields
         defaults = {name: fields[name].default for name in self.engine_settings}
-        env = self.make(**defaults | arguments)
+        make = self.makes.get(split, self.makes[TRAINING])
+        env = make(**defaults | arguments)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0:
             raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")

@@ -11,8 +11,9 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.checkpoints import ANEW, State
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Layouts, TurnEngine
-from hypogoal.observations import digest
+from hypogoal.domains.base import Layouts, Plan, TurnEngine
+from hypogoal.domains.gymnasium.walk import Walk
+from hypogoal.observations import DIGEST, digest
 
 if TYPE_CHECKING:
     from hypogoal.domains.gymnasium.domain import GymnasiumDomain
@@ -44,6 +45,8 @@ class GymnasiumEngine(TurnEngine):
     layout: it keeps its id while it is among the newest ``memory`` distinct ones. Twice as many are kept, so that a
     replay of ``memory`` steps finds its states; older ones are forgotten.
 
+    Where the domain has ``plan``, layout, end and what ``plan`` returns identify a state, too.
+
     Episodes are truncated after ``max_steps`` steps, or earlier by the environment. ``success`` is called at the end of
     each, see ``GymnasiumDomain``.
     """
@@ -65,8 +68,10 @@ class GymnasiumEngine(TurnEngine):
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self.memory: int = memory
         self.room = 2 * memory
-        self.width = len(domain.sub_goals)  # the facts are labels
+        self.width = len(domain.sub_goals) + DIGEST  # the facts are labels, and what identifies the state
         self._envs = [domain.make_env(**arguments) for _ in range(count)]
+        self._walk = Walk(self, domain.make_env(**arguments)) if domain.plan else None
+        self._is_planned = False
         self._earned = [0.0] * count  # in the episode so far
         self._played: list[list[int]] = [[] for _ in range(count)]  # the episode's actions
         self.observation_shape = domain.observation_shape
@@ -81,7 +86,7 @@ class GymnasiumEngine(TurnEngine):
         seed = self.layouts.begin(number)
         observation, _info = env.reset(seed=seed)
         self._played[number], self._earned[number] = [], 0.0
-        return self._remember(env, observation)
+        return self.remember(env, observation, seed)
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
         env = self._envs[number]
@@ -92,7 +97,11 @@ class GymnasiumEngine(TurnEngine):
         truncated = is_over and not terminated
         self._played[number].append(action)
         self._earned[number] += earned
-        state = self._remember(env, observation)
+        seed = self.layouts.now[number]
+        state = self.remember(env, observation, seed, terminated)
+        if self._walk and self._is_planned:
+            before = int(self.ids[number])
+            self._walk.require(before, action, state, seed)
         success = self.domain.success
         if success is None:
             return state, earned, terminated, truncated
@@ -102,17 +111,31 @@ class GymnasiumEngine(TurnEngine):
             succeeded = bool(success(env, info, so_far, terminated))
         return state, earned, terminated, truncated, succeeded
 
-    def _remember(self, env: gymnasium.Env, observation: Any) -> int:
-        """The id of an environment's current state."""
+    def remember(self, env: gymnasium.Env, observation: Any, seed: int, terminated: bool = False) -> int:
+        """The id of an environment's current state, in the layout of a seed."""
         domain = self.domain
         image = domain.reader.read(observation)
         labels = labels_of(env, domain.label_functions)
-        look = digest(image, labels.tobytes())
+        known = labels.tobytes()
+        if domain.plan:
+            hidden = domain.plan(env) if callable(domain.plan) else None
+            known += repr((seed, terminated, hidden)).encode()
+        look = digest(image, known)
         state = self._ids.get(look)
         if state is None or state < self.n_states - self.memory:
-            state = self._add(image, labels)
+            state = self._add(image, np.append(labels, np.frombuffer(look, np.uint8)).astype(np.uint8))
             self._file(look, state)
         return state
+
+    def plan(self, starts: Ints | None = None) -> Plan | None:
+        """What follows in all states of the layouts, whatever ``starts``; None where the domain has no ``plan``."""
+        if self._walk is None:
+            return None
+        if not self._is_planned:
+            for seed in self.layouts.seeds:
+                self._walk.through(seed)
+            self._is_planned = True
+        return self._walk.plan()
 
     def _file(self, look: bytes, state: int) -> None:
         """Enter a digest's newest id, and drop one of a forgotten state where there are more than states."""
@@ -123,7 +146,8 @@ class GymnasiumEngine(TurnEngine):
             del self._ids[oldest]
 
     def labels(self, ids: Ints) -> Bools:
-        return self.facts_of(ids).view(bool)
+        labels = len(self.domain.sub_goals)
+        return self.facts_of(ids)[:, :labels].view(bool)
 
     def snapshot(self) -> State:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
@@ -136,11 +160,11 @@ class GymnasiumEngine(TurnEngine):
         """
         super().restore(snapshot)
         states = np.arange(self.oldest, self.n_states)
-        of_states = self.labels(states)
+        looks = self.facts_of(states)[:, -DIGEST:]
         self._seen = dict(zip(states.tolist(), snapshot["images"], strict=True))
         self._ids.clear()
-        for (state, image), labels in zip(self._seen.items(), of_states, strict=True):
-            self._file(digest(image, labels.tobytes()), state)
+        for state, look in zip(states.tolist(), looks, strict=True):
+            self._file(look.tobytes(), state)
         for number in range(self.count):
             self._replay(number)
 

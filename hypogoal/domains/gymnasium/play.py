@@ -13,7 +13,7 @@ from numpy.random import Generator
 from hypogoal.core.arrays import Bools
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GET_MORE, Collected, States, Unmet, require_classes
+from hypogoal.data import GET_MORE, PLANTED, Collected, States, Unmet, require_classes
 from hypogoal.domains.gymnasium.engine import labels_of
 from hypogoal.observations import Observations, digest
 
@@ -34,7 +34,7 @@ class Met(NamedTuple):
 
     observation: Observations
     labels: Bools
-    origin: tuple[int, int, int]  # by ``ORIGINS``
+    origin: tuple[int, ...]  # by ``ORIGINS``, then the domain's own
 
 
 def played(
@@ -75,8 +75,11 @@ def sampled(
     config: GymnasiumConfig,
     seen: set[bytes],
     rng: Generator,
+    *,
+    by_features: bool,
 ) -> list[Met]:
-    """Distinct states of a layout, except those in ``seen``, digests: an even sample of all combinations of sub-goals.
+    """Distinct states of a layout, except those in ``seen``, digests: an even sample of all combinations of sub-goals,
+    and of features.
 
     Of each combination at most ``config.states`` are kept, each of those met with the same probability.
     """
@@ -103,8 +106,12 @@ def sampled(
         if changed.any():
             names = ", ".join(np.array(domain.sub_goals)[changed])
             raise UserError("a label differs when it is asked for again", names, "Have it keep nothing.")
-        state = Met(values, labels, origin)
+        kept_beside = {name: int(function(env)) for name, function in domain.origins.items()}
+        state = Met(values, labels, (*origin, *kept_beside.values()))
         combination = labels.tobytes()
+        if by_features:
+            features = [number for name, number in kept_beside.items() if name.startswith(PLANTED)]
+            combination += bytes(features)
         sample = kept.setdefault(combination, [])
         offered[combination] += 1
         if len(sample) < config.states:
@@ -132,22 +139,26 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
     """Labelled, unlabelled and held-out states reached in play on each layout, each picture once.
 
     Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
-    and ``step``, counted from 0. Raises ``Unmet`` if the labelled states have one class only, or if there are no
-    unlabelled or no held-out states.
+    and ``step``, counted from 0, and the domain's own. Raises ``Unmet`` if the labelled states have one class
+    only, or if there are no unlabelled or no held-out states.
     """
     world = domain.world(config.model_dump())
-    env, reader = domain.make_env(**world), domain.reader
+    reader = domain.reader
+    names = *ORIGINS, *domain.origins
     seeds_of_sets = [getattr(config, name) for name in SEEDS]
     progress.total = sum(map(len, seeds_of_sets))
     training: set[bytes] = set()  # digests of labelled and unlabelled states
     sets = []
     for name, seeds in zip(SEEDS, seeds_of_sets, strict=True):
+        env = domain.make_env(name.removesuffix("_seeds"), **world)
         met = []
         for layout_seed in seeds:
             seen = set(training) if name == "heldout_seeds" else set()
             rng = rng_for(seed, "play", layout_seed)
-            met += sampled(domain, env, layout_seed, config, seen, rng)
+            by_features = name != "unlabelled_seeds"  # nobody knows them there
+            met += sampled(domain, env, layout_seed, config, seen, rng, by_features=by_features)
             progress.advance()
+        env.close()
         if not met:
             raise Unmet(
                 f"there are no states for {name}",
@@ -155,7 +166,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
                 "Give other seeds, or more steps: states that look like training states do not count.",
             )
         observations, labels, origins = zip(*met, strict=True)
-        named = dict(zip(ORIGINS, np.transpose(origins), strict=True))
+        named = dict(zip(names, np.transpose(origins), strict=True))
         states = States(
             np.array([*observations], reader.dtype),  # a tuple would be one mixed observation
             np.array(labels),
@@ -163,7 +174,6 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
         )
         sets.append(states)
         training.update(map(digest, observations))
-    env.close()
     labelled, unlabelled, heldout = sets
     require_classes(labelled.labels, domain.sub_goals, f"steps={config.steps}", GET_MORE)
     return Collected(reader.shape, domain.sub_goals, labelled, unlabelled, heldout, reader.features)
