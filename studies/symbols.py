@@ -341,7 +341,8 @@ def tables(path: Path) -> Iterator[str]:
     by_world: dict[str, list[dict[str, str]]] = {}
     for row in read_rows(path):
         by_world.setdefault(row["world"], []).append(row)
-    for name, rows in by_world.items():
+    for name in filter(by_world.get, ALL):
+        rows = by_world[name]
         yield f"{ALL[name].title}: episodes until 95 % of 20 are solved ({LIMIT}: never); shares solved; steps.\n"
         yield from _table(rows)
 
