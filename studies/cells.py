@@ -162,8 +162,10 @@ def won(values: Floats) -> str:
     """Write how many of n differences are above 0, with the sign test's p, ties left out."""
     above = int((values > ROUNDING).sum())
     below = int((values < -ROUNDING).sum())
-    p = sign_test(above, below)
-    return f"{above} of {len(values)}" + ("" if np.isnan(p) else f", p = {p:.3f}")
+    count, p = f"{above} of {len(values)}", sign_test(above, below)
+    if np.isnan(p):
+        return count
+    return f"{count}, p = {p:.3f}" if p >= 0.001 else f"{count}, p < 0.001"
 
 
 def bootstrap_t(values: Floats) -> tuple[float, float]:

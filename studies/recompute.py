@@ -88,7 +88,7 @@ def of_hypotheses(found: Found) -> None:
     compare(found, "accuracy-apart", accuracy["dbat"] - accuracy["cnn"])
     common = cells("figure2-ladders", step=300).groupby(["method", "seed"])["common"].mean()
     found["attention"], found["attention-none"] = common["dbat"].mean(), common["none"].mean()
-    compare(found, "attention-apart", common["dbat"] - common["none"])
+    found["attention-apart"] = score(common["dbat"] - common["none"])
     ladders: dict[str, Any] = {}
     for method, looks in cells("figure3-ladders", groups=1).groupby("method"):
         halves = []
@@ -157,26 +157,26 @@ def of_rooms(found: Found) -> None:
         found[f"both-{method}"] = share((runs[f"{method}-truth-shape"] + runs[f"{method}-truth-place"]) / 2)
     compare(found, "shape-lead", runs["dbat-truth-shape"] - runs["none-truth-shape"], np.mean)
     found["place-behind"] = (runs["none-truth-place"] - runs["dbat-truth-place"]).mean()
+    joint = played("rooms-joint")
     for truth in ("shape", "place"):
-        joint = played("rooms-joint")
         found[f"joint-{truth}"] = median(joint[f"joint-truth-{truth}"] - joint[f"dbat-truth-{truth}"])
     weight = cells("weight").pivot(index="seed", columns="method")
     owned = (weight["owned_shape"] >= 0.9) & (weight["owned_place"] >= 0.9)
     solved = (weight["solved_shape"] + weight["solved_place"]) / 2
-    found["auto-place"] = share(weight["solved_place"]["auto"])
     for name, method in METHODS.items():
         compare(found, f"owned-{name}", owned[method].astype(int), np.mean)
         compare(found, f"gain-{name}", solved["auto"] - solved[method], median)
-        found[f"{name}-shape"] = share(weight["solved_shape"][method])
+        found |= {f"{name}-{truth}": share(weight[f"solved_{truth}"][method]) for truth in ("shape", "place")}
 
 
 def shown_in(root: Path, where: str) -> list[str]:
     """The numbers of README's table and picture, or those in bold on a page, without code and addresses."""
-    path = root / ("README.md" if where == "README" else f"docs/results/{where}.md")
-    page = COUNTED.sub("", path.read_text("utf-8"))
+    name = "README.md" if where == "README" else f"docs/results/{where}.md"
+    page = COUNTED.sub("", (root / name).read_text("utf-8"))
     parts = ROW.findall(page) if where == "README" else BOLD.findall(page)
-    shown = NUMBER.findall(NO_NUMBER.sub(" ", " ; ".join(parts)))
-    return shown + (Image.open(root / "docs/results.png").info["Description"].split() if where == "README" else [])
+    with Image.open(root / "docs/results.png") as picture:
+        of_picture = picture.info["Description"].split() if where == "README" else []
+    return NUMBER.findall(NO_NUMBER.sub(" ", " ; ".join(parts))) + of_picture
 
 
 def differences(root: Path = ROOT) -> Iterator[str]:

@@ -96,9 +96,9 @@ def findings(results: Results) -> list[dict[str, Any]]:
 def among_members(agent: str, results: Results) -> dict[str, float]:
     """How often an agent takes the better of two members of a sub-goal, and uniform-random choice; NaN if unknown."""
     taken = per_run(results.of(quantity="pair"), "pair", scope=FROZEN)
-    own, random = _of(agent, taken), _of(UNIFORM, taken)
-    random = random[random["artefact"].isin(own["artefact"])]
-    return {"better": own["value"].mean(), "better_at_random": random["value"].mean()}
+    agents, random = _of(agent, taken), _of(UNIFORM, taken)
+    random = random[random["artefact"].isin(agents["artefact"])]
+    return {"better": agents["value"].mean(), "better_at_random": random["value"].mean()}
 
 
 def _of(method, numbers):
