@@ -28,7 +28,7 @@ RIGHT = [0, 3, 6, 9, 12]  # the first member of every sub-goal knows it
 
 def agent(layout_seed: int, steps: int) -> OptionLoop:
     """PPO over planned options of planted members, in a world where a wrong key ends the episode."""
-    engine, config = harsh(layout_seed, 16), TrainMetaConfig.of(network="planned")
+    engine, config = harsh(layout_seed, 16), TrainMetaConfig.of(chooser="ppo", network="planned")
     terminations = planted(engine)
     learner = PlannedLearner(engine, terminations, config, seed=0)
     loop = OptionLoop(
@@ -58,7 +58,7 @@ def test_the_agent_finds_the_planted_truth() -> None:
 def qualities_of(engine: DoorKeyEngine) -> NDArray[np.float64]:
     """Of the planted members, begun in every state that can be reached."""
     terminations = planted(engine)
-    config = TrainMetaConfig.of(network="planned")
+    config = TrainMetaConfig.of(chooser="ppo", network="planned")
     learner = PlannedLearner(engine, terminations, config, seed=0)
     loop = OptionLoop(engine, terminations, learner, Silent(), Recorder(15, engine), config, GAMMA)
     return qualities(loop, GOALS, engine.reachable())

@@ -90,7 +90,7 @@ def test_nothing_of_an_earlier_chooser_is_left() -> None:
     """The second one is asked first where episodes begin, in every environment, and plays as if it were alone."""
 
     def loop_at(seed: int) -> OptionLoop:
-        engine, config = harsh(220, 16), TrainMetaConfig.of(network="planned")
+        engine, config = harsh(220, 16), TrainMetaConfig.of(chooser="ppo", network="planned")
         terminations, rng = planted(engine), np.random.default_rng(seed)
         learner = PlannedLearner(engine, terminations, config, seed=0)
         return OptionLoop(engine, terminations, learner, RandomChooser(rng), Recorder(15, engine), config, GAMMA)
@@ -125,7 +125,7 @@ class Falling(Terminations):
 def test_play_teaches_nothing() -> None:
     """Thresholds and counters are after it what they were before."""
     engine = harsh(220, 16)
-    config = TrainMetaConfig.of(network="planned")
+    config = TrainMetaConfig.of(chooser="ppo", network="planned")
     truth = planted(engine)
     ends = Falling(truth.classify, 15)
     learner = PlannedLearner(engine, truth, config, seed=0)
