@@ -36,7 +36,7 @@ from hypogoal.experiments.built_in import SOLVABLE
 from hypogoal.meta import symbols
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.tables import Episodes
-from studies.cells import Jobs, Row, importable, parser_of, printed, read_rows, run_cells, table
+from studies.cells import Jobs, Row, amount, importable, parser_of, printed, read_rows, run_cells, table
 
 TUNED = (*range(100, 114), 115, 118, 119)  # 114, 116 and 117 have a wrong key in the way
 TUNING_SEED = 900
@@ -364,7 +364,7 @@ def _table(rows: list[dict[str, str]]) -> Iterator[str]:
             title = f"{title}: {', '.join(filter(None, constants))}"
         ratios = np.array([numbers[layout] / first[layout] for layout in numbers])
         shares = [_mean(own, quantity) for quantity in QUANTITIES[:-1]]
-        shown.append([title, *_summary(values), f"{np.median(ratios):.1f}", *shares, _steps(own)])
+        shown.append([title, *_summary(values), amount(ratios, 1), *shares, _steps(own)])
     titles = ["", "arrived", "median", "mean", "most", "ratio, median", "1-10", "11-20", "21-50", "51-100"]
     yield from table([*titles, "steps, median"], shown)
 
@@ -381,8 +381,10 @@ def _steps(rows: list[dict[str, str]]) -> str:
 
 
 def _summary(values: NDArray[np.float64]) -> list[str]:
+    """How many arrived; the median with its interval, the mean and the most, ``LIMIT`` where they never do."""
     arrived = f"{(values < LIMIT).sum()} of {len(values)}"
-    return [arrived, *(f"{value:.0f}" for value in (np.median(values), values.mean(), values.max()))]
+    or_never = np.where(values < LIMIT, values, np.inf)
+    return [arrived, amount(or_never, 0), f"{values.mean():.0f}", f"{values.max():.0f}"]
 
 
 def main() -> None:
