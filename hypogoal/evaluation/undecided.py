@@ -27,7 +27,7 @@ def facts(work: Work, numbers: pd.DataFrame) -> dict[str, Any]:
 
     It fails if it solves less than 95 % of the episodes that it plays after training; if it played none, of the last.
     """
-    found = []
+    undecided = []
     played = numbers[(numbers["scope"] == FROZEN) & (numbers["quantity"] == "success") & (numbers["method"] != UNIFORM)]
     for artefact in work.contents.agents:
         if artefact.config.get("chooser") != "symbols":
@@ -39,9 +39,9 @@ def facts(work: Work, numbers: pd.DataFrame) -> dict[str, Any]:
         if len(frozen):
             solved = frozen.mean()
         if len(succeeded) >= EPISODES and solved < SOLVED:
-            about = {"agent": place["method"], "episodes": len(succeeded)}
-            found += [{**about, **each} for each in of_agent(work, artefact)]
-    return {"undecided": found}
+            named = {"agent": place["method"], "episodes": len(succeeded)}
+            undecided += [{**named, **each} for each in of_agent(work, artefact)]
+    return {"undecided": undecided}
 
 
 def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
@@ -62,14 +62,14 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
     executions = np.bincount(model.pairs(), model.sums[:, 0], len(model.symbols) * options).reshape(-1, options)
     draw = np.random.default_rng(0).standard_gamma
     drawn = np.stack([model.qualities(draw) for _ in range(DRAWS)])
-    found = []
+    undecided = []
     for goal, sub_goal in enumerate(sub_goals):
-        own = slice(goal * members, (goal + 1) * members)
-        place = executions[:, own].sum(axis=1).argmax()
-        tried = np.flatnonzero(executions[place, own])
+        options_of_goal = slice(goal * members, (goal + 1) * members)
+        place = executions[:, options_of_goal].sum(axis=1).argmax()
+        tried = np.flatnonzero(executions[place, options_of_goal])
         if len(tried) < 2:
             continue
-        values = drawn[:, place, own][:, tried]
+        values = drawn[:, place, options_of_goal][:, tried]
         second, best = values.mean(axis=0).argsort()[-2:]
         difference = values[:, best] - values[:, second]
         low, high = np.percentile(difference, (2.5, 97.5))
@@ -78,8 +78,8 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
         pair = sorted([int(tried[best]), int(tried[second])])
         numbers = {"difference": difference.mean(), "low": low, "high": high}
         states = to_label(work, artefact, sub_goal, pair)
-        found.append({"sub_goal": sub_goal, "members": pair, **numbers, **states})
-    return found
+        undecided.append({"sub_goal": sub_goal, "members": pair, **numbers, **states})
+    return undecided
 
 
 def to_label(work: Work, artefact: Artefact, sub_goal: str, pair: list[int]) -> dict[str, Any]:

@@ -125,8 +125,8 @@ class Model(Resumable):
     def _from_others(self, weights: Doubles) -> Doubles:
         """By symbols and option (S, O) the sum over the same option's outcomes in all other symbols."""
         shape = len(self.symbols), self.options
-        own = np.bincount(self.pairs(), weights, shape[0] * shape[1]).reshape(shape)
-        return np.maximum(own.sum(axis=0) - own, 0.0)  # a difference can be a hair below 0
+        of_each = np.bincount(self.pairs(), weights, shape[0] * shape[1]).reshape(shape)
+        return np.maximum(of_each.sum(axis=0) - of_each, 0.0)  # a difference can be a hair below 0
 
 
 class SymbolsChooser(Chooser):

@@ -116,11 +116,11 @@ class GymnasiumEngine(TurnEngine):
         domain = self.domain
         image = domain.reader.read(observation)
         labels = labels_of(env, domain.label_functions)
-        known = labels.tobytes()
+        besides = labels.tobytes()
         if domain.plan:
             hidden = domain.plan(env) if callable(domain.plan) else None
-            known += repr((seed, terminated, hidden)).encode()
-        look = digest(image, known)
+            besides += repr((seed, terminated, hidden)).encode()
+        look = digest(image, besides)
         state = self._ids.get(look)
         if state is None or state < self.n_states - self.memory:
             state = self._add(image, np.append(labels, np.frombuffer(look, np.uint8)).astype(np.uint8))

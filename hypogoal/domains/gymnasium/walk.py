@@ -62,9 +62,9 @@ class Walk:
         """The fewest actions from a state of which the last was never tried; empty if there are none."""
         ways: dict[int, list[int]] = {state: []}
         queue = [state]
-        for here in queue:
-            for action, after in enumerate(self.following[here]):
-                way = [*ways[here], action]
+        for passed in queue:
+            for action, after in enumerate(self.following[passed]):
+                way = [*ways[passed], action]
                 if after == UNTRIED:
                     return way
                 if after not in ways:
