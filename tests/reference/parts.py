@@ -37,6 +37,7 @@ CURVE_POINTS = 20  # that are kept of each curve
 NEWER = (  # quantities that release 0.23.0 did not have
     *("solved_1_10", "solved_11_20", "solved_21_50", "solved_51_100", "episodes_to_95", "solved_by_episode"),
 )
+NEWER_COLUMNS = ("better", "better_at_random")  # of the verdict's table
 CLOSE = 1e-4
 # Where pictures are trained on, forty steps part further on a processor that adds up otherwise: by 0.012 at most
 # between an AMD EPYC and an Intel Xeon. Another objective parts by 0.17 at least.
@@ -299,8 +300,9 @@ def numbers_of(path: Path) -> Table:
 
 
 def recorded_of(path: Path) -> list[dict[str, str]]:
-    """The rows of a file but those of ``NEWER``."""
-    return [row for row in rows_of(path) if row.get("quantity") not in NEWER]
+    """The rows of a file but those of ``NEWER``, and of planted features as scopes."""
+    rows = [row for row in rows_of(path) if row.get("quantity") not in NEWER]
+    return [row for row in rows if not str(row.get("scope")).startswith("planted_")]
 
 
 def table_of(path: Path) -> Table:
@@ -308,6 +310,8 @@ def table_of(path: Path) -> Table:
     rows: Table = []
     for line, row in enumerate(recorded_of(path)):
         for column, text in row.items():
+            if column in NEWER_COLUMNS:
+                continue
             with contextlib.suppress(ValueError):
                 rows.append((f"tables/{path.name}", f"{line} {column}", number(float(text))))
     return rows
@@ -479,7 +483,7 @@ def evaluation_rooms(work: Path) -> Table:
             words = [*chosen, *settings(steps=100, workers=1, **IN_ROOMS)]
             out = run / f"ensemble/method-{method}-seed-{seed}"
             ensemble = made(out, "train-ensemble", str(data), *words, seed=seed)
-            words = settings(layout_seed=seed, world="truth=shape", steps=2_000)
+            words = settings(layout_seed=seed, world="truth=shape", steps=2_000, chooser="ppo")
             out = run / f"agent/method-{method}-truth-shape-seed-{seed}"
             made(out, "train-meta", str(ensemble), *words, seed=seed)
     return evaluated(run)
@@ -491,7 +495,8 @@ def evaluation_demo(work: Path) -> Table:
     run = work / "demo"
     shorter = settings_of("collect", heldout_layouts=2) + settings_of("train-ensemble", steps=40, batch_size=32)
     explored = {"epsilon_steps": 8_000, "update_interval": 16, "option_learning_rate": 5e-4}  # as the preset once had
-    shorter += settings_of("train-options", steps=8_000, **explored) + settings_of("train-meta", steps=6_000)
+    chosen = {"chooser": "ppo", "epsilon_steps": 8_000, "epsilon_final": 0.05}
+    shorter += settings_of("train-options", steps=8_000, **explored) + settings_of("train-meta", steps=6_000, **chosen)
     shorter += settings_of("train-baseline", steps=6_000)
     command("run", "doorkey", "--preset", "demo", *settings(workers=1), *shorter, "--out", str(run))
     return evaluated(run)
