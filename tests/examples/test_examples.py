@@ -139,7 +139,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path) -> None:
     assert "pictures" in fails("report", folder, "--videos", "1", "--force").err
     assert "pictures" in fails("show", data, "--pictures", tmp_path).err
     for setting in ("network=paper", "meta_network=paper"):
-        own = settings(setting, "experience=own")
+        own = settings(setting, "experience=own", "chooser=ppo")
         told = fails("train-meta", ensemble, "--out", tmp_path / "m", "-q", *own)
         assert f"see pictures only: {setting}" in told.err
 
