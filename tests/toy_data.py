@@ -47,7 +47,7 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
         played = {LOG, "episodes.csv", "layout.json", "options.safetensors", "choices.csv", "terminations.h5"}
         played |= {"visited.h5"} if config.get("save_visited") else set()
         played |= {"audit.json", "exploits.csv"} if kind == "audit" else set()
-        chooses = kind == "meta" and config.get("chooser") == "ppo"
+        chooses = kind == "meta" and config.get("chooser") in ("ppo", "symbols")
         return played | ({"meta.safetensors"} if chooses else set())
     return {
         "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
