@@ -30,7 +30,7 @@ def facts(work: Work, numbers: pd.DataFrame) -> dict[str, Any]:
     undecided = []
     played = numbers[(numbers["scope"] == FROZEN) & (numbers["quantity"] == "success") & (numbers["method"] != UNIFORM)]
     for artefact in work.contents.agents:
-        if artefact.config.get("chooser") != "symbols":
+        if artefact.config.get("chooser") != "symbols" or artefact.config["termination"] == "oracle":
             continue
         place = work.place(artefact)
         succeeded = Episodes.read(artefact.path / Episodes.FILE).succeeded
@@ -83,15 +83,23 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
 
 
 def to_label(work: Work, artefact: Artefact, sub_goal: str, pair: list[int]) -> dict[str, Any]:
-    """``data``, the ensemble's file, and ``states``: the unlabelled ones of it on which two members differ most."""
+    """``data``, the ensemble's file, and ``states``: the unlabelled ones of it on which two members differ most.
+
+    There are none if the ensemble is not part of the run, or its file has no unlabelled states.
+    """
     from hypogoal.data import open_dataset
     from hypogoal.evaluation.recorded import next_to_label
     from hypogoal.hypotheses.ensemble import read_ensemble
 
-    source = next(each for each in work.contents.ensembles if each.path.samefile(artefact.input("ensemble")))
+    place = artefact.input("ensemble").resolve()
+    source = next((each for each in work.contents.ensembles if each.path.resolve() == place), None)
+    if source is None:
+        return {"data": "", "states": []}
     data = work.contents.data_of[source.path]
     ensemble = read_ensemble(source.path, source.config, sub_goal)
     unlabelled = open_dataset(data).unlabelled()
+    if not len(unlabelled):
+        return {"data": str(data), "states": []}
     thresholds: Doubles = np.array(ensemble.thresholds.tolist())[pair]
     rows, _ = next_to_label(unlabelled, ensemble.predict(unlabelled)[:, pair], thresholds, NAMED)
     return {"data": str(data), "states": rows.tolist()}

@@ -9,6 +9,7 @@ import pytest
 import torch
 from command_line import run, settings
 
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.progress import Progress
 from hypogoal.core.tensors import save_tensors
 from hypogoal.data import open_dataset
@@ -89,6 +90,20 @@ def test_what_it_plays_after_training_counts_before_its_training(rooms: Path) ->
     counts = [7, 0, 6], [5, 30, 6]
     assert told(rooms, *counts, solved=0.5, frozen=1.0) == []
     assert len(told(rooms, *counts, solved=1.0, frozen=0.5)) == 1
+
+
+def test_an_ensemble_elsewhere_has_no_states_to_name(rooms: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Agents may be evaluated without the ensemble that they were made of."""
+    counts = [7, 0, 6], [5, 30, 6]
+    [known] = told(rooms, *counts)
+    elsewhere = rooms.with_name("elsewhere")
+    (rooms / "ensemble").rename(elsewhere)
+    try:
+        monkeypatch.setattr(Artefact, "input", lambda *_: elsewhere)
+        [found] = told(rooms, *counts)
+    finally:
+        elsewhere.rename(rooms / "ensemble")
+    assert known["states"] and found["states"] == []
 
 
 def test_it_is_a_sentence_below_the_verdict() -> None:

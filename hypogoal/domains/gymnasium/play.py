@@ -110,7 +110,7 @@ def sampled(
         state = Met(values, labels, (*origin, *kept_beside.values()))
         combination = labels.tobytes()
         if by_features:
-            features = [number for name, number in kept_beside.items() if name.startswith(PLANTED)]
+            features = [number > 0 for name, number in kept_beside.items() if name.startswith(PLANTED)]
             combination += bytes(features)
         sample = kept.setdefault(combination, [])
         offered[combination] += 1
