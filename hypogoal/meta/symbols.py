@@ -17,7 +17,7 @@ in n0, so
 
 Posterior sampling: for each episode of each environment one p and q are drawn, and followed greedily. If every
 execution ends the task with 1 or 0, there is one s, and Q(o) ~ Beta(n_1 + PRIOR HOPE, n_0 + PRIOR (1 - HOPE)) if g_o
-is 1, so this is Thompson sampling. They are drawn again in an episode where s is new, or executions have doubled the n of (s, o).
+is 1, so this is Thompson sampling. They are drawn again where s is new, or executions have doubled the n of (s, o).
 Value iteration begins at V = 0 and takes at most ``SWEEPS`` sweeps: the value of so many decisions, in bounded time.
 An episode that is cut does not tell what follows: its last execution counts as one that led back to s, so V(s) stays.
 Options that learn drift: with each execution of an option its counts fade, by half in ``HALF_LIFE`` of them.
