@@ -23,22 +23,30 @@ def ensemble_loss(context: Context) -> Tensor:
 
     Source: arXiv:2202.03418 (DivDis), its repulsion loss and its regularisation loss.
     """
-    logits = context.unlabelled
-    frozen = context.frozen
-    members, states = logits.shape[:2]
-    if states == 0:
-        return logits.sum()
+    if context.unlabelled.shape[1] == 0:
+        return context.unlabelled.sum()
+    terms = dependence(context)
+    priors = (1.0 - context.positives, context.positives)
+    for log_share, prior in zip(log_shares(context).unbind(-1), priors, strict=True):
+        ratio = log_share.exp() * (log_share - math.log(prior))
+        terms.append(RATIO_WEIGHT * ratio.sum())
+    return torch.stack(terms).sum()
+
+
+def dependence(context: Context) -> list[Tensor]:
+    """Mutual information of all pairs of members, in terms () whose sum it is; there is at least one state."""
+    logits, frozen = context.unlabelled, context.frozen
     terms = []
-    for number in range(1, members):
+    for number in range(1, len(logits)):
         earlier = logits[:number]
         shared = pair_loss(earlier, logits[number].expand_as(earlier))
         terms.append(2.0 * shared.sum())
     if len(frozen):
         terms += [pair_loss(frozen, member.expand_as(frozen)).sum() for member in logits]
-    log_classes = torch.log_softmax(logits, dim=-1)
-    log_shares = log_mean(log_classes, dim=1)  # (K, 2)
-    priors = (1.0 - context.positives, context.positives)
-    for log_share, prior in zip(log_shares.unbind(-1), priors, strict=True):
-        ratio = log_share.exp() * (log_share - math.log(prior))
-        terms.append(RATIO_WEIGHT * ratio.sum())
-    return torch.stack(terms).sum()
+    return terms
+
+
+def log_shares(context: Context) -> Tensor:
+    """Logarithms of the shares of negatives and positives among unlabelled states, float (K, 2), of each member."""
+    log_classes = torch.log_softmax(context.unlabelled, dim=-1)
+    return log_mean(log_classes, dim=1)

@@ -178,6 +178,7 @@ class AutoTraining:
             self.folds, self.remark = held_out(labels, self.origins.labelled.get(GROUP), seed)
         one_by_one = config.schedule == "sequential" and config.members > 1 and not config.teacher
         self.begins_alone = acts and one_by_one and (self.searches or config.restarts > 1)
+        self.begins_together = acts and config.schedule == "simultaneous" and config.restarts > 1
         self.early = max(1, round(config.steps * EARLY))
         self.most = self.cost(len(self.folds), len(WEIGHTS))
 
@@ -193,7 +194,8 @@ class AutoTraining:
         first = config.steps + (config.restarts - 1) * self.early if self.begins_alone else 0
         rounds = config.members if config.schedule == "sequential" else 1
         others = config.steps * (rounds - self.begins_alone)
-        return folds * ((first or others) + weights * others) + first + others
+        last = others * (config.restarts if self.begins_together else 1)
+        return folds * ((first or others) + weights * others) + first + last
 
     def snapshot(self) -> State:
         """All that the next steps depend on."""
@@ -225,6 +227,8 @@ class AutoTraining:
         begun = self._fresh
         if self.begins_alone:
             begun = yield from self._begin(everything)
+        if self.begins_together:
+            begun = yield from self._best_start(everything, self.config.members, self.config.steps, self.weight)
         self.is_last = True
         yield from self._train(everything, begun, self.weight)
 
@@ -258,25 +262,29 @@ class AutoTraining:
     def _begin(self, rows: Bools, held: Bools | None = None) -> Outcome:
         """Train without diversity on the labels of ``rows``: all members, or a first one alone.
 
-        Of several first ones that begin, the one that tells most goes on. Among unlabelled states as many positives are
-        expected from then on as it predicts.
+        Among unlabelled states as many positives are expected from then on as the first one predicts.
         """
-        members, restarts = self.config.members, 1
-        if self.begins_alone:
-            members, restarts = 1, self.config.restarts
-        candidates = [self._fresh]
-        for restart in range(restarts if restarts > 1 else 0):
-            seed = seeding.seed_for(self.seed, "restart", restart) if restart else self.seed
-            begun = self._fresh | {"seed": seed}
-            candidates.append((yield from self._train(rows, begun, members=members, until=self.early)))
-        best = max(candidates, key=itemgetter("information"))
-        for candidate in candidates:
-            if candidate is not best:
-                candidate["training"] = None  # it may be large
-        outcome = yield from self._train(rows, best, members=members, held=held)
+        members = 1 if self.begins_alone else self.config.members
+        begun = self._fresh
+        if self.begins_alone and self.config.restarts > 1:
+            begun = yield from self._best_start(rows, members, self.early)
+        outcome = yield from self._train(rows, begun, members=members, held=held)
         if self.config.share == AUTO:
             self.share = outcome["positive"]
         return outcome
+
+    def _best_start(self, rows: Bools, members: int, until: int, weight: float = 0.0) -> Outcome:
+        """Begin ``restarts`` trainings: the one that tells most after so many steps, to go on from."""
+        starts = []
+        for restart in range(self.config.restarts):
+            seed = seeding.seed_for(self.seed, "restart", restart) if restart else self.seed
+            begun = self._fresh | {"seed": seed}
+            starts.append((yield from self._train(rows, begun, weight, members=members, until=until)))
+        best = max(starts, key=itemgetter("information"))
+        for start in starts:
+            if start is not best:
+                start["training"] = None  # it may be large
+        return best
 
     def _train(
         self,
@@ -326,7 +334,7 @@ class AutoTraining:
         positive = predictions.mean(axis=0)
         is_first = self.begins_alone and len(now.ensemble) == 1
         return {
-            "information": information_of(probabilities[:, 0]),
+            "information": float(np.mean([information_of(member) for member in probabilities.T])),
             "training": now.snapshot() if is_candidate else None,
             "first": now.ensemble.networks[0].state_dict() if is_first and not is_candidate else None,
             "positive": float((predictions[:, 0].sum() + 1) / (len(predictions) + 2)),  # neither 0 nor 1

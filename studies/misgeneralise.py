@@ -1,0 +1,205 @@
+"""Goal misgeneralisation in MiniGrid as released: do members own both features, and does an agent find the right one?
+
+    PYTHONPATH=examples HYPOGOAL_TRUST=1 python -m studies.misgeneralise runs/misgeneralise \
+        docs/results/misgeneralise.csv
+    python -m studies.misgeneralise --tables docs/results/misgeneralise.csv
+
+A cell is a world (Fetch or GoToObject, see ``examples/misgeneralise.py``), a method and a seed, which has its own
+labelled, unlabelled, held-out and new levels. ``owned``: the best member's balanced accuracy by a feature on the ends
+of episodes in held-out levels, in which no thing has both features. ``solved``: the share of training episodes in
+thirty new levels that an agent over planned options solves, rewarded for that feature, each episode in a level drawn
+anew. ``random``: the same by uniform-random choice among the options of the first method.
+
+All methods have the settings of the example but those that name them; the weight of diversity and the share of
+positives are ``auto`` throughout.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from functools import partial
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+import hypogoal
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.data import open_dataset
+from hypogoal.evaluation.curves import run_numbers
+from hypogoal.hypotheses.scores import member_scores
+from hypogoal.options.tables import Episodes
+from studies.cells import Jobs, Row, amount, parser_of, printed, read_rows, run_cells, share, table, won
+
+WORLDS = {"fetch": "misgeneralise:FETCH", "goto": "misgeneralise_goto:GOTO"}
+FEATURES = ("colour", "shape")
+NO_DIVERSITY = {"diversity": "none"}
+ONE = {**NO_DIVERSITY, "members": 1}
+METHODS: dict[str, dict[str, Any]] = {  # settings of train-ensemble, beside the example's
+    "independent": {},
+    "one classifier": ONE,
+    "no diversity": NO_DIVERSITY,
+    "true sub-goals": ONE,
+    "D-BAT": {"diversity": "dbat"},
+    "DivDis": {"diversity": "divdis"},
+    "DivDis, share 1/3": {"diversity": "divdis", "share": 1 / 3},
+    "D-BAT, unpaired": {"diversity": "dbat-unpaired"},
+    "K = 3": {"members": 3},
+    "whole episodes": {},
+    "one start": {"restarts": 1},
+    "K = 5": {"members": 5},
+    "a hidden layer": {"network": "studies.misgeneralise:shallow", "l2_weight": 1e-4},
+    "1,000 unlabelled levels": {},
+    "no diversity, K = 16": {**NO_DIVERSITY, "members": 16},
+}
+PLAYED = 8  # of these methods, the first, have agents
+FIRST, ORACLE = "independent", "true sub-goals"
+LEVELS = {"labelled": 160, "unlabelled": 300, "heldout": 60, "new": 30}
+MANY = 1_000
+STEPS = 10_000  # of an agent: at least 100 episodes
+WINDOWS = ("solved_11_20", "solved_51_100")
+KEYS = ("world", "method", "seed")
+COLUMNS = (
+    *KEYS,
+    "step",
+    "weight",
+    "share",
+    *(f"owned_{feature}" for feature in FEATURES),
+    *(f"{window}_{feature}" for feature, window in product(FEATURES, WINDOWS)),
+    *(f"random_{feature}" for feature in FEATURES),
+    "seconds",
+)
+OWNED = 0.9
+
+
+def shallow(channels: int) -> Any:
+    """A member network with a hidden layer: what each tile of 8x8 pixels shows."""
+    return [nn.Conv2d(channels, 16, kernel_size=8, stride=8, bias=False), nn.BatchNorm2d(16), nn.ReLU()], ()
+
+
+def levels(seed: int, kind: str, count: int) -> tuple[int, ...]:
+    """Layout seeds of a kind of level, of which no two seeds share any."""
+    first = seed * 10_000 + 1_000 * [*LEVELS].index(kind)
+    return tuple(range(first, first + count))
+
+
+def data_of(folder: Path, world: str, method: str, seed: int) -> Path:
+    """The states of a seed, collected unless they are there."""
+    kind = method if method in ("whole episodes", "1,000 unlabelled levels") else "ends"
+    path = folder / f"{world}-{kind.split()[0]}-{seed}.h5"
+    counts = LEVELS | ({"unlabelled": MANY} if kind.endswith("levels") else {})
+    if not path.exists():
+        sets: Any = {f"{split}_seeds": levels(seed, split, counts[split]) for split in [*LEVELS][:3]}
+        ends = not kind.startswith("whole")
+        hypogoal.collect(WORLDS[world], path, seed=seed, quiet=True, resume=True, ends=ends, **sets)
+    return path
+
+
+def run_cell(folder: Path, world: str, method: str, seed: int) -> list[Row]:
+    """Train the ensemble, and, where the method has agents, one for each feature."""
+    torch.set_num_threads(1)
+    begun = time.process_time()
+    data = data_of(folder, world, method, seed)
+    row: Row = {"world": world, "method": method, "seed": seed, "step": 0}
+    with TemporaryDirectory() as name:
+        ensemble = Path(name) / "ensemble"
+        hypogoal.train_ensemble(data, ensemble, seed=seed, workers=1, quiet=True, **METHODS[method])
+        chosen = open_artefact(ensemble).config.get("chosen", {}).get("target", {})
+        row |= {"weight": chosen.get("diversity_weight", ""), "share": chosen.get("share", "")}
+        states = open_dataset(data).heldout("target")
+        ends = states.where(states.origins["over"] == 1)
+        predictions = hypogoal.load_ensemble(ensemble, "target").predictions(ends.observations)
+        for feature in FEATURES:
+            truth = ends.origins[f"planted_{feature}"] == 1
+            row[f"owned_{feature}"] = float(member_scores(predictions, truth)["balanced_accuracy"].max())
+        if method in [*METHODS][:PLAYED]:
+            for feature in FEATURES:
+                row |= solved(ensemble, method, feature, seed)
+    row["seconds"] = time.process_time() - begun
+    return [row]
+
+
+def solved(ensemble: Path, method: str, feature: str, seed: int) -> Row:
+    """What an agent solves that is rewarded for a feature, and what random choice does."""
+    first, *_, last = levels(seed, "new", LEVELS["new"])
+    row: Row = {}
+    for chooser in ("symbols", "random"):
+        settings: dict[str, Any] = {"world": (f"task={feature}",), "layouts": f"{first}-{last}", "steps": STEPS}
+        if method == ORACLE:
+            settings["termination"] = "oracle"
+        out = ensemble.with_name(f"{feature}-{chooser}")
+        hypogoal.train_meta(ensemble, out, seed=seed, quiet=True, chooser=chooser, **settings)
+        numbers = run_numbers(Episodes.read(out / Episodes.FILE), None)
+        if chooser == "random":
+            row[f"random_{feature}"] = numbers["solved_51_100"]
+        else:
+            row |= {f"{window}_{feature}": numbers[window] for window in WINDOWS}
+        if method != FIRST:
+            break
+    return row
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the rows say, as lines of Markdown: a table of members and one of agents for each world."""
+    rows = read_rows(path)
+    seeds = sorted({int(row["seed"]) for row in rows})
+
+    def values_of(world: str, method: str, column: str) -> np.ndarray:
+        own = [row for row in rows if row["world"] == world and row["method"] == method]
+        by_seed = {int(row["seed"]): float(row[column] or "nan") for row in own}
+        return np.array([by_seed.get(seed, np.nan) for seed in seeds])
+
+    for world in WORLDS:
+        own = [method for method in METHODS if np.isfinite(values_of(world, method, "owned_colour")).any()]
+        of_members, of_agents = [], []
+        for method in own:
+            owned = np.array([values_of(world, method, f"owned_{feature}") for feature in FEATURES])
+            known = np.isfinite(owned).all(axis=0)
+            both = f"{int((owned[:, known] >= OWNED).all(axis=0).sum())} of {known.sum()}"
+            weights = np.unique(values_of(world, method, "weight")[known])
+            chosen = ", ".join(f"{weight:g}" for weight in weights[np.isfinite(weights)])
+            if method != ORACLE:
+                of_members.append([method, chosen, both, *(share(values[known]) for values in owned)])
+            late = np.array([values_of(world, method, f"solved_51_100_{feature}") for feature in FEATURES])
+            played = np.isfinite(late).all(axis=0)
+            if not played.any():
+                continue
+            early = np.array([values_of(world, method, f"solved_11_20_{feature}") for feature in FEATURES])
+            chance = np.array([values_of(world, method, f"random_{feature}") for feature in FEATURES])
+            cells = [share(values[played]) for values in (*early, *late)]
+            worse = share(late.min(axis=0)[played])
+            by_chance = share(chance.mean(axis=0)[played]) if np.isfinite(chance).any() else "-"
+            best = np.array([values_of(world, FIRST, f"solved_51_100_{feature}") for feature in FEATURES])
+            apart = best.mean(axis=0)[played] - late.mean(axis=0)[played]
+            versus = ["-", "-"] if method == FIRST else [amount(apart), won(apart)]
+            of_agents.append([method, *cells, worse, by_chance, *versus])
+        yield ""
+        yield from table(["", "weight", "both owned", "colour", "shape"], of_members)
+        episodes = [f"{feature}, episodes {span}" for span in ("11-20", "51-100") for feature in FEATURES]
+        yield from table(
+            ["", *episodes, "worse task", "random choice", "independent minus it, median", "seeds"], of_agents
+        )
+
+
+def main() -> None:
+    """Run the cells that are missing."""
+    parser = parser_of(__doc__, "100-109", run="the folder of collected states; made where there is none")
+    parser.add_argument("--methods", help=f"some alone, separated by semicolons: {'; '.join(METHODS)}")
+    arguments = parser.parse_args()
+    if printed(arguments, tables):
+        return
+    arguments.run.mkdir(parents=True, exist_ok=True)
+    methods = arguments.methods.split("; ") if arguments.methods else [*METHODS]
+    jobs: Jobs = {}
+    for method, seed, world in product(methods, arguments.seeds, WORLDS):
+        jobs[world, method, str(seed)] = partial(run_cell, arguments.run, world, method, seed)
+    run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda _: [0], arguments.workers)
+
+
+if __name__ == "__main__":
+    main()
