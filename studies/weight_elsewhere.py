@@ -35,7 +35,7 @@ from studies.weight import CROSSED, FEATURES
 AUTO: dict[str, Any] = {"diversity_weight": "auto", "schedule": "sequential"}
 PAPER: dict[str, Any] = {"diversity_weight": 1e-4, "schedule": "simultaneous", "restarts": 1}
 BOTH: dict[str, dict[str, Any]] = {"auto": AUTO, "the paper's": PAPER}
-FETCH = {"network": "misgeneralise:shallow", "learning_rate": 1e-3, "steps": 500}
+FETCH = {"network": "studies.misgeneralise:shallow", "learning_rate": 1e-3, "steps": 500}
 KEYS = ("case", "method", "seed")
 COLUMNS = (*KEYS, "step", "weight", "first", "second", "idle")
 Spoil = Callable[[h5py.Group, np.random.Generator], None]
@@ -120,7 +120,7 @@ CASES = {
         {
             **BOTH,
             "by hand": {"diversity_weight": 0.01, "schedule": "sequential", "restarts": 1},
-            "auto, divdis": {**AUTO, "diversity": "divdis", "schedule": "simultaneous"},
+            "auto, divdis": {**AUTO, "diversity": "divdis", "schedule": "simultaneous", "restarts": 1},
             "divdis, share 1/3, weight 1": {
                 **PAPER,
                 "diversity": "divdis",

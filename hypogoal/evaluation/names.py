@@ -27,7 +27,7 @@ ON_LADDERS = dict.fromkeys(
     "",
 )  # of options, said in other columns
 OF_DIVERSITY = {"diversity_weight", "schedule", "restarts", "share"}  # settings without effect where there is none
-OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "none": "no diversity"}
+OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "independent": "independence", "none": "no diversity"}
 ONE = "one classifier"
 ORACLE = "oracle termination"
 LEARNED = "option agent"

@@ -21,7 +21,8 @@ states differ on ``a (1 - b) + b (1 - a)``, which is at most 1/2 if neither says
 The first member of a sequential ensemble is trained on the labels alone, once for all weights. If it mixes features,
 later members can only mix what is left. So ``restarts`` of them begin, and after ``EARLY`` of its steps the one stays
 whose predictions tell most about unlabelled states, by the mutual information of state and prediction, H(mean p) -
-mean H(p) (Bridle et al. 1991): a mixture is in doubt where its features part, or says no to most states.
+mean H(p) (Bridle et al. 1991): a mixture is in doubt where its features part, or says no to most states. Members that
+are trained at once end in different mixtures, so of ``restarts`` whole ensembles the one stays that tells most.
 """
 
 from collections.abc import Generator, Iterator

@@ -91,7 +91,7 @@ class EnsembleConfig(MembersConfig):
     diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     schedule: str = setting("simultaneous", "all members at once, or one after the other", choices=SCHEDULES)
     share: float | Literal["labels"] = setting(
-        LABELS, "share of positives that divdis expects among unlabelled states", low=0.0, high=1.0, words=[LABELS]
+        LABELS, "share of positives that divdis and independent expect", low=0.0, high=1.0, words=[LABELS]
     )
 
 
@@ -115,15 +115,17 @@ class TrainEnsembleConfig(MembersConfig):
     )
     restarts: int = setting(
         4,
-        "first members of a sequential ensemble that begin; the one stays that tells most about unlabelled states",
+        "first members of a sequential ensemble that begin, or whole ensembles if simultaneous; the one stays that "
+        "tells most about unlabelled states",
         source=f"{BEYOND}: docs/results/rooms.md",
         low=1,
         high=64,
     )
     share: float | Literal["auto", "labels"] = setting(
         AUTO,
-        "share of positives that divdis expects among unlabelled states; auto: what a member without diversity "
-        "predicts, if the weight is auto or the schedule sequential; labels: that of the labelled states",
+        "share of positives among unlabelled states: what divdis expects, or the least that independent does; auto: "
+        "what a member without diversity predicts, if the weight is auto or the schedule sequential; labels: that of "
+        "the labelled states",
         source=f"labels: DivDis (arXiv:2202.03418); auto: {BEYOND}",
         low=0.0,
         high=1.0,

@@ -76,7 +76,7 @@ def test_from_nothing_to_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     few = settings("labelled=40", "unlabelled=60", "new=6", "workers=1")
     run("run", "misgeneralise:fetch", "--out", out, "--trust", *few)
     rows = pd.read_csv(out / "evaluation" / "results.csv")
-    assert {*rows["task"].dropna()} == {"colour", "shape"} and {*rows["method"].dropna()} == {"divdis", "one"}
+    assert {*rows["task"].dropna()} == {"colour", "shape"} and {*rows["method"].dropna()} == {"independent", "one"}
     numbers = pd.read_csv(out / "evaluation" / "numbers.csv")
     assert {"planted_colour", "planted_shape"} <= {*numbers["scope"]}
     assert (out / "report" / "index.html").is_file()

@@ -49,6 +49,26 @@ def test_the_largest_weight_is_taken_that_members_bear() -> None:
     assert odd.step == odd.most == odd.cost(0, 0) == 5 + 3 * 2 + 5
 
 
+def test_of_whole_ensembles_the_one_stays_that_tells_most() -> None:
+    """Simultaneous members: each restart is trained to its end, and none is trained again."""
+    fixed = {"schedule": "simultaneous", "diversity_weight": 0.01, "steps": 20}
+    training = trained(AUTO.model_copy(update={**fixed, "restarts": 3}))
+    assert training.step == training.most == 3 * 20
+    starts = training.snapshot()["outcomes"]
+    told = [start["information"] for start in starts]
+    assert len({*told}) == 3
+    probabilities = training.ensemble.predict(toy()[2])
+    assert np.mean([information_of(member) for member in probabilities.T]) == pytest.approx(max(told))
+    [_, *others] = starts
+    for seed, start in zip((1, *(other["seed"] for other in others)), starts, strict=True):
+        observations, labels, unlabelled = toy()
+        alone = AutoTraining(observations, labels, unlabelled, AUTO.model_copy(update={**fixed, "restarts": 1}), seed)
+        for _ in alone.steps():
+            pass
+        one = alone.ensemble.predict(unlabelled)
+        assert np.mean([information_of(member) for member in one.T]) == pytest.approx(start["information"])
+
+
 def test_the_final_members_have_all_labels() -> None:
     """With the weight that was chosen, from the start that was chosen, they are what a fixed weight gives."""
     training = trained()
@@ -59,8 +79,15 @@ def test_the_final_members_have_all_labels() -> None:
 
 @pytest.mark.parametrize(
     "changed",
-    [{}, {"schedule": "simultaneous"}, {"diversity": "divdis"}, {"diversity": "divdis", "members": 1}, {"restarts": 1}],
-    ids=["sequential", "simultaneous", "divdis", "one member", "one start"],
+    [
+        {},
+        {"schedule": "simultaneous"},
+        {"diversity": "divdis"},
+        {"diversity": "independent"},
+        {"diversity": "divdis", "members": 1},
+        {"restarts": 1},
+    ],
+    ids=["sequential", "simultaneous", "divdis", "independent", "one member", "one start"],
 )
 def test_breaks_leave_no_trace_in_a_search(changed: dict[str, object], tmp_path: Path) -> None:
     """Spec G1: broken in each of its trainings, it tries, chooses and ends as if it had not been."""

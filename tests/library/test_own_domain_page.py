@@ -40,7 +40,7 @@ def test_the_smallest_domain_without_gymnasium(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("trusted")
-def test_four_rooms_from_the_page_to_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_four_rooms_from_the_page_to_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Labelled in a corner, planned and played elsewhere; no engine is written."""
     module_of("FourRoomsEnv", tmp_path, "four_rooms")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -61,3 +61,6 @@ def test_four_rooms_from_the_page_to_an_agent(tmp_path: Path, monkeypatch: pytes
         *settings("network=planned", "steps=300", "layouts=4", "max_episode_steps=40"),
     )
     assert json.loads((folder / "meta" / "manifest.json").read_text(encoding="utf-8"))["config"]["network"] == "planned"
+    run("evaluate", folder, "-q")
+    run("report", folder, "-q")
+    assert (folder / "report" / "index.html").is_file()
