@@ -122,8 +122,12 @@ def coverage(probabilities: Floats, planted: Mapping[str, Ints]) -> float:
     """Spec H1: the share of planted features (N,) that some member (N, K) has found: it ranks by it, and by no other.
 
     Every combination of features is equally frequent, so an area under the ROC curve of .5 is blindness to a feature.
+    NaN where some combination is missing: who ranks by one feature then ranks by another, too.
     """
-    areas = np.stack([scores.ranking(probabilities, values > 0) for values in planted.values()], axis=1)
+    holding = np.stack([values > 0 for values in planted.values()], axis=1)
+    if len(np.unique(holding, axis=0)) < 2 ** len(planted):
+        return float("nan")
+    areas = np.stack([scores.ranking(probabilities, feature) for feature in holding.T], axis=1)
     ranks = at_least(areas, OWNED_FROM)
     ignored = at_least(IGNORED_TO - 0.5, np.abs(areas - 0.5))
     alone = ignored.sum(axis=1, keepdims=True) == areas.shape[1] - 1

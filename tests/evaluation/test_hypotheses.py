@@ -65,6 +65,13 @@ def test_coverage_of_members_whose_knowledge_is_known(members: np.ndarray, cover
     assert coverage(members.astype(np.float32), PLANTED) == covered
 
 
+def test_coverage_of_features_that_exclude_each_other_is_not_told() -> None:
+    """Who ranks by one ranks by the other, too, the wrong way round."""
+    apart = CROSSED[:, 0] != CROSSED[:, 1]
+    planted = {"a": CROSSED[apart, 0], "b": CROSSED[apart, 1]}
+    assert np.isnan(coverage(SURE[apart, :2], planted))
+
+
 def accuracies(method: str, seed: int, **by_goal: list[float]) -> list[dict]:
     """Rows of an ensemble's members."""
     rows = []
