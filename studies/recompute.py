@@ -20,7 +20,6 @@ BOLD = re.compile(r"\*\*(.+?)\*\*", re.DOTALL)
 ROW = re.compile(r"^\| [^|]*\|(.*)$", re.MULTILINE)
 NO_NUMBER = re.compile(r"`[^`]*`|\]\([^)]*\)|\b\d+-\d+\b|\*\*")  # code, links, ladders
 NUMBER = re.compile(r"(?<![\w.-])-?(?:\d[\d,]*(?:\.\d+)?|\.\d+)|never(?=\])")
-COUNTED = re.compile(r"## How many episodes choosing takes.*?\n(?=## )", re.DOTALL)  # counts of the table below it
 ENDS = ["mean", "min", "max"]
 METHODS = {"auto": "auto", "none": "no diversity", "one": "one classifier", "unpaired": "auto, unpaired"}
 Found = dict[str, Any]
@@ -169,10 +168,35 @@ def of_rooms(found: Found) -> None:
         found |= {f"{name}-{truth}": share(weight[f"solved_{truth}"][method]) for truth in ("shape", "place")}
 
 
+def of_levels(found: Found) -> None:
+    """What members own and agents solve where labels fit colour and shape."""
+    for world, rows in cells("misgeneralise").groupby("world"):
+        own = rows.pivot(index="seed", columns="method")
+        owned = (own["owned_colour"] >= 0.9) & (own["owned_shape"] >= 0.9)
+        late = own["solved_51_100_colour"], own["solved_51_100_shape"]
+        for name in own["owned_colour"]:
+            key = f"{world}-{name.replace(' ', '-').replace(',', '')}"
+            found[f"{key}-owned"] = [owned[name].sum(), len(owned)]
+            found[f"{key}-worse"] = share(np.minimum(*(solved[name] for solved in late)))
+            for task, solved in zip(("colour", "shape"), late, strict=True):
+                found[f"{key}-{task}"] = share(solved[name])
+                found[f"{key}-{task}-early"] = share(own[f"solved_11_20_{task}"][name])
+
+
+def of_episodes(found: Found) -> None:
+    """How many episodes choosing takes."""
+    agents = cells("symbols").replace({"episodes_to_95": {np.nan: np.inf}})
+    for (world, chooser), rows in agents.groupby(["world", "chooser"]):
+        found[f"{world}-{chooser}"] = rows["episodes_to_95"].median()
+        found[f"{world}-{chooser}-most"] = rows["episodes_to_95"].max()
+    planned = agents[agents["world"] == "planned"].pivot(index="layout", columns="chooser", values="episodes_to_95")
+    found["times"] = (planned["ppo-16"] / planned["symbols"]).median()
+
+
 def shown_in(root: Path, where: str) -> list[str]:
     """The numbers of README's table and picture, or those in bold on a page, without code and addresses."""
     name = "README.md" if where == "README" else f"docs/results/{where}.md"
-    page = COUNTED.sub("", (root / name).read_text("utf-8"))
+    page = (root / name).read_text("utf-8")
     parts = ROW.findall(page) if where == "README" else BOLD.findall(page)
     with Image.open(root / "docs/results.png") as picture:
         of_picture = picture.info["Description"].split() if where == "README" else []
@@ -182,7 +206,7 @@ def shown_in(root: Path, where: str) -> list[str]:
 def differences(root: Path = ROOT) -> Iterator[str]:
     """A line for each number under a folder that is off by more than its last digit."""
     found: Found = {}
-    for part in (of_hypotheses, of_options, of_agents, of_rooms):
+    for part in (of_hypotheses, of_options, of_agents, of_rooms, of_levels, of_episodes):
         part(found)
     found |= {f"mean-{name}": np.ravel(value)[0] for name, value in found.items()}
     for where, names in cells("recomputed").to_numpy():

@@ -37,7 +37,7 @@ ORACLE_AGENT = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
 BUILT_IN = ("symbols", "ppo")  # choosers that learn; both in a run, their names are told apart as any setting's
 UNIFORM = "uniform-random choice among its own options"
-METHODS = ("D-BAT", "DivDis", "no diversity", ONE)  # of ensembles
+METHODS = ("D-BAT", "DivDis", "independence", "no diversity", ONE)  # of ensembles
 ORDER = (*METHODS, LEARNED, RANDOM, PRETRAINING, ORACLE_AGENT, ORACLE_RANDOM)  # in tables and figures
 
 

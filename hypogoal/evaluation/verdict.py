@@ -26,16 +26,18 @@ CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a fi
 
 def facts(work):
     """The tasks of a run, in their domains' words, each agent's, and the cap of episodes, times the shortest path."""
-    task_of, caps = {}, []
+    task_of, tasks, caps = {}, [], []
     for artefact in (*work.contents.agents, *work.contents.ladders):
         config = artefact.config
+        task = ""
         domain = installed_domain(config["domain"])
         if domain is not None:
-            world = domain.world(config.get("domain_config") or {})
-            task_of[work.place(artefact)["method"]] = domain.task(world)
+            task = domain.task(domain.world(config.get("domain_config") or {}))
+            tasks.append(task)
             caps.append(config.get("cap") or 0)
-    tasks = dict.fromkeys(filter(None, task_of.values()))
-    return {"tasks": [*tasks], "task_of": task_of, "cap": max(caps, default=0)}
+        task_of[work.place(artefact)["method"]] = ", ".join([task, *config.get("world", ())])
+    tasks = [*dict.fromkeys(filter(None, tasks))]
+    return {"tasks": tasks, "task_of": task_of, "cap": max(caps, default=0)}
 
 
 def outcome_of(difference: float, low: float, high: float) -> str:

@@ -1,6 +1,7 @@
 """Goal misgeneralisation in MiniGrid as released: examples/misgeneralise.py and misgeneralise_goto.py (Spec B6, G4)."""
 
 import importlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +81,5 @@ def test_from_nothing_to_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     numbers = pd.read_csv(out / "evaluation" / "numbers.csv")
     assert {"planted_colour", "planted_shape"} <= {*numbers["scope"]}
     assert (out / "report" / "index.html").is_file()
+    results = json.loads((out / "evaluation" / "run.json").read_text(encoding="utf-8"))
+    assert results["task_of"]["one classifier, task=shape"].endswith("task=shape"), "unlike tasks are not compared"
