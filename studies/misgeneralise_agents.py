@@ -100,7 +100,8 @@ def baselines(_: Path, world: str, seed: int) -> list[Row]:
         seen = env.reset()
         while len(env.episodes) < LOOKED_AT:
             actions, _state = agent.predict(seen)
-            seen, *_rest = env.step(actions)
+            env.step_async(actions)
+            seen, *_rest = env.step_wait()
         return numbers_of([succeeded for *_, succeeded in env.episodes])
 
     def learn(agent: Any) -> Row:

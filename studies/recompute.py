@@ -174,10 +174,12 @@ def of_levels(found: Found) -> None:
         own = rows.pivot(index="seed", columns="method")
         owned = (own["owned_colour"] >= 0.9) & (own["owned_shape"] >= 0.9)
         late = own["solved_51_100_colour"], own["solved_51_100_shape"]
+        both = (late[0] + late[1]) / 2
         for name in own["owned_colour"]:
             key = f"{world}-{name.replace(' ', '-').replace(',', '')}"
             found[f"{key}-owned"] = [owned[name].sum(), len(owned)]
             found[f"{key}-worse"] = share(np.minimum(*(solved[name] for solved in late)))
+            compare(found, f"{key}-gain", both["independent"] - both[name], median)
             for task, solved in zip(("colour", "shape"), late, strict=True):
                 found[f"{key}-{task}"] = share(solved[name])
                 found[f"{key}-{task}-early"] = share(own[f"solved_11_20_{task}"][name])
