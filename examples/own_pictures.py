@@ -5,14 +5,13 @@ Unlabelled pictures of other rooms make the members differ: one goes by the lamp
 
     python own_pictures.py
     hypogoal import pictures.npz --out runs/lamp/data.h5
-    hypogoal train-ensemble runs/lamp/data.h5 --out runs/lamp/ensemble --diversity divdis --members 2 \
-        --set schedule=simultaneous --set share=labels --set steps=100
+    hypogoal train-ensemble runs/lamp/data.h5 --out runs/lamp/ensemble --diversity independent \
+        --members 2 --set schedule=simultaneous --set steps=100
     hypogoal evaluate runs/lamp
     hypogoal report runs/lamp
 
 "Lamp or window" and "lamp and window" fit the labels as well, and differ as often as lamp and window do. D-BAT, the
-default, finds these two here. With ``share=labels`` DivDis expects as many positives elsewhere as among the labels,
-half, which neither "or" nor "and" has; in other rooms of your own it may be another share.
+default, finds these two here. Independent members are not "or" and "and", because whoever says "and" says "or".
 """
 
 import numpy as np

@@ -51,7 +51,8 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
 ) -> None:
     """Spec B6, A1-A5: an environment, two label functions and a way to wander, under 30 lines, are all one writes.
 
-    The page's commands in their order, but for ``check`` of the domain, which the next test does.
+    The page's commands in their order, but for ``check`` of the domain, which the next test does, and those in
+    FourRooms, which ``test_own_domain_page`` runs in small.
     """
     page = EXAMPLES.parent / "docs" / "own-domain.md"
     example = EXAMPLES / "unlock_pickup.py"
@@ -63,7 +64,8 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
     monkeypatch.delenv("HYPOGOAL_TRUST")
     ran = []
     for words in commands(page):
-        if words[:3] != ["hypogoal", "check", "unlock_pickup:DOMAIN"]:
+        in_four_rooms = "four" in " ".join(words)
+        if words[:3] != ["hypogoal", "check", "unlock_pickup:DOMAIN"] and not in_four_rooms:
             assert main([*words[1:], *SHORT.get(words[1], ())]) == 0, words
             ran.append(words[1])
     stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
