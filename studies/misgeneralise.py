@@ -34,7 +34,7 @@ from hypogoal.data import open_dataset
 from hypogoal.evaluation.curves import run_numbers
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.options.tables import Episodes
-from studies.cells import Jobs, Row, amount, parser_of, printed, read_rows, run_cells, share, table, won
+from studies.cells import Floats, Jobs, Row, amount, parser_of, printed, read_rows, run_cells, share, table, won
 
 WORLDS = {"fetch": "misgeneralise:FETCH", "goto": "misgeneralise_goto:GOTO"}
 FEATURES = ("colour", "shape")
@@ -145,45 +145,87 @@ def solved(ensemble: Path, method: str, feature: str, seed: int) -> Row:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """What the rows say, as lines of Markdown: a table of members and one of agents for each world."""
+    """What the rows say, as lines of Markdown: for each world a table of members and one of agents."""
     rows = read_rows(path)
-    seeds = sorted({int(row["seed"]) for row in rows})
-
-    def values_of(world: str, method: str, column: str) -> np.ndarray:
-        own = [row for row in rows if row["world"] == world and row["method"] == method]
-        by_seed = {int(row["seed"]): float(row[column] or "nan") for row in own}
-        return np.array([by_seed.get(seed, np.nan) for seed in seeds])
-
     for world in WORLDS:
-        own = [method for method in METHODS if np.isfinite(values_of(world, method, "owned_colour")).any()]
-        of_members, of_agents = [], []
-        for method in own:
-            owned = np.array([values_of(world, method, f"owned_{feature}") for feature in FEATURES])
-            known = np.isfinite(owned).all(axis=0)
-            both = f"{int((owned[:, known] >= OWNED).all(axis=0).sum())} of {known.sum()}"
-            weights = np.unique(values_of(world, method, "weight")[known])
-            chosen = ", ".join(f"{weight:g}" for weight in weights[np.isfinite(weights)])
-            if method != ORACLE:
-                of_members.append([method, chosen, both, *(share(values[known]) for values in owned)])
-            late = np.array([values_of(world, method, f"solved_51_100_{feature}") for feature in FEATURES])
-            played = np.isfinite(late).all(axis=0)
-            if not played.any():
-                continue
-            early = np.array([values_of(world, method, f"solved_11_20_{feature}") for feature in FEATURES])
-            chance = np.array([values_of(world, method, f"random_{feature}") for feature in FEATURES])
-            cells = [share(values[played]) for values in (*early, *late)]
-            worse = share(late.min(axis=0)[played])
-            by_chance = share(chance.mean(axis=0)[played]) if np.isfinite(chance).any() else "-"
-            best = np.array([values_of(world, FIRST, f"solved_51_100_{feature}") for feature in FEATURES])
-            apart = best.mean(axis=0)[played] - late.mean(axis=0)[played]
-            versus = ["-", "-"] if method == FIRST else [amount(apart), won(apart)]
-            of_agents.append([method, *cells, worse, by_chance, *versus])
+        numbers: dict[str, Numbers] = {}
+        for method in METHODS:
+            own = [row for row in rows if (row["world"], row["method"]) == (world, method)]
+            if own:
+                numbers[method] = numbers_of(own)
         yield ""
-        yield from table(["", "weight", "both owned", "colour", "shape"], of_members)
-        episodes = [f"{feature}, episodes {span}" for span in ("11-20", "51-100") for feature in FEATURES]
-        yield from table(
-            ["", *episodes, "worse task", "random choice", "independent minus it, median", "seeds"], of_agents
-        )
+        yield from table(OF_MEMBERS, members_of(numbers))
+        yield from table(OF_AGENTS, agents_of(numbers))
+
+
+Numbers = dict[str, dict[int, float]]  # by column and seed
+OF_MEMBERS = (
+    "members",
+    "weights chosen",
+    "seeds with both owned",
+    "best member's balanced accuracy by colour",
+    "by shape",
+)
+OF_AGENTS = (
+    "members",
+    "colour, episodes 11-20",
+    "shape, 11-20",
+    "colour, 51-100",
+    "shape, 51-100",
+    "worse task, 51-100",
+    "random choice, both",
+    "independent minus it, both",
+    "seeds on which it leads",
+)
+
+
+def numbers_of(rows: list[dict[str, str]]) -> Numbers:
+    """The numbers that rows of one method have."""
+    found: Numbers = {}
+    for row, column in product(rows, COLUMNS[4:]):
+        if row[column] not in ("", "labels"):
+            found.setdefault(column, {})[int(row["seed"])] = float(row[column])
+    return found
+
+
+def in_order(numbers: Numbers, column: str) -> Floats:
+    """A column's numbers by seed."""
+    by_seed = numbers.get(column, {})
+    return np.array([by_seed[seed] for seed in sorted(by_seed)])
+
+
+def members_of(numbers: dict[str, Numbers]) -> Iterator[list[str]]:
+    """A row for each method: what its best members know."""
+    for method, own in numbers.items():
+        if method == ORACLE:
+            continue
+        accuracies = [in_order(own, f"owned_{feature}") for feature in FEATURES]
+        both = np.minimum(*accuracies) >= OWNED
+        weights = ", ".join(f"{weight:g}" for weight in np.unique(in_order(own, "weight")))
+        yield [method, weights, f"{both.sum()} of {len(both)}", *map(share, accuracies)]
+
+
+def agents_of(numbers: dict[str, Numbers]) -> Iterator[list[str]]:
+    """A row for each method that has agents: what they solve."""
+    for method, own in numbers.items():
+        if "solved_51_100_colour" not in own:
+            continue
+        solved = [in_order(own, f"{window}_{feature}") for window in WINDOWS for feature in FEATURES]
+        worse = np.minimum(*solved[2:])
+        by_chance = [in_order(own, f"random_{feature}") for feature in FEATURES]
+        chance = share(np.mean(by_chance, axis=0)) if len(by_chance[0]) else "-"
+        lead = lead_of(numbers[FIRST], own)
+        versus = ["-", "-"] if method == FIRST else [amount(lead), won(lead)]
+        yield [method, *map(share, solved), share(worse), chance, *versus]
+
+
+def lead_of(first: Numbers, other: Numbers) -> Floats:
+    """The mean of both tasks minus another method's, by seed."""
+    means = []
+    for numbers in (first, other):
+        by_seed = [numbers[f"solved_51_100_{feature}"] for feature in FEATURES]
+        means.append({seed: (by_seed[0][seed] + by_seed[1][seed]) / 2 for seed in by_seed[0]})
+    return np.array([means[0][seed] - means[1][seed] for seed in sorted(means[1])])
 
 
 def main() -> None:
