@@ -276,15 +276,13 @@ class AutoTraining:
 
     def _best_start(self, rows: Bools, members: int, until: int, weight: float = 0.0) -> Outcome:
         """Begin ``restarts`` trainings: the one that tells most after so many steps, to go on from."""
-        starts = []
+        best = self._fresh
         for restart in range(self.config.restarts):
             seed = seeding.seed_for(self.seed, "restart", restart) if restart else self.seed
             begun = self._fresh | {"seed": seed}
-            starts.append((yield from self._train(rows, begun, weight, members=members, until=until)))
-        best = max(starts, key=itemgetter("information"))
-        for start in starts:
-            if start is not best:
-                start["training"] = None  # it may be large
+            start = yield from self._train(rows, begun, weight, members=members, until=until)
+            worse, best = sorted([start, best], key=itemgetter("information"))
+            worse["training"] = None  # it may be large
         return best
 
     def _train(
