@@ -1,4 +1,4 @@
-"""Members that are independent, whatever share of states each says yes to: DivDis with a range of shares."""
+"""Members that are independent, each with a share of positives of its own: DivDis with a range of shares."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ def ensemble_loss(context: Context) -> Tensor:
 
     ``sum_m sum_{i != m} I(y_i; y_m) + sum_m KL(s_m || nearest of [share, 1/2])``, with s_m = mean_n p_m(y|n). DivDis
     expects the same share of every member. But two features that the labels fit need not hold equally often, and a
-    member that must say yes to more or fewer states than its feature does is a mixture. Here the setting ``share`` is
+    member that must be positive on more or fewer states than its feature is a mixture. Here the setting ``share`` is
     the least: what fits all features at once is rarer than each of them.
 
     Returns:
