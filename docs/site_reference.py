@@ -63,10 +63,8 @@ PYTHON: dict[str, tuple[str | tuple[str, str], ...]] = {
             "hypogoal.hypotheses.scores",
             "member_scores, ranking, best_threshold, cross_fitted, best_mean_worst, mean_disagreement",
         ),
-        (
-            "hypogoal.evaluation.house",
-            "read_numbers, per_run, over, pairs, compare, interval, student_interval, interquartile_mean",
-        ),
+        ("hypogoal.evaluation.table", "read_numbers, per_run"),
+        ("hypogoal.evaluation.statistics", "over, pairs, compare, interval, bounded, median_bounds"),
         ("hypogoal.hypotheses.deep_lift", "attributed, Attributions"),
         "hypogoal.meta.smdp.smdp_advantages",
         "hypogoal.learners.double_dqn.double_q_targets",

@@ -2,9 +2,10 @@
 
 from functools import partial
 
-from hypogoal.evaluation.house import per_run, tables_of
 from hypogoal.evaluation.page import Drawn
 from hypogoal.evaluation.plots import plot
+from hypogoal.evaluation.statistics import tables_of
+from hypogoal.evaluation.table import per_run
 
 TITLE = "How long options take"
 STEPS = 15  # in a second: 60 frames, four a step

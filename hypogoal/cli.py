@@ -229,7 +229,7 @@ def show(
     details = look.describe(path)
     echo(details, as_json, [*look.outcome(details), *look.lines(details)] or look.in_the_making(path))
     if pictures is not None:
-        from hypogoal.evaluation.pictures import write_sheets
+        from hypogoal.tools.sheets import write_sheets
 
         say(*write_sheets(path, pictures), err=as_json)
 

@@ -9,15 +9,16 @@ from statistics import fmean
 from typing import Any
 
 from hypogoal.cells import read_plan, status_lines
-from hypogoal.core.artefacts import LOG, MANIFEST, Artefact, Draft
+from hypogoal.core.artefacts import LOG, MANIFEST, SUMMARY, Artefact, Draft
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_log, visible
+from hypogoal.core.files import read_log, reading, visible
 from hypogoal.core.progress import say
 from hypogoal.data import SPLITS, open_dataset
 from hypogoal.observations import type_text
 
 WIDTH = 80  # columns
 EVALUATION = "evaluation"
+SUMMARISED = {EVALUATION: "Evaluate the run again, with --force.", "comparison": "Compare the runs again."}
 # Of a training's log, in the order in which they are shown.
 LOGGED = ("labelled", "success", "length", "reached", "terminated", "duration", "episodes")
 Details = dict[str, Any]  # a description
@@ -91,18 +92,11 @@ def outcome(details: Details) -> list[str]:
         return evaluations[0] if evaluations else []
     if kind == "data":
         return count_lines(numbers)
-    if kind == EVALUATION:
-        from hypogoal.evaluation.questions import answers, summary
-        from hypogoal.evaluation.run import read_results
-
-        path = Path(details["path"])
-        results = read_results(Artefact(path))
-        return summary(results, answers(results))
-    if kind == "comparison":
-        from hypogoal.evaluation.compare import read_pairs, winners
-
-        return winners(read_pairs(Path(details["path"])))
-    return []
+    if kind not in SUMMARISED:
+        return []
+    path = Path(details["path"]) / SUMMARY
+    with reading(path, SUMMARISED[kind], "the summary"):
+        return path.read_text(encoding="utf-8").splitlines()
 
 
 def count_lines(counts: Details) -> list[str]:
@@ -220,7 +214,7 @@ class Made:
         """Its numbers: counts of states or a training's last log entry, a dict; of an evaluation the DataFrame."""
         table = self.path / "numbers.csv"
         if table.is_file():
-            from hypogoal.evaluation.house import read_numbers
+            from hypogoal.evaluation.table import read_numbers
 
             return read_numbers(table)
         return dict(describe(self.path).get("numbers", {}))

@@ -14,13 +14,12 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
 
 from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
 from hypogoal.core.progress import Progress
 from hypogoal.domains.base import Domain
-from hypogoal.evaluation.house import ROUNDING, sign_test
+from hypogoal.evaluation.statistics import MEDIANS_FROM, ROUNDING, SHARES_FROM, TAILS, bounded, median_bounds, sign_test
 from hypogoal.stages.collect import collect
 
 T = TypeVar("T")
@@ -30,9 +29,8 @@ Bounds: TypeAlias = Callable[[Floats], tuple[float, float]]
 Cell = tuple[str, ...]
 Jobs: TypeAlias = dict[Cell, Callable[[], list[Row]]]  # what makes a cell's rows
 # How many values an interval takes: ``studies.coverage`` chose method and number for each kind of value.
-SCORES_FROM, SHARES_FROM, AMOUNTS_FROM = 4, 3, 6
+SCORES_FROM = 4
 RESAMPLES = 20_000
-TAILS = (0.025, 0.975)
 
 
 def parser_of(doc: str | None, seeds: str = "", *, run: str = "") -> argparse.ArgumentParser:
@@ -137,7 +135,7 @@ def share(values: Floats, digits: int = 2, least: float = 0.0) -> str:
 
 def amount(values: Floats, digits: int = 2) -> str:
     """Write the median of amounts, or of differences of shares, with the interval of :func:`median_bounds`."""
-    return _shown(values, digits, np.median, median_bounds, AMOUNTS_FROM)
+    return _shown(values, digits, np.median, median_bounds, MEDIANS_FROM)
 
 
 def _shown(values: Floats, digits: int, middle: Any, bounds: Bounds, least: int) -> str:
@@ -183,30 +181,6 @@ def bootstrap_t(values: Floats) -> tuple[float, float]:
     ratios = (resamples.mean(axis=1)[differ] - mean) / errors[differ]
     low, high = np.quantile(ratios, TAILS)
     return float(mean - high * error), float(mean - low * error)
-
-
-def bounded(values: Floats, least: float = 0.0) -> tuple[float, float]:
-    """Bound the mean of (n,) values between ``least`` and 1: Gaffke's 95 % interval (2005).
-
-    Each value, and a bound that was not seen, weighs as much as the gaps between n even numbers say: the lower end has
-    ``least`` as the unseen one, the upper end 1. Of zeros and ones it is Clopper and Pearson's interval.
-    """
-    weights = np.random.default_rng(0).dirichlet(np.ones(len(values) + 1), RESAMPLES)
-    known = weights[:, 1:] @ np.sort(values)
-    low = np.quantile(known + weights[:, 0] * least, TAILS[0])
-    high = np.quantile(known + weights[:, 0], TAILS[1])
-    return float(low), float(high)
-
-
-def median_bounds(values: Floats) -> tuple[float, float]:
-    """Bound the median of (n,) values: the widest pair of them outside of which few enough are expected.
-
-    At n = 10 these are the second and the ninth, since at most one of ten lies below the median in 1 % of cases.
-    Without ties it excludes 0 where the sign test does (p < .05).
-    """
-    ordered = np.sort(values)
-    outside = int(binom.ppf(TAILS[0], len(values), 0.5))
-    return float(ordered[outside - 1]), float(ordered[-outside])
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

@@ -177,7 +177,7 @@ def bounded(values: Values) -> Bounds:
 
 
 def median(values: Values) -> Bounds:
-    """The interval of the median between two of the values, see ``studies.cells.median_bounds``; NaN below six."""
+    """The interval of the median between two of the values, see ``hypogoal.evaluation.statistics``; NaN below six."""
     n = values.shape[1]
     ordered = np.sort(values, 1)
     outside = int(stats.binom.ppf(0.025, n, 0.5))

@@ -33,7 +33,7 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.data import Collected
 from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig
-from hypogoal.evaluation.house import above
+from hypogoal.evaluation.statistics import above
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking

@@ -50,10 +50,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def short_evaluations() -> Iterator[None]:
     """Evaluations explain 5 states of the gallery instead of 20, and let agents play a quarter of the episodes."""
-    from hypogoal.evaluation import attributing, frozen
+    from hypogoal.evaluation import frozen, saliency
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(attributing, "EXPLAINED", 5)
+        patch.setattr(saliency, "EXPLAINED", 5)
         patch.setattr(frozen, "EPISODES", 2)
         patch.setattr(frozen, "STEPS", 100)
         yield

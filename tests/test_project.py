@@ -141,6 +141,7 @@ def test_extras_that_a_line_names_exist() -> None:
         (STEP, {"torch"}, {"torch._dynamo"}),
         (HELP, {"typer", "hypogoal.experiments.run"}, HEAVY),
         (TRAINING, {"torch"}, {"scipy", "pandas", "matplotlib"}),
+        ("import hypogoal.evaluation.run", {"pandas"}, {"matplotlib", "jinja2", "rich"}),
     ],
 )
 def test_imports_are_light(code: str, loaded: set[str], unloaded: set[str]) -> None:

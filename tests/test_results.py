@@ -15,14 +15,14 @@ from scipy.stats import binomtest
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.domains.rooms.domain import DOMAIN
+from hypogoal.evaluation import statistics
+from hypogoal.evaluation.statistics import bounded, median_bounds
 from studies import cells, coverage, hypotheses, pages, recompute
 from studies.cells import (
     amount,
     bootstrap_t,
-    bounded,
     collect_once,
     interval,
-    median_bounds,
     run_cells,
     share,
     won,
@@ -180,8 +180,8 @@ def test_tables_show_the_intervals_that_were_chosen() -> None:
     rows = cells.read_rows(RESULTS / "coverage.csv")
     chosen = {kind: coverage.chosen(rows, kind) for kind in coverage.SHAPES}
     assert chosen["score"] == chosen["pair of scores"] == ("bootstrap-t", cells.SCORES_FROM)
-    assert chosen["solved"] == ("bounded", cells.SHARES_FROM)
-    assert chosen["pair of shares"] == chosen["amount"] == ("median", cells.AMOUNTS_FROM)
+    assert chosen["solved"] == ("bounded", statistics.SHARES_FROM)
+    assert chosen["pair of shares"] == chosen["amount"] == ("median", statistics.MEDIANS_FROM)
     values = np.random.default_rng(0).uniform(0.4, 0.9, 10)
     for simulated, shown in ((coverage.bootstrap_t, bootstrap_t), (coverage.bounded, bounded)):
         assert np.ravel(simulated(values[None])) == pytest.approx(shown(values), abs=0.02)

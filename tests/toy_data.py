@@ -52,9 +52,9 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
     return {
         "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
         "baseline": {LOG, "episodes.csv", "layout.json", "policy.safetensors"},
-        "evaluation": {"run.json", "numbers.csv", "arrays.h5"},
+        "evaluation": {"run.json", "numbers.csv", "arrays.h5", "summary.txt"},
         "report": {"index.html"},
-        "comparison": {"index.html", "pairs.csv"},
+        "comparison": {"index.html", "pairs.csv", "summary.txt"},
     }[kind]
 
 

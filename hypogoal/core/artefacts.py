@@ -26,6 +26,7 @@ from hypogoal.core.files import reading, replace_text, sync
 
 MANIFEST = "manifest.json"
 LOG = "metrics.jsonl"
+SUMMARY = "summary.txt"  # what `evaluate` and `compare` print
 TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
 DATA = "data"  # the kind of outputs that are HDF5 files
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock

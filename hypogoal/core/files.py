@@ -7,8 +7,11 @@ import contextlib
 import json
 import os
 from collections.abc import Iterator, Sequence
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
+
+from pydantic_core import to_json
 
 from hypogoal.core.errors import UserError, reason
 
@@ -102,3 +105,13 @@ def visible(folder: Path, pattern: str) -> list[Path]:
     """The paths below a folder that match a pattern, sorted; hidden ones, such as drafts, are left out."""
     paths = [path for path in folder.rglob(pattern) if "/." not in f"/{path.relative_to(folder).as_posix()}"]
     return sorted(paths)
+
+
+def as_json(facts: Any) -> str:
+    """Text of facts and numbers, NumPy's too; NaN becomes null."""
+    return to_json(
+        facts,
+        indent=1,
+        inf_nan_mode="null",
+        fallback=methodcaller("item"),
+    ).decode()

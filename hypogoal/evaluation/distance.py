@@ -13,17 +13,12 @@ from pandas import DataFrame
 from hypogoal.core.arrays import Bytes
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import (
-    melted,
-    options_of,
-    per_run,
-    tables_of,
-    tidy,
-)
 from hypogoal.evaluation.hypotheses import VALIDATED
 from hypogoal.evaluation.names import ORACLE
 from hypogoal.evaluation.page import Drawn
 from hypogoal.evaluation.run import takes
+from hypogoal.evaluation.statistics import tables_of
+from hypogoal.evaluation.table import melted, options_of, per_run, tidy
 from hypogoal.hypotheses.scores import most_and_least
 from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Executions

@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints
 from hypogoal.data import PLANTED
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import at_least, melted, per_run, tables_of, tidy
 from hypogoal.evaluation.judging import Judged
 from hypogoal.evaluation.page import Drawn
+from hypogoal.evaluation.statistics import at_least, tables_of
+from hypogoal.evaluation.table import melted, per_run, tidy
 from hypogoal.hypotheses import scores
 
 TITLE = "Hypotheses"

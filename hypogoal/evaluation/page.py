@@ -23,7 +23,6 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import versions
 from hypogoal.evaluation import pictures
-from hypogoal.evaluation.house import BOOTSTRAP_FROM
 from hypogoal.evaluation.plots import slug, styled, to_file
 
 WIDTH = 80  # of tables in a terminal
@@ -50,27 +49,6 @@ class Drawn:
     def svg(self) -> bytes:
         """Its file."""
         return to_file(self.figure, "svg")
-
-
-@dataclass(frozen=True)
-class Results:
-    """An evaluated run: what ``numbers.csv``, ``run.json`` and ``arrays.h5`` hold."""
-
-    numbers: DataFrame
-    facts: Mapping[str, Any]
-    arrays: Mapping[str, Any] = field(default_factory=dict)
-
-    def of(self, **fields: Any) -> DataFrame:
-        """The numbers whose columns have these values; a list: any of them."""
-        rows = self.numbers
-        for name, value in fields.items():
-            rows = rows[rows[name].isin(value if isinstance(value, list) else [value])]
-        return rows
-
-    def within(self, folder: str) -> dict[str, Any]:
-        """The arrays of a folder, by their names in it."""
-        start = f"{folder}/"
-        return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
 
 def fixed(
@@ -116,9 +94,8 @@ deviation = partial(spread, error="standard_deviation")  # beside the mean the s
 
 
 def bounded(row: Any, *how: Any) -> str:
-    """The mean or the interquartile mean, whichever the 95 % interval beside it is of."""
-    value = row["mean"] if row["units"] < BOOTSTRAP_FROM else row["iqm"]
-    return fixed(value, *how) + between(row["low"], row["high"], *how)
+    """The mean of shares or the median of all else, and its 95 % interval."""
+    return fixed(row["estimate"], *how) + between(row["low"], row["high"], *how)
 
 
 def counted(row: Any) -> str:
@@ -131,7 +108,7 @@ def displayed(
     by: dict[str, str],
     columns: Mapping[str, Any],
 ) -> DataFrame:
-    """A table of :func:`house.over` as people read it: a row for each combination of ``by``, whose titles it gives.
+    """A table of :func:`statistics.over` as people read it: a row for each combination of ``by``, with titles.
 
     ``columns`` are by title a quantity, and a function that writes a row's statistics with its further arguments.
     Labels that are the same everywhere are left out but the method's.

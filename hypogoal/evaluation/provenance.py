@@ -6,8 +6,7 @@ import pandas as pd
 
 from hypogoal.data import open_dataset
 from hypogoal.evaluation.names import as_text
-from hypogoal.evaluation.page import Results
-from hypogoal.evaluation.run import Contents
+from hypogoal.evaluation.run import Contents, Results
 
 TITLE = "Data, settings, provenance"
 KEPT = {"kind", "seed", "config", "inputs", "command", "versions"}  # of a manifest

@@ -1,17 +1,17 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own, its template, and a line here.
 
-A question is a module with ``TITLE`` and ``context(results)``, of :class:`page.Results`: by name what its template
+A question is a module with ``TITLE`` and ``context(results)``, of :class:`run.Results`: by name what its template
 needs, nothing where the run has nothing of it. These names are known here:
 
-- ``table``: each run's numbers, of :func:`house.per_run`, over which :func:`house.over` goes; written as a file.
+- ``table``: each run's numbers, of :func:`table.per_run`, over which :func:`statistics.over` goes; written as a file.
 - ``compared``: those of each run's numbers whose pairs, ``pairs``, its table of pairs has.
 - ``figures``: :class:`page.Drawn` ones, of which its template's macro ``caption`` says what they show.
 
-Its template sets ``shown``, what a terminal prints, unless it is ``FOLDED``. What puts numbers of its own into the
-table is named in ``LOOKS`` or ``ROWS``.
+Its template sets ``shown``, what a terminal prints, unless it is folded.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,12 +20,13 @@ import pandas as pd
 from rich.console import Group
 from rich.table import Table
 
+from hypogoal.core.artefacts import SUMMARY
+from hypogoal.core.files import as_json
 from hypogoal.evaluation import (
     choosing,
     curves,
     distance,
     exploits,
-    house,
     hypotheses,
     judging,
     page,
@@ -33,29 +34,46 @@ from hypogoal.evaluation import (
     rooms,
     saliency,
     selection,
+    statistics,
+    table,
     undecided,
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.page import Results
-from hypogoal.evaluation.run import FORMAT
+from hypogoal.evaluation.run import FORMAT, Results
 
 Context = dict[str, Any]  # what a question's template is given
-QUESTIONS = [  # in the order of the page
-    curves,
-    rooms,
-    distance,
-    exploits,
-    hypotheses,
-    saliency,
-    selection,
-    choosing,
-    zero_shot,
-    provenance,
-]
-FOLDED = (exploits, saliency, selection, provenance)  # until asked for
-LOOKS = (hypotheses.look, saliency.look)  # rows (DataFrames) of :class:`judging.Work` and :class:`judging.Judgement`
-ROWS = (curves.rows, distance.rows, exploits.rows, selection.rows, choosing.rows, zero_shot.rows)  # of ``Work`` alone
+Rows = Iterable[pd.DataFrame]  # of the table of numbers
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question: its module, and what puts numbers of its own into the table."""
+
+    module: ModuleType
+    look: Callable[[judging.Work, judging.Judgement], Rows] | None = None  # is called with each sub-goal judged
+    rows: Callable[[judging.Work], Rows] | None = None  # is called once, after all of them
+    folded: bool = False  # on the page until asked for, and not in a terminal
+    beside: bool = False  # told of several runs side by side, too
+
+    @property
+    def name(self) -> str:
+        """What its template, its table and its section are called."""
+        return self.module.__name__.rpartition(".")[-1].replace("_", "-")
+
+
+QUESTIONS = (  # in the order of the page
+    Question(curves, rows=curves.rows, beside=True),
+    Question(rooms, beside=True),
+    Question(distance, rows=distance.rows, beside=True),
+    Question(exploits, rows=exploits.rows, folded=True),
+    Question(hypotheses, look=hypotheses.look, beside=True),
+    Question(saliency, look=saliency.look, folded=True),
+    Question(selection, rows=selection.rows, folded=True),
+    Question(choosing, rows=choosing.rows),
+    Question(zero_shot, rows=zero_shot.rows),
+    Question(provenance, folded=True),
+)
 
 
 def answers(results: Results) -> list[Context]:
@@ -64,39 +82,36 @@ def answers(results: Results) -> list[Context]:
     return [context for context in contexts if context]
 
 
-def context_of(question: ModuleType, results: Results) -> Context | None:
+def context_of(question: Question, results: Results) -> Context | None:
     """What a question's template is given; None where the run has nothing of it."""
-    parts = question.context(results)
+    parts = question.module.context(results)
     if not parts:
         return None
     compared = parts.get("compared", pd.DataFrame())
     return {
-        "name": name_of(question),
-        "title": question.TITLE,
-        "folded": question in FOLDED,
+        "name": question.name,
+        "title": question.module.TITLE,
+        "folded": question.folded,
         "results": results,
         "table": pd.DataFrame(),
-        "pairs": compared if compared.empty else house.pairs(compared),
+        "pairs": compared if compared.empty else statistics.pairs(compared),
         "figures": [],
         **parts,
     }
-
-
-def name_of(question: ModuleType) -> str:
-    """What its template, its table and its section are called."""
-    return question.__name__.rpartition(".")[-1].replace("_", "-")
 
 
 def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
     """Every number of a run, and what else its page needs: ensembles are judged, then all questions asked."""
     parts: list[pd.DataFrame] = []
     for judgement in work.judgements():
-        for look in LOOKS:
-            parts += look(work, judgement)
+        for question in QUESTIONS:
+            if question.look:
+                parts += question.look(work, judgement)
         work.progress.advance()
-    for rows in ROWS:
-        parts += rows(work)
-    numbers = house.joined(parts)
+    for question in QUESTIONS:
+        if question.rows:
+            parts += question.rows(work)
+    numbers = table.joined(parts)
     missing = [] if work.contents.ensembles else ["no ensemble"]
     facts = {
         "format": FORMAT,
@@ -112,18 +127,21 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
     return Results(numbers, facts)
 
 
-def write(folder: Path, results: Results, every: list[Context]) -> None:
-    """Write ``numbers.csv``, ``run.json`` and, of :func:`answers`, ``tables/*.csv``."""
+def write(folder: Path, results: Results, every: list[Context]) -> list[str]:
+    """Write ``numbers.csv``, ``run.json`` and, of :func:`answers`, ``tables/*.csv`` and the summary; return that."""
     results.numbers.to_csv(folder / "numbers.csv", index=False)
-    (folder / "run.json").write_text(house.as_json(results.facts) + "\n", encoding="utf-8")
+    (folder / "run.json").write_text(as_json(results.facts) + "\n", encoding="utf-8")
     tables = {"verdict": pd.DataFrame(verdict.findings(results))}
     for context in every:
         tables[context["name"]] = context["table"]
         tables[f"{context['name']}-pairs"] = context["pairs"]
     (folder / "tables").mkdir()
-    for name, table in tables.items():
-        if not table.empty:
-            table.to_csv(folder / "tables" / f"{name}.csv", index=False)
+    for name, rows in tables.items():
+        if not rows.empty:
+            rows.to_csv(folder / "tables" / f"{name}.csv", index=False)
+    lines = summary(results, every)
+    (folder / SUMMARY).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return lines
 
 
 def summary(results: Results, every: list[Context]) -> list[str]:

@@ -12,9 +12,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.house import per_run, tables_of
 from hypogoal.evaluation.hypotheses import KNOWN, VALIDATED
 from hypogoal.evaluation.page import Drawn
+from hypogoal.evaluation.statistics import tables_of
+from hypogoal.evaluation.table import per_run
 
 TITLE = "Hypotheses in rooms without labels"
 SCORED = ("balanced_accuracy", "accuracy", "ranking")
@@ -72,7 +73,7 @@ def _figures(table):
 def scores_over_groups(table: pd.DataFrame) -> Figure:
     """Figure 3: scores against the number of labelled ladder groups, a panel for each of ``PANELS``.
 
-    Of a table of :func:`house.over`, all of one sub-goal; dotted is a member that is never positive.
+    Of a table of :func:`statistics.over`, all of one sub-goal; dotted is a member that is never positive.
     """
     never = table[table["quantity"] == NEVER].drop_duplicates("N").set_index("N")["mean"]
     figure = Figure(figsize=(plots.WIDTH, 4.55))

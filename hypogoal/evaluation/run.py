@@ -4,21 +4,45 @@ A damaged file is refused in one line (Spec G2).
 """
 
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+from pandas import DataFrame
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading, visible
 from hypogoal.core.own_code import command
 from hypogoal.data import opened
-from hypogoal.evaluation.house import EVALUATE_AGAIN, read_numbers
-from hypogoal.evaluation.page import Results
+from hypogoal.evaluation.table import EVALUATE_AGAIN, read_numbers
 from hypogoal.options.tables import Executions
 
-FORMAT = 5  # of ``run.json``
+FORMAT = 6  # of an evaluation, in its ``run.json``
 DEPTH = 3  # levels of folders below a run that are searched for artefacts
+
+
+@dataclass(frozen=True)
+class Results:
+    """An evaluated run: what ``numbers.csv``, ``run.json`` and ``arrays.h5`` hold."""
+
+    numbers: DataFrame
+    facts: Mapping[str, Any]
+    arrays: Mapping[str, Any] = field(default_factory=dict)
+
+    def of(self, **fields: Any) -> DataFrame:
+        """The numbers whose columns have these values; a list: any of them."""
+        rows = self.numbers
+        for name, value in fields.items():
+            rows = rows[rows[name].isin(value if isinstance(value, list) else [value])]
+        return rows
+
+    def within(self, folder: str) -> dict[str, Any]:
+        """The arrays of a folder, by their names in it."""
+        start = f"{folder}/"
+        return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
 
 @dataclass(frozen=True)

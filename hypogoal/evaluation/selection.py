@@ -13,9 +13,9 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains import base
 from hypogoal.evaluation import page, plots
 from hypogoal.evaluation.curves import chosen_by
-from hypogoal.evaluation.house import melted, options_of
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.run import takes
+from hypogoal.evaluation.table import melted, options_of
 from hypogoal.hypotheses import scores
 from hypogoal.meta.config import layout_seeds
 from hypogoal.observations import PICTURE

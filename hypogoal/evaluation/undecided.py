@@ -73,7 +73,7 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
         second, best = values.mean(axis=0).argsort()[-2:]
         difference = values[:, best] - values[:, second]
         low, high = np.percentile(difference, (2.5, 97.5))
-        if outcome_of(difference.mean(), low, high) != UNDECIDED:
+        if outcome_of(low, high) != UNDECIDED:
             continue
         pair = sorted([int(tried[best]), int(tried[second])])
         numbers = {"difference": difference.mean(), "low": low, "high": high}
@@ -88,8 +88,8 @@ def to_label(work: Work, artefact: Artefact, sub_goal: str, pair: list[int]) -> 
     There are none if the ensemble is not part of the run, or its file has no unlabelled states.
     """
     from hypogoal.data import open_dataset
-    from hypogoal.evaluation.recorded import next_to_label
     from hypogoal.hypotheses.ensemble import read_ensemble
+    from hypogoal.hypotheses.labelling import next_to_label
 
     place = artefact.input("ensemble").resolve()
     source = next((each for each in work.contents.ensembles if each.path.resolve() == place), None)

@@ -13,10 +13,11 @@ import pandas as pd
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.choosing import FROZEN
 from hypogoal.evaluation.curves import chosen_by
-from hypogoal.evaluation.house import compare, paired, per_run
 from hypogoal.evaluation.hypotheses import VALIDATED
 from hypogoal.evaluation.names import ONE, ORACLE, UNIFORM
-from hypogoal.evaluation.page import Results
+from hypogoal.evaluation.run import Results
+from hypogoal.evaluation.statistics import MEDIANS_FROM, compare, paired
+from hypogoal.evaluation.table import per_run
 from hypogoal.evaluation.zero_shot import SCOPE as OTHER_LAYOUTS
 
 MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
@@ -40,13 +41,11 @@ def facts(work):
     return {"tasks": tasks, "task_of": task_of, "cap": max(caps, default=0)}
 
 
-def outcome_of(difference: float, low: float, high: float) -> str:
-    """What a difference of shares says; of one unit, whose bounds are NaN, the difference alone.
+def outcome_of(low: float, high: float) -> str:
+    """What the interval of a difference of shares says; of too few units for one, the range of their differences.
 
-    An interval within ``MARGIN`` of 0 is no difference, one above or below 0 is a difference, any other undecided.
+    Within ``MARGIN`` of 0 it is no difference, above or below 0 it is a difference, any other is undecided.
     """
-    if math.isnan(low):
-        low = high = difference
     if max(abs(low), abs(high)) < MARGIN:
         return ALIKE
     if low > 0:
@@ -63,8 +62,10 @@ def finding(subject: str, first: pd.DataFrame, second: pd.DataFrame, on: list[st
     if both.empty:
         return []
     result = compare(both.assign(of="success"), "ladder" if subject == OPTIONS else "layout")
-    bounds = [result[f"difference{end}"] for end in ("", "_low", "_high")]
-    return [{"subject": subject, **result, "outcome": outcome_of(*bounds)}]
+    low, high = result["difference_low"], result["difference_high"]
+    if math.isnan(low):
+        low, high = result["difference_least"], result["difference_most"]
+    return [{"subject": subject, **result, "outcome": outcome_of(low, high)}]
 
 
 def findings(results: Results) -> list[dict[str, Any]]:
@@ -125,6 +126,7 @@ def context(results):
     return {
         "results": results,
         "margin": MARGIN,
+        "enough": MEDIANS_FROM,
         "findings": findings(results),
         "undecided": results.facts.get("undecided", []),
         "agents": agents,

@@ -16,8 +16,9 @@ from hypogoal.core.artefacts import Artefact
 from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation.choosing import with_choosers
 from hypogoal.evaluation.curves import scores
-from hypogoal.evaluation.house import options_of, per_run, tables_of
 from hypogoal.evaluation.names import UNIFORM
+from hypogoal.evaluation.statistics import tables_of
+from hypogoal.evaluation.table import options_of, per_run
 
 if TYPE_CHECKING:
     from hypogoal.options.loop import OptionLoop

@@ -59,7 +59,6 @@ def evaluate(
         if left := cells.unmade(run):
             line = f"{len(left)} of the run's cells are not done; the first is {left[0]}"
             results.facts["missing"].append(line)
-        every = questions.answers(results)
-        questions.write(draft.files, results, every)
+        lines = questions.write(draft.files, results, questions.answers(results))
         cells.write_results(run, draft.files)
-    return Done(questions.summary(results, every))
+    return Done(lines)

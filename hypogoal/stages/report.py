@@ -38,10 +38,10 @@ def report(
     if format != "svg":
         raise UserError("--format is for --figures", format, "Give --figures DIR too, or leave it out.")
 
-    from hypogoal.evaluation.films import NEEDED, agent_to_film, films_of
     from hypogoal.evaluation.page import source, write
     from hypogoal.evaluation.questions import answers, render
     from hypogoal.evaluation.run import evaluation_of, read_evaluation
+    from hypogoal.films import NEEDED, agent_to_film, films_of
 
     evaluation = evaluation_of(run)
     agent = None if videos == 0 else agent_to_film(run)

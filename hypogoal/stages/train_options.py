@@ -26,8 +26,8 @@ def train_options(
 
     ``options``, an artefact, are trained further.
     """
-    from hypogoal.evaluation.nearness import distances_of
     from hypogoal.meta import training
+    from hypogoal.meta.nearness import distances_of
     from hypogoal.stages import agents
 
     practice = open_artefact(options, "options") if options else None

@@ -64,16 +64,16 @@ def _in_play(
     member: int,
 ) -> tuple[list[str], dict[str, float | None]]:
     """Train and play the policies: the findings in lines, and the shares of false positives."""
+    from hypogoal.core.files import as_json
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
-    from hypogoal.evaluation import audit as played
-    from hypogoal.evaluation.classifiers import classifier_of
-    from hypogoal.evaluation.house import as_json
     from hypogoal.evaluation.page import lines_of
     from hypogoal.learners.world import columns_of
     from hypogoal.meta.setup import Setup
     from hypogoal.meta.training import assemble
     from hypogoal.stages import agents
+    from hypogoal.tools.audits import played
+    from hypogoal.tools.audits.classifiers import classifier_of
 
     config = call.settings(domain)
     world = load_domain(domain)

@@ -18,12 +18,13 @@ def audited(
 
     ``out`` gets ``audit.json``, the page ``index.html`` and, for each sub-goal (or the named one), ``next/SUB_GOAL/``.
     """
+    from hypogoal.core.files import as_json
     from hypogoal.core.progress import Progress
     from hypogoal.data import open_dataset
-    from hypogoal.evaluation import page, recorded
-    from hypogoal.evaluation.classifiers import classifier_of
-    from hypogoal.evaluation.house import as_json
+    from hypogoal.evaluation import page
     from hypogoal.evaluation.plots import slug
+    from hypogoal.tools.audits import recorded
+    from hypogoal.tools.audits.classifiers import classifier_of
 
     is_ensemble = Path(source).is_dir()
     if member is not None or call.typed or call.preset or call.resume or not (data or is_ensemble):

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from typer import Argument
 
+from hypogoal.core.artefacts import SUMMARY
 from hypogoal.core.errors import UserError
 from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
@@ -21,9 +22,9 @@ def compare(
 
     Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
-    from hypogoal.evaluation import compare as beside
     from hypogoal.evaluation.page import write
     from hypogoal.evaluation.run import evaluation_of, read_evaluation
+    from hypogoal.tools import beside
 
     where = " ".join(map(str, runs))
     places = {run.resolve() for run in runs}
@@ -43,5 +44,6 @@ def compare(
         write(draft.files, page, figures)
         for name, table in tables.items():
             table.to_csv(draft.files / f"{name}.csv", index=False)
-    pairs = beside.read_pairs(call.out)
-    return Done(beside.winners(pairs))
+        lines = beside.winners(tables["pairs"])
+        (draft.files / SUMMARY).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return Done(lines)

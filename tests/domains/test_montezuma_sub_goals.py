@@ -12,7 +12,7 @@ from hypogoal.domains.montezuma.env import BEGINNINGS, arrives, make_starts
 from hypogoal.domains.montezuma.ladders import BASES, LADDERS, TOPS, Ladder
 from hypogoal.domains.montezuma.states import gather
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ENEMIES, GATES, LASER_Y, SUB_GOALS, labels_of
-from hypogoal.evaluation.nearness import distances_of
+from hypogoal.meta.nearness import distances_of
 
 pytestmark = pytest.mark.atari
 

@@ -11,7 +11,7 @@ import hypogoal
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.films import agent_to_film, films_of
+from hypogoal.films import agent_to_film, films_of
 
 pytestmark = pytest.mark.usefixtures("trusted")
 

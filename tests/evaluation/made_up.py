@@ -6,9 +6,9 @@ from typing import Any
 import pandas as pd
 
 from hypogoal.evaluation import page
-from hypogoal.evaluation.house import joined
-from hypogoal.evaluation.page import Results
-from hypogoal.evaluation.questions import context_of
+from hypogoal.evaluation.questions import Context, Question, context_of
+from hypogoal.evaluation.run import Results
+from hypogoal.evaluation.table import joined
 
 NOTHING: dict[str, Any] = {"agents": {}, "tasks": [], "cap": None, "missing": []}
 LEARNED = {"members": 3, "choice": "learned"}
@@ -29,14 +29,19 @@ def results_of(*rows: dict[str, Any], **facts: Any) -> Results:
     return Results(numbers_of(*rows), NOTHING | facts)
 
 
+def asked(question: ModuleType, results: Results) -> Context | None:
+    """What a question's template is given."""
+    return context_of(Question(question), results)
+
+
 def shown(question: ModuleType, results: Results) -> pd.DataFrame:
     """The table that a terminal prints."""
-    context = context_of(question, results)
+    context = asked(question, results)
     assert context is not None
     return page.words_of(context).shown
 
 
 def figures(question: ModuleType, results: Results) -> list[page.Drawn]:
     """A question's figures."""
-    context = context_of(question, results)
+    context = asked(question, results)
     return [] if context is None else context["figures"]

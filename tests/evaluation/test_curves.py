@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from made_up import LEARNED, figures, results_of, row, shown
+from made_up import LEARNED, asked, figures, results_of, row, shown
 
 from hypogoal.evaluation import curves as question
 from hypogoal.evaluation.curves import by_episode, curves, run_numbers
-from hypogoal.evaluation.questions import context_of
 from hypogoal.options.tables import Episodes
 
 
@@ -81,11 +80,11 @@ def test_agents_over_runs() -> None:
         place = {"method": "option agent", "layout": layout, "seed": number, "artefact": f"a-{number}"}
         rows += [row("success", success, **place), row("steps_to_95", steps, **place), row("steps", 9_000, **place)]
     results = results_of(*rows, agents={"option agent": LEARNED})
-    table = context_of(question, results)["table"].set_index("quantity")
+    table = asked(question, results)["table"].set_index("quantity")
     assert table["mean"]["success"] == 0.5
     agent = shown(question, results).loc["option agent"]
     assert (agent["runs"], agent["at 95 %"]) == ("3", "2")
-    assert context_of(question, results_of()) is None
+    assert asked(question, results_of()) is None
 
 
 def test_a_figure_of_lengths_that_are_all_alike_says_nothing() -> None:

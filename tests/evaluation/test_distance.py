@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 from ladder_run import COLUMNS, executions
-from made_up import figures, results_of, row, shown
+from made_up import asked, figures, results_of, row, shown
 from toy_data import write_table
 
 from hypogoal.evaluation import distance
 from hypogoal.evaluation.distance import BEST, WORST, last_executions, option_numbers, rows_of_ladder
-from hypogoal.evaluation.house import joined
-from hypogoal.evaluation.questions import context_of
+from hypogoal.evaluation.table import joined
 from hypogoal.options.tables import Executions
 
 
@@ -109,7 +108,7 @@ def test_mean_over_ladders_then_over_seeds():
     ]
     rows += stopped("1L", 0, 2, method="oracle termination", groups=None)
     results = results_of(*rows)
-    table = context_of(distance, results)["table"].set_index(["method", "quantity"])
+    table = asked(distance, results)["table"].set_index(["method", "quantity"])
     assert {*table.index.get_level_values("method")} == {"D-BAT"}, "the oracle lacks a ladder"
     found = table.loc["D-BAT"]
     means = [found["mean"][which] for which in ("best", "validated", "mean", "worst", "executions_deviation")]
@@ -118,13 +117,13 @@ def test_mean_over_ladders_then_over_seeds():
     assert (found["mean"]["reached_base"], found["mean"]["timed_out"], found["n"]["best"]) == (0.5, 0.25, 2)
     assert shown(distance, results).loc["D-BAT", "best"] == "20.0 ± 7.1"
     assert [drawn.name for drawn in figures(distance, results)] == ["figure4"]
-    assert context_of(distance, results_of()) is None
+    assert asked(distance, results_of()) is None
 
 
 def test_unlike_ladders_are_not_averaged():
     """Spec F3: a seed that lacks one of the ladders is left out of the mean over ladders."""
     rows = [*stopped("1L", 0, 10), *stopped("2-6", 0, 30), *stopped("1L", 1, 1)]
-    found = context_of(distance, results_of(*rows))["table"].set_index("quantity")
+    found = asked(distance, results_of(*rows))["table"].set_index("quantity")
     assert (found["mean"]["best"], found["n"]["best"]) == (20, 1)
 
 
@@ -133,7 +132,7 @@ def test_options_are_paired_by_ladder_and_seed():
     rows = [*stopped("1L", 0, 10, np.nan), *stopped("1R", 0, 20, np.nan)]
     rows += [*stopped("1L", 0, 40, method="one"), *stopped("1R", 0, 10, method="one")]
     rows += stopped("1L", 0, 0, method="oracle termination", groups=None)
-    pairs = context_of(distance, results_of(*rows))["pairs"].set_index("quantity")
+    pairs = asked(distance, results_of(*rows))["pairs"].set_index("quantity")
     best = pairs.loc["best"]
     assert (best["first"], best["second"], best["n"], best["wins"], best["units"]) == ("D-BAT", "one", 2, 1, 1)
     assert pairs["difference"].tolist() == [-10, -10, -10]

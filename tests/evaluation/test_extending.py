@@ -22,8 +22,9 @@ def test_a_figure_with_its_number_is_one_file_and_one_line(small_ladders, tmp_pa
     templates = shutil.copytree(str(resources.files("hypogoal.evaluation") / "templates"), tmp_path / "templates")
     shutil.copy(EXAMPLES / "durations.html", templates)
     monkeypatch.setattr(page, "TEMPLATES", templates)
-    monkeypatch.setattr(questions, "LOOKS", ())  # members' predictions, which it does not read
-    monkeypatch.setattr(questions, "QUESTIONS", [questions.curves, importlib.import_module("durations")])
+    *others, _ = questions.QUESTIONS[:4]
+    durations = questions.Question(importlib.import_module("durations"))
+    monkeypatch.setattr(questions, "QUESTIONS", [*others, durations])
     evaluate(small_ladders, quiet=True)
     text = (report(small_ladders).path / "index.html").read_text(encoding="utf-8")
     drawn, _ = draw_figures(small_ladders, tmp_path / "figures")

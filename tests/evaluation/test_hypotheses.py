@@ -4,12 +4,11 @@ from itertools import product
 
 import numpy as np
 import pytest
-from made_up import results_of, row
+from made_up import asked, results_of, row
 
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.hypotheses import coverage, knowledge
 from hypogoal.evaluation.judging import Judged
-from hypogoal.evaluation.questions import context_of
 from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
 
 RNG = np.random.default_rng(0)
@@ -86,10 +85,10 @@ def test_best_mean_and_worst_member_over_seeds() -> None:
     """And the first method against the second, by seed and sub-goal."""
     rows = accuracies("D-BAT, 2 members", 0, red=[0.8, 0.6]) + accuracies("D-BAT, 2 members", 1, red=[0.9, 0.5])
     results = results_of(*rows, *accuracies("one classifier", 1, red=[0.7]))
-    context = context_of(hypotheses, results)
+    context = asked(hypotheses, results)
     table = context["table"].set_index(["method", "quantity"])["mean"]
     found = [table["D-BAT, 2 members", which] for which in ("best", "mean", "worst")]
     assert found == pytest.approx([0.85, 0.7, 0.55])
     best = context["pairs"].set_index("quantity").loc["best"]
     assert (best["n"], best["difference"]) == (1, pytest.approx(0.2))
-    assert context_of(hypotheses, results_of()) is None
+    assert asked(hypotheses, results_of()) is None

@@ -3,12 +3,11 @@
 import numpy as np
 import pandas as pd
 import pytest
-from made_up import figures, results_of, row, shown
+from made_up import asked, figures, results_of, row, shown
 
 from hypogoal.evaluation import rooms
 from hypogoal.evaluation.hypotheses import VALIDATED, choose, rows_of
 from hypogoal.evaluation.judging import Judged
-from hypogoal.evaluation.questions import context_of
 
 YES, NO = True, False
 # Rooms 1 (labelled), 9 (unlabelled), 6 (unseen): two positives and two negatives each; 20 (unseen): two negatives.
@@ -81,7 +80,7 @@ def test_a_row_for_each_method_and_n_over_seeds() -> None:
     rows = ensemble("D-BAT, 2 members", 1, 0, 0.9, 0.5, validated=1) + ensemble("D-BAT, 2 members", 1, 1, 0.7, 0.5)
     rows += ensemble("D-BAT, 2 members", 2, 0, 0.8, 0.6) + ensemble("one classifier", 1, 0, 0.6)
     results = results_of(*rows)
-    context = context_of(rooms, results)
+    context = asked(rooms, results)
     table = context["table"].set_index(["method", "N", "quantity"])["mean"]
     own = ("D-BAT, 2 members", 1)
     means = [table[*own, f"balanced_accuracy, unseen, {which}"] for which in ("best", "validated", "mean", "worst")]
@@ -95,4 +94,4 @@ def test_a_row_for_each_method_and_n_over_seeds() -> None:
     (legend,) = drawn.figure.legends
     named = [text.get_text() for text in legend.get_texts()]
     assert drawn.name == "figure3" and named == ["D-BAT, 2 members", "one classifier"]
-    assert context_of(rooms, results_of()) is None
+    assert asked(rooms, results_of()) is None

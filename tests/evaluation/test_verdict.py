@@ -1,6 +1,7 @@
 """The verdict on made-up shares of solved episodes, where the right sentence is known (Spec F7)."""
 
 import math
+import statistics
 from typing import Any
 
 import pytest
@@ -8,8 +9,8 @@ from made_up import LEARNED, results_of, row
 
 from hypogoal.evaluation.choosing import FROZEN
 from hypogoal.evaluation.names import ONE, RANDOM, UNIFORM
-from hypogoal.evaluation.page import Results
 from hypogoal.evaluation.questions import sentences
+from hypogoal.evaluation.run import Results
 from hypogoal.evaluation.verdict import ALIKE, BETTER, CHOOSING, HYPOTHESES, UNDECIDED, WORSE, findings, outcome_of
 
 SEVERAL = "D-BAT, 3 members"
@@ -41,6 +42,8 @@ def run_of(
         ([(0.5, 1.0), (0.4, 0.9), (0.45, 1.0)], WORSE),
         ([(1.0, 1.0), (0.99, 1.0), (1.0, 0.99)], ALIKE),
         ([(1.0, 0.2), (0.2, 1.0), (0.6, 0.5)], UNDECIDED),
+        ([(1.0, 0.2)] * 5 + [(0.2, 0.3)], UNDECIDED),
+        ([(1.0, 0.2)] * 9 + [(0.2, 0.3)], BETTER),
         ([(1.0, 1.0)] * 10, ALIKE),
         ([(1.0, 0.0)] * 10, BETTER),
     ],
@@ -52,24 +55,29 @@ def test_each_kind_of_outcome(shares: list[tuple[float, float]], outcome: str) -
     (found,) = findings(run_of({SEVERAL: [0.0] * len(first), RANDOM: [1.0] * len(first)}, played))
     assert (found["subject"], found["second"], found["outcome"]) == (CHOOSING, UNIFORM, outcome)
     assert found["units"] == len(shares)
-    assert found["difference"] == pytest.approx(sum(a - b for a, b in shares) / len(shares))
-    assert -1 <= found["difference_low"] <= found["difference_high"] <= 1 or math.isnan(found["difference_low"])
+    assert found["difference"] == pytest.approx(statistics.median(a - b for a, b in shares))
+    assert math.isnan(found["difference_low"]) == (len(shares) < 6)
 
 
 def test_a_small_certain_difference_is_none() -> None:
-    """An interval within the margin is no difference, also where 0 lies outside of it; NaN bounds are of one unit."""
-    assert outcome_of(0.05, 0.02, 0.08) == ALIKE
-    assert outcome_of(0.09, 0.02, 0.16) == BETTER
-    assert outcome_of(0.5, math.nan, math.nan) == BETTER
+    """An interval within the margin is no difference, also where 0 lies outside of it."""
+    assert outcome_of(0.02, 0.08) == ALIKE
+    assert outcome_of(0.02, 0.16) == BETTER
 
 
 def test_seeds_are_the_units_of_a_single_layout() -> None:
-    """And the sentence says what the units are, with the interval."""
+    """And the sentence says what the units are, with the interval, or the range of too few."""
     played = {SEVERAL: [1.0, 0.9, 1.0], UNIFORM: [0.5, 0.4, 0.45]}
-    (sentence,) = sentences(run_of({SEVERAL: [0.0]}, played, layouts=False))
+    sentence, warning = sentences(run_of({SEVERAL: [0.0]}, played, layouts=False))
     assert sentence == (
-        "Choosing mattered over 3 seeds: the agent solves 97 % of the episodes, uniform-random choice among its own "
-        "options 45 % (+52 points [44, 59])."
+        "Choosing mattered on these 3 seeds: the agent solves 97 % of the episodes, uniform-random choice among its "
+        "own options 45 % (+50 points in the median, 50 to 55)."
+    )
+    assert warning == "Fewer than six layouts or seeds are not evidence: train more."
+    several = {SEVERAL: [1.0] * 6, UNIFORM: [0.5, 0.4, 0.45] * 2}
+    (sentence,) = sentences(run_of({SEVERAL: [0.0]}, several, layouts=False))
+    assert sentence.startswith("Choosing mattered over 6 seeds:") and sentence.endswith(
+        "(+55 points in the median [50, 60])."
     )
     one = sentences(run_of({SEVERAL: [0.0]}, {SEVERAL: [1.0], UNIFORM: [0.5]}))
     assert one[0].startswith("Choosing mattered on this layout:") and "points" not in one[0]
@@ -149,8 +157,8 @@ def test_options_on_ladders_are_compared_by_the_member_that_validation_picks() -
     """The first where nothing could be validated."""
     rows = [each for seed in range(3) for each in ladder("D-BAT, 2 members", seed, 0.0, 0.9, validated=1)]
     rows += [each for seed in range(3) for each in ladder(ONE, seed, 0.1, validated=None)]
-    (sentence,) = sentences(results_of(*rows))
-    assert sentence.startswith("Several hypotheses mattered over 3 seeds: options of D-BAT, 2 members stop")
+    sentence, _ = sentences(results_of(*rows))
+    assert sentence.startswith("Several hypotheses mattered on these 3 seeds: options of D-BAT, 2 members stop")
     assert "in 90 % of the executions, those of one classifier in 10 %" in sentence
     (alone,) = sentences(results_of(*ladder("D-BAT, 2 members", 0, 0.25)))
     assert "unknown: the run has no options of one classifier" in alone

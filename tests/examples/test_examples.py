@@ -22,7 +22,7 @@ from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.evaluation import attributing
+from hypogoal.evaluation import saliency
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
@@ -156,7 +156,7 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYPOGOAL_TRUST")
     lines = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", "").splitlines()
-    monkeypatch.setattr(attributing, "INTEGRATED", 2)
+    monkeypatch.setattr(saliency, "INTEGRATED", 2)
     two = settings("sub_goals=collect-red-key,open-red-door")
     few = {**SHORT, "collect": settings("unlabelled_seeds=1", "heldout_layouts=1")}
     few["train-ensemble"] = [*SHORT["train-ensemble"], *two]

@@ -18,10 +18,10 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.evaluation.classifiers import OwnClassifier
 from hypogoal.evaluation.pictures import picture_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
+from hypogoal.tools.audits.classifiers import OwnClassifier
 from tests import mixed
 from tests.mixed import GOAL
 

@@ -10,11 +10,16 @@ from command_line import refuses, run
 from toy_data import fill, reseal, write_table
 
 from hypogoal.core.artefacts import Artefact, create, open_artefact, sha256_of
-from hypogoal.evaluation.compare import labels_of, read_pairs
 from hypogoal.stages.evaluate import evaluate
+from hypogoal.tools.beside import labels_of
 from hypogoal.tools.compare import compare
 
 STEPS = 3_000
+
+
+def read_pairs(comparison):
+    """Its table of pairs."""
+    return pd.read_csv(comparison / "pairs.csv").astype({"N": "Int64"})
 
 
 def write_baseline(run, agent, layout, seed, length, steps=STEPS, solved=1, **more):
@@ -120,7 +125,7 @@ def test_methods_side_by_side(runs, tmp_path):
     [
         ('"domain": "doorkey"', '"domain": "montezuma"', "other: montezuma)"),
         ('"agents": {', '"agents": {}, "others": {', "no kind of result in common"),
-        ('"format": 5', '"format": 1', "another version of hypogoal evaluated this (format 1, needed: 5)"),
+        ('"format": 6', '"format": 1', "another version of hypogoal evaluated this (format 1, needed: 6)"),
     ],
 )
 def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, old, new, words):

@@ -18,7 +18,7 @@ from hypogoal.cells import Cell
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.evaluation import house
+from hypogoal.evaluation import table
 from hypogoal.evaluation.run import read_evaluation
 from hypogoal.experiments.run import begin
 from hypogoal.hypotheses.ensemble import read_ensemble
@@ -117,7 +117,7 @@ def test_selection_counts_every_decision(tiny_run, results):
 
 def test_every_number_is_explained(tiny_run, results):
     """Spec A5, A8: each quantity has its unit and meaning, run.json is strict, the inputs' hashes in the manifest."""
-    meanings = tomllib.loads((Path(house.__file__).parent / "quantities.toml").read_text(encoding="utf-8"))
+    meanings = tomllib.loads((Path(table.__file__).parent / "quantities.toml").read_text(encoding="utf-8"))
     assert {*results.numbers["quantity"]} <= {*meanings}
 
     def refuse(name):

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.evaluation.films import agent_to_film, draw_frame, episode_gif, films_of, frame_lines
+from hypogoal.films import agent_to_film, draw_frame, episode_gif, films_of, frame_lines
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
 

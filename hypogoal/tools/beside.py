@@ -3,34 +3,26 @@
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from types import ModuleType
+from operator import attrgetter
 
 import pandas as pd
 from pandas import DataFrame
 
-from hypogoal.core.files import reading
-from hypogoal.evaluation import (
-    curves,
-    distance,
-    hypotheses,
-    rooms,
-)
-from hypogoal.evaluation.house import pairs
+from hypogoal.evaluation import curves
 from hypogoal.evaluation.page import (
     DASH,
     Drawn,
-    Results,
     lines_of,
     listed,
     render,
 )
 from hypogoal.evaluation.provenance import domains_of, settings_of
-from hypogoal.evaluation.questions import Context, context_of, name_of
+from hypogoal.evaluation.questions import QUESTIONS, Context, Question, context_of
+from hypogoal.evaluation.run import Results
+from hypogoal.evaluation.statistics import pairs
 
 Runs = Mapping[str, Results]  # by a run's label
-Shared = Mapping[ModuleType, Mapping[str, Context]]  # see :func:`shared`
-QUESTIONS = (curves, hypotheses, rooms, distance)
+Shared = Mapping[Question, Mapping[str, Context]]  # see :func:`shared`
 FIRST = 4  # lines that the page begins with
 
 
@@ -43,7 +35,7 @@ def labels_of(paths: Sequence[str]) -> list[str]:
 def shared(runs: Runs) -> Shared:
     """The questions of which every run has results, and what these are, by the run's label."""
     questions = {}
-    for question in QUESTIONS:
+    for question in filter(attrgetter("beside"), QUESTIONS):
         contexts = {}
         for label, results in runs.items():
             context = context_of(question, results)
@@ -97,12 +89,6 @@ def compare_runs(questions: Shared) -> DataFrame:
     return pd.concat(parts) if parts else DataFrame(columns=["N", "quantity", "first", "second", "of"])
 
 
-def read_pairs(path: Path) -> DataFrame:
-    """The pairs of a comparison artefact; a ``UserError`` where they are missing or damaged."""
-    with reading(path, "Compare the runs again.", "the comparison"):
-        return pd.read_csv(path / "pairs.csv").astype({"N": "Int64"})
-
-
 def winners(compared: DataFrame) -> list[str]:
     """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
     rows = compared.astype(object).where(compared.notna(), None)
@@ -121,9 +107,9 @@ def page_of(
     }
     titles = {}
     for question, contexts in questions.items():
-        name = name_of(question)
-        titles[name] = question.TITLE
-        tables[name] = of_runs(contexts, "table").sort_values(question.BY, kind="stable")
+        titles[question.name] = question.module.TITLE
+        rows = of_runs(contexts, "table")
+        tables[question.name] = rows.sort_values(question.module.BY, kind="stable")
     figures = [*_curves(runs)]
     label, first = next(iter(runs.items()))
     section = {

@@ -10,7 +10,7 @@ from PIL import Image
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected, States, write_dataset
-from hypogoal.evaluation.pictures import COLUMNS, GAP, MOST_STATES, sheet, sheets, write_sheets
+from hypogoal.tools.sheets import COLUMNS, GAP, MOST_STATES, sheet, sheets, write_sheets
 
 SIDE = 20
 

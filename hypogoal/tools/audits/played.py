@@ -16,10 +16,9 @@ from scipy.special import expit
 
 from hypogoal.core.arrays import Floats, Ints
 from hypogoal.domains.base import Engine
-from hypogoal.evaluation.classifiers import Classifier
 from hypogoal.evaluation.exploits import option_numbers
-from hypogoal.evaluation.films import episode_gif
 from hypogoal.evaluation.selection import states_met
+from hypogoal.films import episode_gif
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
@@ -29,6 +28,7 @@ from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.tables import Exploits
 from hypogoal.options.termination import Terminations, load_rule
+from hypogoal.tools.audits.classifiers import Classifier
 
 BEFORE, MENDED = POLICIES = ("before", "mended")
 CELL = 8  # of positions that count as one place

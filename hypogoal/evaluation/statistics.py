@@ -1,0 +1,204 @@
+"""Spec F5: means over runs, intervals that hold as often as they say, pairs of runs, and equality up to rounding."""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from pandas import DataFrame
+from scipy.special import bdtr
+
+from hypogoal.core.arrays import Doubles
+from hypogoal.evaluation.table import SHARED, shares
+
+LOWER_IS_BETTER = ("length", "solved_length", "distance")
+DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
+ROUNDING = 10.0**-DIGITS
+TAILS = (0.025, 0.975)  # of a 95 % interval
+RESAMPLES = 20_000
+SHARES_FROM, MEDIANS_FROM = 3, 6  # values that an interval takes: ``studies/coverage.py`` simulates how often it holds
+
+
+def tables_of(
+    runs: DataFrame,
+    by: Sequence[str],
+    paired: Sequence[str] = (),
+) -> dict[str, DataFrame]:
+    """What a question's template is given of :func:`per_run`: ``table``, and ``compared``; nothing without runs."""
+    if runs.empty:
+        return {}
+    return {
+        "table": over(runs, by),
+        "compared": runs[runs["quantity"].isin(paired)],
+    }
+
+
+def over(runs: DataFrame, by: Sequence[str]) -> DataFrame:
+    """Spec F5: a row of statistics for each combination of ``by`` and each quantity of :func:`table.per_run`.
+
+    The values are layouts, each by the mean of its runs or, with one layout, the runs. Columns: ``by``, ``quantity``,
+    mean, standard_error and standard_deviation (n - 1); estimate, the mean of shares and the median of all else, and
+    its 95 % interval, low and high, see :func:`interval`; n (runs), units (values).
+    """
+    names = [*by, "quantity"]
+    rows = []
+    for key, cell in runs.groupby(names, dropna=False, sort=False):
+        labels = dict(zip(names, key, strict=True))
+        rows.append(labels | statistics(cell))
+    return DataFrame(rows)
+
+
+def statistics(runs: DataFrame) -> dict[str, Any]:
+    """See :func:`over`: of runs that are alike."""
+    values = runs["value"]
+    if runs["layout"].nunique() > 1:
+        values = values.groupby(runs["layout"], sort=False).mean()
+    are_shares = runs["of"].iloc[0] in shares()
+    low, high = interval(values.to_numpy(), are_shares=are_shares)
+    return {
+        "mean": values.mean(),
+        "standard_error": values.sem(),
+        "standard_deviation": values.std(),
+        "estimate": values.mean() if are_shares else values.median(),
+        "low": low,
+        "high": high,
+        "n": len(runs),
+        "units": len(values),
+    }
+
+
+def interval(values: Doubles, *, are_shares: bool) -> tuple[float, float]:
+    """Spec F5: a 95 % interval of (n,) independent values; NaN where there are too few.
+
+    Of shares, from ``SHARES_FROM`` on, that of :func:`bounded`; of all else, from ``MEDIANS_FROM`` on, that of
+    :func:`median_bounds`.
+    """
+    least, bounds = (SHARES_FROM, bounded) if are_shares else (MEDIANS_FROM, median_bounds)
+    return bounds(values) if len(values) >= least else (math.nan, math.nan)
+
+
+def bounded(values: Doubles, least: float = 0.0) -> tuple[float, float]:
+    """Bound the mean of (n,) values between ``least`` and 1: Gaffke's 95 % interval (2005).
+
+    Each value, and a bound that was not seen, weighs as much as the gaps between n even numbers say: the lower end has
+    ``least`` as the unseen one, the upper end 1. Of zeros and ones it is Clopper and Pearson's interval.
+    """
+    weights = gaps(len(values))
+    known = weights[:, 1:] @ np.sort(values)
+    low = np.quantile(known + weights[:, 0] * least, TAILS[0])
+    high = np.quantile(known + weights[:, 0], TAILS[1])
+    return float(low), min(float(high), 1.0)  # up to rounding
+
+
+@cache
+def gaps(count: int) -> Doubles:
+    """The gaps that so many even numbers leave within 0 and 1, drawn again and again: (RESAMPLES, count + 1)."""
+    return np.random.default_rng(0).dirichlet(np.ones(count + 1), RESAMPLES)
+
+
+def median_bounds(values: Doubles) -> tuple[float, float]:
+    """Bound the median of (n,) values: the widest pair of them outside of which few enough are expected.
+
+    At n = 10 these are the second and the ninth, since at most one of ten lies below the median in 1 % of cases.
+    Without ties it excludes 0 where the sign test does (p < .05).
+    """
+    count = len(values)
+    ordered = np.sort(values)
+    below = bdtr(np.arange(count), count, 0.5)  # how often at most so many lie below the median
+    outside = int((below < TAILS[0]).sum())
+    return float(ordered[outside - 1]), float(ordered[-outside])
+
+
+def pairs(runs: DataFrame) -> DataFrame:
+    """Spec F5: the first method against each other by each quantity, at each N, over runs that share ``SHARED``.
+
+    Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Columns: N,
+    quantity, first, second, and those of :func:`compare`.
+    """
+    rows = []
+    for (groups, quantity), cell in runs.groupby(["N", "quantity"], dropna=False, sort=False):
+        place = {
+            "N": groups,
+            "quantity": quantity,
+        }
+        (_, first), *others = cell.groupby("method", sort=False)
+        for _, second in others:
+            both = paired(first, second, SHARED)
+            if len(both):
+                rows.append(place | compare(both))
+    return DataFrame(rows)
+
+
+def paired(
+    first: DataFrame,
+    second: DataFrame,
+    on: Sequence[str],
+) -> DataFrame:
+    """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
+    return first.merge(second, on=list(on), suffixes=("", "_second"))
+
+
+def compare(both: DataFrame, unit: str = "layout") -> dict[str, Any]:
+    """Spec F5: the first of two methods against the second over n pairs of runs, see :func:`paired`.
+
+    Pairs of one unit (a column: the layout, or the seed where there is one layout) are not independent: everything but
+    the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.
+
+    Returns:
+        first and second, their names and mean_first and mean_second; n, units (how many), unit (of what), wins, ties,
+        probability (of improvement) with probability_low and _high, difference (median of first - second) with
+        difference_low and _high (95 %) and _least and _most (of all units), sign_test (two-sided p, ties left out),
+        and higher, whether that is better. Intervals are NaN for too few units, see :func:`interval`.
+    """
+    unit = unit if both[unit].nunique() > 1 else "seed"
+    higher = both["of"].iloc[0] not in LOWER_IS_BETTER
+    difference = both["value"] - both["value_second"]
+    better = np.sign(difference.round(DIGITS)) * (1 if higher else -1)
+    columns: dict[str, Any] = {
+        "mean_first": both["value"],
+        "mean_second": both["value_second"],
+        "probability": (1 + better) / 2,
+        "difference": difference,
+    }
+    by_unit = both[[unit]].assign(**columns).groupby(unit, sort=False).mean()
+    won = int((by_unit["probability"] > 0.5).sum())
+    lost = int((by_unit["probability"] < 0.5).sum())
+    probability_low, probability_high = interval(by_unit["probability"].to_numpy(), are_shares=True)
+    differences = by_unit["difference"]
+    low, high = interval(differences.to_numpy(), are_shares=False)
+    return {
+        "first": both["method"].iloc[0],
+        "second": both["method_second"].iloc[0],
+        "n": len(both),
+        "units": len(by_unit),
+        "unit": unit,
+        "wins": int((better > 0).sum()),
+        "ties": int((better == 0).sum()),
+        "sign_test": sign_test(won, lost),
+        "higher": higher,
+        **by_unit[["mean_first", "mean_second", "probability"]].mean(),
+        "probability_low": probability_low,
+        "probability_high": probability_high,
+        "difference": differences.median(),
+        "difference_low": low,
+        "difference_high": high,
+        "difference_least": differences.min(),
+        "difference_most": differences.max(),
+    }
+
+
+def sign_test(won: int, lost: int) -> float:
+    """The two-sided p of so uneven a count where neither is better; NaN without any."""
+    decided = won + lost
+    return min(1.0, 2 * bdtr(min(won, lost), decided, 0.5)) if decided else math.nan
+
+
+def at_least(values: Any, bound: Any) -> Any:
+    """Whether values (...) are at least ``bound`` (...), up to rounding, as .3 - .1 is .2: bool (...)."""
+    return values >= bound - ROUNDING
+
+
+def above(values: Any, bound: Any) -> Any:
+    """Whether values (...) exceed ``bound`` (...) by more than rounding: bool (...)."""
+    return values > bound + ROUNDING

@@ -1,0 +1,1 @@
+"""What audits say: of policies that exploit a classifier, and of recorded states (Spec H5, I6)."""
