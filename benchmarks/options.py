@@ -29,13 +29,13 @@ from hypogoal.core.config import preset as read_preset  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey.engine import DoorKeyEngine  # noqa: E402
-from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
 from hypogoal.meta.config import TrainOptionsConfig  # noqa: E402
 from hypogoal.options.choosers import RandomChooser  # noqa: E402
 from hypogoal.options.conv_gru import PaperLearner  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.loop import OptionLoop  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
+from hypogoal.options.replay import PrioritisedReplay  # noqa: E402
 from hypogoal.options.termination import Terminations  # noqa: E402
 
 LAYOUT = 100

@@ -67,7 +67,7 @@ PYTHON: dict[str, tuple[str | tuple[str, str], ...]] = {
         ("hypogoal.evaluation.statistics", "over, pairs, compare, interval, bounded, median_bounds"),
         ("hypogoal.hypotheses.deep_lift", "attributed, Attributions"),
         "hypogoal.meta.smdp.smdp_advantages",
-        "hypogoal.learners.double_dqn.double_q_targets",
+        "hypogoal.options.double_dqn.double_q_targets",
     ),
 }
 

@@ -32,8 +32,8 @@ from torch import Tensor, nn
 
 import hypogoal
 from hypogoal.core.arrays import Ints, tensor
-from hypogoal.learners.double_dqn import DoubleDQN, descend
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
+from hypogoal.options.double_dqn import DoubleDQN, descend
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.learner import Learner as AnyLearner
 from hypogoal.options.learner import Transitions

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.figure6 import PLAYED, STEPS, TRAINED
+from hypogoal.baselines.agents import train
+from hypogoal.baselines.engine_env import EngineEnv
+from hypogoal.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.doorkey.domain import DOMAIN
-from hypogoal.learners.baselines.agents import train
-from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
-from hypogoal.learners.episodes import EpisodeRecorder
+from hypogoal.domains.episodes import EpisodeRecorder
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, of_ensemble
 from hypogoal.options.tables import Episodes

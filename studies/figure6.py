@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains.episodes import LAST
 from hypogoal.evaluation.curves import budget_of, run_numbers
 from hypogoal.evaluation.frozen import ENVIRONMENTS, play
 from hypogoal.evaluation.run import find_artefacts
-from hypogoal.learners.episodes import LAST
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.tables import Episodes

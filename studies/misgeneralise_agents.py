@@ -82,9 +82,9 @@ def learned(folder: Path, world: str, seed: int) -> list[Row]:
 
 def baselines(_: Path, world: str, seed: int) -> list[Row]:
     """PPO in labelled levels and in new ones."""
-    from hypogoal.learners.baselines.agents import make_agent
-    from hypogoal.learners.baselines.engine_env import EngineEnv
-    from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+    from hypogoal.baselines.agents import make_agent
+    from hypogoal.baselines.engine_env import EngineEnv
+    from hypogoal.baselines.settings import HYPERPARAMETERS
 
     torch.set_num_threads(1)
     settings = HYPERPARAMETERS["ppo", "tuned"]

@@ -38,7 +38,7 @@ MODELS = {  # by stage; collect's are its domain's, those of run its experiment'
     "train-ensemble": "hypogoal.hypotheses.config:TrainEnsembleConfig",
     "train-options": "hypogoal.meta.config:TrainOptionsConfig",
     "train-meta": "hypogoal.meta.config:TrainMetaConfig",
-    "train-baseline": "hypogoal.learners.baselines.settings:BaselineConfig",
+    "train-baseline": "hypogoal.baselines.settings:BaselineConfig",
     "audit": "hypogoal.meta.config:AuditConfig",
 }
 STAGES = ("collect", *MODELS)

@@ -10,12 +10,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.core.arrays import Bools, Doubles, Ints
+from hypogoal.domains.episodes import LAST
 from hypogoal.evaluation.page import Drawn
 from hypogoal.evaluation.plots import DOTTED, legend_below, plot
 from hypogoal.evaluation.run import Results, choice_of
 from hypogoal.evaluation.statistics import at_least, tables_of
 from hypogoal.evaluation.table import melted, per_run, tidy
-from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Episodes
 
 TITLE = "Summary"

@@ -12,6 +12,7 @@ from pandas import DataFrame
 
 from hypogoal.core.arrays import Bytes
 from hypogoal.domains.base import installed_domain
+from hypogoal.domains.episodes import LAST
 from hypogoal.evaluation import plots
 from hypogoal.evaluation.hypotheses import VALIDATED
 from hypogoal.evaluation.names import ORACLE
@@ -20,7 +21,6 @@ from hypogoal.evaluation.run import takes
 from hypogoal.evaluation.statistics import tables_of
 from hypogoal.evaluation.table import melted, options_of, per_run, tidy
 from hypogoal.hypotheses.scores import most_and_least
-from hypogoal.learners.episodes import LAST
 from hypogoal.options.tables import Executions
 
 TITLE = "Options on ladders"

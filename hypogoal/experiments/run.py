@@ -27,7 +27,7 @@ PRELOADED = [  # what stages import when they are called
     "hypogoal.cli",
     "hypogoal.hypotheses.sub_goals",
     "hypogoal.meta.training",
-    "hypogoal.learners.baselines.agents",
+    "hypogoal.baselines.agents",
     "hypogoal.evaluation.questions",
 ]
 POLL_SECONDS = 0.05

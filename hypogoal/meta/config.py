@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from hypogoal.core.config import MOST, OWN, Config, integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.learners.config import WorldConfig
+from hypogoal.domains.world import WorldConfig
 from hypogoal.options.config import OptionConfig
 
 GAMMA = 0.99  # discount per environment step, ours: an option of tau steps counts GAMMA^tau; the paper gives none

@@ -7,7 +7,7 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Domain, Engine
-from hypogoal.learners.world import columns_of
+from hypogoal.domains.world import columns_of
 from hypogoal.meta.setup import Setup
 from hypogoal.options.termination import ORACLE
 

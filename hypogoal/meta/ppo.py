@@ -15,11 +15,11 @@ from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_into
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import descend
 from hypogoal.meta import networks, smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Outcome
+from hypogoal.options.double_dqn import descend
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5

@@ -7,9 +7,9 @@ from typing import Any
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains import world
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.learners import world
 from hypogoal.meta.config import MetaConfig, PracticeConfig, TrainMetaConfig, layout_seeds
 from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options import termination as ends

@@ -23,12 +23,12 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import DoubleDQN, ReplayBatch
-from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import saved
 from hypogoal.options.config import STACK, PaperConfig
+from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.replay import PrioritisedReplay
 
 
 class PaperQNetwork(nn.Module):

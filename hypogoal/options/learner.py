@@ -15,8 +15,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import LearnerConfig
+from hypogoal.options.double_dqn import linear_epsilon
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.parts import Part, answer_of, saved_row
 from hypogoal.options.saved import Policies, SavedOptions

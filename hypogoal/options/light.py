@@ -18,11 +18,11 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import DoubleDQN, ReplayBatch
-from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options import networks, saved
 from hypogoal.options.config import STACK, LightConfig
+from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.replay import PrioritisedReplay, Steps, StepsAhead
 
 POSITIVES_KEPT = 512  # per member
 POSITIVE_SHARE = 0.25  # of a batch: steps that reached a sub-goal

@@ -13,7 +13,7 @@ from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.data import create_hdf5
 from hypogoal.domains.base import Engine, Step
-from hypogoal.learners.episodes import LAST, EpisodeRecorder
+from hypogoal.domains.episodes import LAST, EpisodeRecorder
 from hypogoal.options.choosers import Outcome
 from hypogoal.options.tables import ChoiceCounts, Episodes, Executions, Exploits
 

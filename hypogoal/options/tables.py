@@ -15,7 +15,7 @@ from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
 from hypogoal.core.artefacts import AGAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading, replacing
-from hypogoal.learners.episodes import LAST
+from hypogoal.domains.episodes import LAST
 
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
 

@@ -296,7 +296,7 @@ class Stage:
 def _kept(call: Call, then: str) -> Iterator[str]:
     """The preset and the typed settings of the world that hold for the next stage as well."""
     from hypogoal.core.config import STAGES, model_of
-    from hypogoal.learners.config import WorldConfig
+    from hypogoal.domains.world import WorldConfig
 
     if then not in STAGES:
         return

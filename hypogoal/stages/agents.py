@@ -10,7 +10,7 @@ from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.learners.world import write_layout
+from hypogoal.domains.world import write_layout
 from hypogoal.meta.nearness import nearness
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import train

@@ -25,13 +25,13 @@ def train_baseline(
 
     Without ``data`` it plays in the world of the domain's defaults.
     """
+    from hypogoal.baselines import agents
+    from hypogoal.baselines.engine_env import EngineEnv
+    from hypogoal.baselines.settings import HYPERPARAMETERS
     from hypogoal.core.tensors import save_tensors
     from hypogoal.data import open_dataset
+    from hypogoal.domains import world
     from hypogoal.domains.base import load_domain
-    from hypogoal.learners import world
-    from hypogoal.learners.baselines import agents
-    from hypogoal.learners.baselines.engine_env import EngineEnv
-    from hypogoal.learners.baselines.settings import HYPERPARAMETERS
     from hypogoal.observations import PICTURE, standard_of
     from hypogoal.options.tables import Episodes
 

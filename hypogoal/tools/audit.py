@@ -67,8 +67,8 @@ def _in_play(
     from hypogoal.core.files import as_json
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
+    from hypogoal.domains.world import columns_of
     from hypogoal.evaluation.page import lines_of
-    from hypogoal.learners.world import columns_of
     from hypogoal.meta.setup import Setup
     from hypogoal.meta.training import assemble
     from hypogoal.stages import agents

@@ -150,7 +150,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=20, help="of each command")
     parser.add_argument("--commands", nargs="*", choices=[*COMMANDS], default=[*COMMANDS])
     given = parser.parse_args()
-    for name in ("torch._dynamo", "hypogoal.learners.baselines.agents", "hypogoal.meta.training"):
+    for name in ("torch._dynamo", "hypogoal.baselines.agents", "hypogoal.meta.training"):
         import_module(name)  # what every process would load
     root = Path(tempfile.mkdtemp(prefix="kills-"))
     whole = root / "whole"

@@ -12,6 +12,7 @@ from command_line import run, settings, trusting
 from corridor_env import SENSED
 from gymnasium import spaces
 
+from hypogoal.baselines.engine_env import EngineEnv
 from hypogoal.check import check_domain
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
@@ -20,7 +21,6 @@ from hypogoal.data import open_dataset, write_dataset
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, make_engine, of_ensemble
 from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised

@@ -8,11 +8,11 @@ import pytest
 import torch
 from command_line import run, settings
 
+from hypogoal.baselines.agents import make_agent
+from hypogoal.baselines.engine_env import EngineEnv
+from hypogoal.baselines.settings import PPOSettings
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.learners.baselines.agents import make_agent
-from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.settings import PPOSettings
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.networks import LightMetaNetwork
 from hypogoal.meta.setup import frames_kept

@@ -14,7 +14,7 @@ from loops import CASES, loop_of
 from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.learners import episodes
+from hypogoal.domains import episodes
 from hypogoal.meta import training
 from hypogoal.options import recording
 from hypogoal.options.loop import OptionLoop

@@ -11,7 +11,7 @@ from option_loops import loop_of
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.learners import double_dqn
+from hypogoal.options import double_dqn
 from hypogoal.options.conv_gru import Lived, PaperPolicies, PaperQNetwork
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.saved import SavedOptions

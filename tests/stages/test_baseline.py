@@ -12,6 +12,10 @@ from breaking import Breaking, Broken
 from corridor import Corridor
 from gymnasium import spaces
 
+from hypogoal.baselines.agents import epsilon, train
+from hypogoal.baselines.engine_env import EngineEnv
+from hypogoal.baselines.networks import NETWORKS, BlockConvolution
+from hypogoal.baselines.settings import HYPERPARAMETERS
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import UserError
@@ -19,13 +23,8 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.learners.baselines.agents import epsilon, train
-from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS
-from hypogoal.learners.config import WorldConfig
-from hypogoal.learners.episodes import EpisodeRecorder
-from hypogoal.learners.world import make_engine
+from hypogoal.domains.episodes import EpisodeRecorder
+from hypogoal.domains.world import WorldConfig, make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
 EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 2_000, ("ppo", "tuned"): 3_000, ("dqn", "tuned"): 3_000}

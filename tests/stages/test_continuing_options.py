@@ -8,8 +8,8 @@ from command_line import refuses, run, settings
 from toy_data import reseal
 
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.domains import episodes
 from hypogoal.evaluation.curves import budget_of
-from hypogoal.learners import episodes
 from hypogoal.options.tables import Episodes
 
 FEW = [*settings("environments=4", "warm_up=50", "steps=200", "max_episode_steps=30"), "-q"]

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from hypogoal.core.arrays import Columns
-from hypogoal.learners.double_dqn import SOFT, DoubleDQN, ReplayBatch, double_q_targets, linear_epsilon
-from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import LearnerConfig
+from hypogoal.options.double_dqn import SOFT, DoubleDQN, ReplayBatch, double_q_targets, linear_epsilon
+from hypogoal.options.replay import PrioritisedReplay
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Numbers(Columns):
 
 def test_sampling_follows_priorities_and_weights_correct_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2 (Schaul et al. 2015): with alpha 1 a transition is drawn in proportion to its priority."""
-    monkeypatch.setattr("hypogoal.learners.replay.ALPHA", 1.0)
-    monkeypatch.setattr("hypogoal.learners.replay.BETA", 1.0)
+    monkeypatch.setattr("hypogoal.options.replay.ALPHA", 1.0)
+    monkeypatch.setattr("hypogoal.options.replay.BETA", 1.0)
     replay = PrioritisedReplay(Numbers.zeros(4))
     replay.add(Numbers(np.arange(4)))
     replay.set_priorities(np.arange(4), np.array([1.0, 2.0, 3.0, 4.0]))
@@ -39,7 +39,7 @@ def test_sampling_follows_priorities_and_weights_correct_for_it(monkeypatch: pyt
 
 def test_what_is_new_has_the_largest_priority_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec D2: to the power alpha, as those that were learned from."""
-    monkeypatch.setattr("hypogoal.learners.replay.ALPHA", 0.5)
+    monkeypatch.setattr("hypogoal.options.replay.ALPHA", 0.5)
     replay = PrioritisedReplay(Numbers.zeros(4))
     replay.add(Numbers(np.arange(2)))
     replay.set_priorities(np.arange(2), np.array([1.0, 9.0]))

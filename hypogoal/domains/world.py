@@ -6,13 +6,37 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import Values, assigned
+from hypogoal.core.config import Config, Values, assigned, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, Engine
-from hypogoal.learners.config import WorldConfig
 
 RANDOM_EPISODES = 200  # of random play, which say how hard a layout is
+
+
+class WorldConfig(Config):
+    """The world that an agent plays in."""
+
+    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
+    start: str = setting(
+        "",
+        "where episodes begin, in a domain that names several places",
+        source="paper, policy learning",
+    )
+    max_episode_steps: int = setting(
+        500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
+    )
+    cap: float = setting(
+        0.0,
+        "an episode is cut after this many times the layout's shortest path; 0 for max_episode_steps",
+        source="ours: a task in which choosing decides",
+        low=0.0,
+    )
+    world: tuple[str, ...] = setting(
+        (),
+        "changes to the world that the states were collected in: settings of the domain as name=value",
+        source="ours: a task in which choosing decides",
+    )
 
 
 def played_world(domain: Domain, collected: Values, config: WorldConfig) -> dict[str, Any]:

@@ -14,16 +14,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
+from hypogoal.baselines.engine_env import EngineEnv
+from hypogoal.baselines.networks import CELL, FEATURES, NETWORKS
+from hypogoal.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.core.checkpoints import Checkpoints, Resumable, State, restored, snapshot_of
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for, seed_for
-from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.networks import CELL, FEATURES, NETWORKS
-from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
-from hypogoal.learners.double_dqn import linear_epsilon
-from hypogoal.learners.episodes import EpisodeRecorder
+from hypogoal.domains.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE
+from hypogoal.options.double_dqn import linear_epsilon
 
 LOG_INTERVAL = 5_000  # environment steps
 UPDATED = "train/"  # before the names of the library's numbers of an update

@@ -7,7 +7,7 @@ read the two tables as theirs too. Where it is silent the value is stable-baseli
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
-from hypogoal.learners.config import WorldConfig
+from hypogoal.domains.world import WorldConfig
 
 
 @dataclass(frozen=True)

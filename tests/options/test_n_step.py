@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hypogoal.learners.double_dqn import double_q_targets
-from hypogoal.learners.replay import Steps, StepsAhead
+from hypogoal.options.double_dqn import double_q_targets
+from hypogoal.options.replay import Steps, StepsAhead
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 from corridor import Corridor
 
 from hypogoal.domains.base import Step
-from hypogoal.learners.episodes import EpisodeRecorder
+from hypogoal.domains.episodes import EpisodeRecorder
 from hypogoal.options import tables
 from hypogoal.options.tables import Episodes
 

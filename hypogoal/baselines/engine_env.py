@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from hypogoal.core.arrays import Array, Bools, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.domains.base import Engine
-from hypogoal.learners.episodes import EpisodeRecorder
+from hypogoal.domains.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
 
 
