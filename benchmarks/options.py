@@ -110,7 +110,10 @@ def config_of(*changes: str, preset: str | None = None) -> TrainOptionsConfig:
 
 def terminations(engine: DoorKeyEngine, options: int) -> Terminations:
     """So many options that end at the true sub-goals, in turn."""
-    return Terminations(lambda ids: np.resize(engine.labels(ids).T, (options, len(ids))).T.copy(), options)
+    return Terminations.of_predictions(
+        lambda ids: np.resize(engine.labels(ids).T, (options, len(ids))).T.copy(),
+        options,
+    )
 
 
 def played(config: TrainOptionsConfig, options: int, steps: int) -> OptionLoop:

@@ -24,7 +24,7 @@ from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.domains.montezuma.emulator import SCREEN, SIDE, pixel
 from hypogoal.hypotheses.networks import folded
 from hypogoal.hypotheses.views import Origins, StateOrigins, View
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import TerminationRule
 
 Pictures = NDArray[np.uint8]  # (N, H, W, C): frames, the latest last
 Places = NDArray[np.float64]  # (N, 2): row and column of the agent's middle
@@ -322,14 +322,14 @@ def shade_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
     return (darkest + (lightest - darkest) * shades).astype(np.float32)
 
 
-class Patience(Terminations):
+class Patience(TerminationRule):
     """After ``steps`` steps of an option that hardly ever arrives its threshold falls.
 
     It falls to ``NEXT`` of the highest log-odds among these steps, never below ``LEAST`` of the first threshold.
     """
 
     steps = 10_000
-    CHANGING = (*Terminations.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
+    CHANGING = (*TerminationRule.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
 
     def __init__(self, *arguments: Any, **more: Any):
         super().__init__(*arguments, **more)

@@ -15,7 +15,7 @@ from hypogoal.look import Made
 from hypogoal.options.env import Options
 from hypogoal.options.learner import make_policies
 from hypogoal.options.reward import ensemble_at
-from hypogoal.options.termination import saved_terminations
+from hypogoal.options.termination import saved_rule
 from hypogoal.stages import Place
 
 
@@ -76,13 +76,13 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     weights = load_tensors(artefact.path / "options.safetensors")
     policies = make_policies(config, weights, source.config)
     goals, members = tuple(config["sub_goals"]), config["members"]
-    ends = saved_terminations(config["termination"], weights, len(goals) * members)
+    rule = saved_rule(config["termination"], weights, len(goals) * members)
     return Options(
         goals,
         members,
         ensembles,
         policies,
-        ends,
+        rule,
         config["option_timeout"],
         config["mask_reached"],
         domain=config["domain"],

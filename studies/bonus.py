@@ -85,7 +85,7 @@ def paid(ensemble: Artefact, layout: int, steps: int) -> Run:
         log, progress = MetricsLog(Path(folder) / "metrics.jsonl"), Progress("", steps, quiet=True)
         train(env, chosen, steps, ensemble.seed, log, progress, Checkpoints(None))
     place = {"layout_seed": layout, "shortest_path": engine.shortest_path()}
-    return Run(ensemble.seed, {"steps": steps}, Episodes.of_rows(env.episodes), place)
+    return Run(ensemble.seed, {"steps": steps}, Episodes.of_rows(env.episodes.rows), place)
 
 
 def main() -> None:

@@ -98,15 +98,15 @@ def baselines(_: Path, world: str, seed: int) -> list[Row]:
     def look(agent: Any, task: str, seeds: Sequence[int]) -> Row:
         env = env_of(task, seeds)
         seen = env.reset()
-        while len(env.episodes) < LOOKED_AT:
+        while len(env.episodes.rows) < LOOKED_AT:
             actions, _state = agent.predict(seen)
             env.step_async(actions)
             seen, *_rest = env.step_wait()
-        return numbers_of([succeeded for *_, succeeded in env.episodes])
+        return numbers_of([bool(episode.succeeded) for episode in env.episodes.rows])
 
     def learn(agent: Any) -> Row:
         agent.learn(PPO_STEPS, log_interval=None)
-        return numbers_of([succeeded for *_, succeeded in agent.env.episodes])
+        return numbers_of([bool(episode.succeeded) for episode in agent.env.episodes.rows])
 
     new, own = levels(seed, "new", LEVELS["new"]), levels(seed, LABELLED, LEVELS[LABELLED])
     unseen = tuple(range(own[-1] + 1, own[-1] + 1 + LEVELS["new"]))

@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.views import View
 from hypogoal.options.choosers import Chooser
 from hypogoal.options.learner import Learner
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import TerminationRule
 
 NOBODYS = np.random.default_rng(5)
 Pictures = NDArray[np.uint8]
@@ -131,10 +131,10 @@ class Negative(Straight):
         return np.full(len(ids), -1)
 
 
-class Twice(Terminations):
+class Twice(TerminationRule):
     """Two positive predictions in a row; a threshold falls with every execution."""
 
-    CHANGING = (*Terminations.CHANGING, "row")
+    CHANGING = (*TerminationRule.CHANGING, "row")
 
     def __init__(self, *arguments: Any, **more: Any):
         super().__init__(*arguments, **more)
@@ -148,24 +148,24 @@ class Twice(Terminations):
         self.thresholds = self.thresholds - np.float32(0.001)
 
 
-class AtLeast(Terminations):
+class AtLeast(TerminationRule):
     """No execution reaches its sub-goal in its first two steps."""
 
     def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
         return self.positive(log_odds, options) & (age >= 2)
 
 
-class Never(Terminations):
+class Never(TerminationRule):
     def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
         return np.zeros(len(options), np.bool_)
 
 
-class Counts(Terminations):
+class Counts(TerminationRule):
     def reached(self, log_odds: Any, options: Any, age: Any) -> Any:
         return (log_odds > 0).astype(np.int64)
 
 
-class Bare(Terminations):
+class Bare(TerminationRule):
     def __init__(self, *arguments: Any, **more: Any):
         pass
 

@@ -86,5 +86,8 @@ class Chosen:
     def record(self, outcome: Outcome) -> None:
         self.outcomes.append(outcome)
 
+    def begin_anew(self) -> None:
+        pass
+
     def learn(self) -> dict[str, float]:
         return {}

@@ -26,7 +26,7 @@ def planted(engine: DoorKeyEngine) -> Terminations:
         columns.append(np.stack([labels[:, 4], (x == 1) & (y == 1), (x == 1) & (y == 6)], axis=1))
         return np.concatenate(columns, axis=1)
 
-    return Terminations(classify, 15)
+    return Terminations.of_predictions(classify, 15)
 
 
 def harsh(layout_seed: int, count: int) -> DoorKeyEngine:

@@ -15,7 +15,7 @@ def ends(ids: np.ndarray) -> np.ndarray:
 
 def test_a_member_is_paid_for_once_an_episode_by_hand() -> None:
     """Cells 0..5, start at 2; the first positive of each, not the start's own, again in the next episode."""
-    env = PaidEnv(Corridor(2, max_steps=6), Terminations(ends, 2))
+    env = PaidEnv(Corridor(2, max_steps=6), Terminations.of_predictions(ends, 2))
     env.reset()
     #       to    3/1     4/0     5: over/0  3/1     4/0     5: over, 0: cut
     bonuses = [[1, 1], [0, 1], [1, 0], [1, 0], [0, 0], [1, 0], [1, 1]]
@@ -24,7 +24,7 @@ def test_a_member_is_paid_for_once_an_episode_by_hand() -> None:
         _, rewards, done, _ = env.step(np.array([1, 0]))
         assert rewards.tolist() == pytest.approx((BONUS * np.array(bonus) + reward).tolist())
         assert done[0] == reward[0]
-    assert env.episodes == [(6, 3, 1.0, 1, 1), (12, 3, 1.0, 1, 1), (12, 6, 0.0, 0, 0)]
+    assert env.episodes.rows == [(6, 3, 1.0, 1, 1), (12, 3, 1.0, 1, 1), (12, 6, 0.0, 0, 0)]
     env.reset()
     assert env.step(np.array([1, 0]))[1].tolist() == pytest.approx([BONUS, BONUS])
     assert env.step(np.array([1, 0]))[1].tolist() == pytest.approx([0, BONUS])

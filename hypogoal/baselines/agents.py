@@ -96,13 +96,13 @@ class Watch(BaseCallback):
         shown = {}
         if steps // LOG_INTERVAL > (steps - self.env.num_envs) // LOG_INTERVAL:
             check_finite(self.model, steps)
-            shown = {"success": episodes.recent()["success"] if episodes else 0.0}
+            shown = {"success": episodes.recent()["success"] if episodes.rows else 0.0}
             numbers = {name.removeprefix(UPDATED): value for name, value in _updated(self.model).items()}
             if isinstance(self.model, DQN):
                 numbers["epsilon"] = float(self.model.exploration_rate)
             self.log.write(
                 step=steps,
-                episodes=len(episodes),
+                episodes=len(episodes.rows),
                 **shown,
                 **numbers,
             )
@@ -288,5 +288,5 @@ def epsilon(chosen: DQNSettings, episodes: EpisodeRecorder) -> float:
     """Table 4: exploration falls from 1 to the final value, linearly, from the start or the first goal on."""
     step = episodes.steps
     if chosen.epsilon_from == "first-goal":
-        step -= next((end for end, *_, succeeded in episodes if succeeded), step)
+        step -= next((episode.step for episode in episodes.rows if episode.succeeded), step)
     return float(linear_epsilon(step, chosen.epsilon_steps, chosen.epsilon_final))

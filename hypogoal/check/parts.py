@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,7 +26,11 @@ from hypogoal.options.termination import Terminations, load_rule
 STEPS = 60  # joint steps
 SMALL = {"environments": 4, "max_episode_steps": 30, "option_timeout": 5, "warm_up": 40, "option_batch": 8}
 SOURCE = {"sub_goals": ("one", "other"), "members": 2, "domain_config": {}}
-PLAYED_AS = {"chooser": "chooser", "network": "learner", "termination": "terminations"}  # settings in a loop
+PLAYED_AS = {  # settings in a loop
+    "chooser": attrgetter("chooser"),
+    "network": attrgetter("learner"),
+    "termination": attrgetter("terminations.rule"),
+}
 
 
 def check_part(setting: str, name: str, domain: Domain | None = None, seed: int = 0) -> Iterator[Verdict]:
@@ -100,7 +105,7 @@ class _PlayedPart:
 
     def part(self, loop: OptionLoop) -> Any:
         """The part that is checked."""
-        return getattr(loop, PLAYED_AS[self.setting])
+        return PLAYED_AS[self.setting](loop)
 
     def loop(self) -> OptionLoop:
         """It and other parts, fresh."""
@@ -122,7 +127,7 @@ def _made_up(setup: Setup, engine: Engine) -> Terminations:
         waves = np.sin(ids[:, None] * options)
         return (8 * waves - 4).astype(np.float32)
 
-    return rule(log_odds, setup.options, environments=engine.count)
+    return Terminations(log_odds, rule(np.zeros(setup.options, np.float32), engine.count))
 
 
 def _play(loop: OptionLoop) -> Iterator[dict[str, Any]]:

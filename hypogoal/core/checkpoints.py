@@ -28,6 +28,7 @@ PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment, in place of the form
 JSON_PART = "json"
 ARRAY, TENSOR = "$array", "$tensor"
 ANEW = "Give --force and no --resume to begin anew."
+FORMAT = 2  # of what a state holds: raised where a version cannot go on with the states of those before
 
 
 class Checkpoints:
@@ -62,7 +63,7 @@ class Checkpoints:
             return
         arrays: dict[str, NDArray[Any]] = {}
         try:
-            text = json.dumps(state, default=partial(_without_array, arrays))
+            text = json.dumps({"format": FORMAT, "state": state}, default=partial(_without_array, arrays))
         except FloatingPointError:
             return
         arrays[JSON_PART] = np.frombuffer(text.encode(), np.uint8)
@@ -75,7 +76,7 @@ class Checkpoints:
             raise UserError(fault, self.path, "Free some disk space, then continue with --resume.") from None
 
     def load(self) -> State | None:
-        """The saved state, or None. A damaged file is a ``UserError``."""
+        """The saved state, or None. A damaged file, or another version's, is a ``UserError``."""
         from safetensors.numpy import load_file
 
         if self.path is None or not self.path.is_file():
@@ -83,7 +84,10 @@ class Checkpoints:
         with reading(self.path, ANEW, "the checkpoint"):
             arrays = load_file(self.path)
             text = arrays.pop(JSON_PART).tobytes()
-            return json.loads(text, object_hook=partial(_with_array, arrays))
+            saved = json.loads(text, object_hook=partial(_with_array, arrays))
+        if saved.get("format") != FORMAT:
+            raise UserError("another version of hypogoal wrote this checkpoint", self.path, ANEW)
+        return dict(saved["state"])
 
 
 def _without_array(arrays: dict[str, NDArray[Any]], value: Any) -> Any:

@@ -41,7 +41,7 @@ def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
     Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
-    labels. Executions begin in ``states`` (D,), each as often as it is there: where the option is offered, its
+    labels. Executions begin in ``states`` (D,), each as often as it is there: where its member is negative, its
     sub-goal does not hold, and can be had within the timeout; NaN for an option that begins nowhere.
     """
     from hypogoal.options.planned import distances, places_of
@@ -56,11 +56,11 @@ def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
     column[plan.actions] = np.arange(len(plan.actions))
     good = truth & ~(plan.final & ~plan.solved)[:, None]
     distinct, counts = np.unique(states, return_counts=True)
-    offered = ~loop.terminations.of(distinct)
+    negative = ~loop.terminations.of(distinct)
     qualities = np.full(len(goals), np.nan)
     for option, goal in enumerate(goals):
         steps = away[place[distinct], goal]
-        begins = offered[:, option] & (steps > 0) & (steps <= timeout)
+        begins = negative[:, option] & (steps > 0) & (steps <= timeout)
         if not begins.any():
             continue
         ids = distinct[begins]

@@ -12,8 +12,7 @@ from hypogoal.core.arrays import Bools, Columns, Doubles, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.curves import scores
 from hypogoal.options.choosers import Chooser, Offered, RandomChooser
-from hypogoal.options.loop import NONE, OptionLoop, offered_options
-from hypogoal.options.recording import Recorder
+from hypogoal.options.loop import NONE, OptionLoop
 
 ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout: 512 episodes,
 STEPS = 1_000  # or more, where so many steps of an environment hold more of the longest ones
@@ -77,30 +76,21 @@ def play(
     """
     engine = loop.engine
     episodes = episodes or max(EPISODES, STEPS // engine.max_steps)
-    begin_anew(loop, chooser)
+    loop.begin_anew(chooser)
     ended = np.zeros(engine.count, int)
     length, succeeded = np.zeros((2, engine.count, episodes), int)
     decisions = []
     while ended.min() < episodes:
         free = np.flatnonzero((loop.option == NONE) & (ended < episodes))
         ids = engine.ids[free]
-        offered = np.ones((len(ids), loop.terminations.options), bool)
-        if loop.config.mask_reached:
-            offered = offered_options(loop.terminations.of(ids))
+        offered = loop.offered(ids)
         moved = loop.advance(learning=False)
         decisions.append(Choices(ids, moved.options[free], offered))
         over = np.flatnonzero(engine.elapsed == 0)
-        for place, (_, steps, _, _, success) in zip(over, loop.recorder.episodes, strict=True):
+        for place, episode in zip(over, loop.recorder.episodes.rows, strict=True):
             if ended[place] < episodes:
-                length[place, ended[place]], succeeded[place, ended[place]] = steps, success
+                length[place, ended[place]] = episode.length
+                succeeded[place, ended[place]] = episode.succeeded
                 ended[place] += 1
-        loop.recorder.episodes.clear()
+        loop.recorder.episodes.rows.clear()
     return Play(length, succeeded > 0, Choices.joined(decisions))
-
-
-def begin_anew(loop: OptionLoop, chooser: Chooser) -> None:
-    """Every environment at the beginning of an episode; of earlier episodes, options and choosers nothing is left."""
-    chooser.begin_anew()
-    loop.chooser, loop.recorder = chooser, Recorder(loop.recorder.options, loop.engine)
-    loop.option[:] = NONE
-    loop.engine.reset()

@@ -60,9 +60,9 @@ def alone(
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
     """
-    from hypogoal.evaluation.frozen import Always, begin_anew
+    from hypogoal.evaluation.frozen import Always
 
-    begin_anew(loop, Always(option))
+    loop.begin_anew(Always(option))
     engine = loop.engine
     holds = engine.labels(engine.ids)[:, goal]
     steps = np.zeros(engine.count, int)

@@ -92,8 +92,7 @@ def _frame(loop: OptionLoop, members: int, option: int, ids: Ints, step: int, le
 def _why(loop: OptionLoop, moved: Transitions) -> str:
     """Why an option ended."""
     if moved.terminated[0]:
-        *_, succeeded = loop.recorder.episodes[-1]
-        return SOLVED if succeeded else "the episode, unsolved"
+        return SOLVED if loop.recorder.episodes.rows[-1].succeeded else "the episode, unsolved"
     if moved.timed_out[0]:
         return "its time is up"
     return "its classifier is positive" if moved.reached[0] else "the episode is cut"
@@ -112,6 +111,6 @@ def play_episodes(loop: OptionLoop, count: int) -> Iterator[tuple[Observations, 
 
 def _steps(loop: OptionLoop) -> Iterator[Transitions]:
     """The steps of an episode; options are greedy, and drawn as in training."""
-    played = len(loop.recorder.episodes)
-    while len(loop.recorder.episodes) == played:
+    played = len(loop.recorder.episodes.rows)
+    while len(loop.recorder.episodes.rows) == played:
         yield loop.advance(learning=False)

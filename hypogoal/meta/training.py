@@ -1,28 +1,11 @@
 """Options set up in a domain and trained for a number of steps: what ``train-options`` and ``train-meta`` share.
 
-The words of the loop:
-
 - step: one primitive action in one environment. Budgets, logs and curves count these.
 - joint step: a step in each of the E environments at once, so E steps: one call of ``OptionLoop.step``.
-- execution: an option at work, from the state in which it was chosen to that in which it ends: where it reaches its
-  sub-goal, where its time is up, or with its episode. tau is its number of steps.
-- decision: the choice of an option, and what came of it: the option's first state, R (the rewards inside the execution,
-  discounted from its start), gamma ** tau, the state in which it ended. The meta-policy learns from decisions alone.
 - update: of the option policies, one gradient step on a batch of replayed steps, every ``update_interval`` steps; of
   the meta-policy, ``epochs`` passes over the last ``decisions`` decisions.
 
-Where an option's time runs out in mid-episode (``timed_out`` in :meth:`.OptionLoop.advance`), the episode goes on:
-
-- record: its execution has ended, after ``option_timeout`` steps, without having reached its sub-goal.
-- reward: its policy's reward is 0, as at every step after which its member's prediction is negative; with
-  ``experience=shared`` every other member has its own, by its own prediction of s'.
-- bootstrap: time is not part of a state, so its policy's target there is the Double-DQN value of s', as if it went on.
-  Only the sub-goal and the end of the task are terminal. A transition over several steps ends there, too.
-- SMDP return: R and gamma ** tau, as at any other end. The meta-policy's advantage (:mod:`.smdp`) takes
-  R + gamma ** tau V(s') - V(s), and its trace runs on into the next decision, which is made in the same state s'. It
-  sees s' and which options are offered there, no more: the same option may be chosen again.
-
-With ``restart_options`` the end of an execution is that of its episode too: there the trace ends, V(s') stays.
+What an option's end means for each of those that learn stands in :mod:`hypogoal.options.loop`.
 """
 
 from collections.abc import Callable
@@ -103,7 +86,7 @@ def train(
             reached = {"until_reached": solved} if until else {}
             log.write(
                 step=logged,
-                episodes=len(recorder.episodes),
+                episodes=len(recorder.episodes.rows),
                 states=loop.engine.n_states,
                 **shown,
                 **numbers,
@@ -118,4 +101,4 @@ def continue_with(loop: OptionLoop, trained: Artefact) -> None:
     """Go on with the options of an artefact; replays start empty."""
     weights = load_tensors(trained.path / "options.safetensors")
     loop.learner.load(weights)
-    loop.terminations.load(weights)
+    loop.terminations.rule.load(weights)

@@ -18,7 +18,7 @@ from hypogoal.observations import Observations
 from hypogoal.options.loop import offered_options
 from hypogoal.options.reward import Env, require_observations
 from hypogoal.options.saved import Policies
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import TerminationRule
 
 MASKED = "a masked option runs: choose by action_masks(), or have warnings of this ignored"
 
@@ -32,7 +32,7 @@ class Options:
         members: K.
         ensembles: the termination classifiers, one ensemble per sub-goal.
         policies: starts an option's greedy policy, which :class:`OptionEnv` plays to its end.
-        ends: what ends options, as it was when they were saved; each environment plays with a copy.
+        rule: what ends options, as it was when they were saved; each environment plays with a copy.
         timeout: steps after which an option ends.
         mask_reached: whether options are withheld where their sub-goals already hold, as in training (D6).
         domain, domain_config: where they were trained, see :meth:`make_env`.
@@ -44,7 +44,7 @@ class Options:
     members: int
     ensembles: Sequence[Ensemble]
     policies: Policies
-    ends: Terminations
+    rule: TerminationRule
     timeout: int
     mask_reached: bool
     domain: str
@@ -82,7 +82,7 @@ class Options:
         if not self.mask_reached:
             return np.ones(self.count, bool)
         log_odds = [ensemble.log_odds(observation[None]) for ensemble in self.ensembles]
-        return offered_options(self.ends.positive(np.concatenate(log_odds, axis=1)))[0]
+        return offered_options(self.rule.positive(np.concatenate(log_odds, axis=1)))[0]
 
 
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -127,7 +127,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma)
         gymnasium.Wrapper.__init__(self, env)
         self.options, self.gamma = options, gamma
-        self.ends = copy.deepcopy(options.ends)
+        self.rule = copy.deepcopy(options.rule)
         self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._image: Observations | None = None
@@ -137,6 +137,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Like the environment's own."""
         observation, info = self.env.reset(**kwargs)
         self._image, self._masks = self._look.read(observation), None
+        self.rule.begin_episodes(np.zeros(1, int))
         return observation, info
 
     def action_masks(self) -> Bools:
@@ -171,7 +172,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             image = self._look.read(observation)
             total += self.gamma**duration * float(reward)
             log_odds = options.log_odds(option, image)
-            [reached] = self.ends.reached(log_odds, running, np.array([duration])).tolist()
+            [reached] = self.rule.reached(log_odds, running, np.array([duration])).tolist()
             duration += 1
             ended = reached or terminated or truncated or duration >= options.timeout
         self._image, self._masks = image, None

@@ -1,16 +1,33 @@
 """Options at work: many environments, each running one option at a time (Spec A3, A4, D1, D6, E1, E5).
 
-The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. An option runs at least
-one step and its termination is tested on the state it arrives at; it ends when its sub-goal is reached (see
-:mod:`.termination`), when its time is up, or when the episode ends. Where every option begins at a start state (Spec
-D4), the end of an option is also that of its episode.
+The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. It works in these steps:
+
+- decision: a chooser takes one of the options offered.
+- execution: that option at work, from the state in which it was chosen. It takes tau steps, at least one.
+- outcome: what came of it: its first state, R (the rewards inside, discounted from its start), gamma ** tau, the state
+  in which it ended. The policy over options learns from these alone.
+
+An execution ends at the first of three things. They are not exclusive, and each is told to those that learn:
+
+- ``reached``: the rule (:mod:`.termination`) says so of the state that it came to. For the option's policy that is a
+  terminal state, with a reward of 1. For the policy over options it is a state like any other: its value counts.
+- ``timed_out``: it has taken ``option_timeout`` steps, and the episode goes on. The option's policy is rewarded 0.
+  Time is not part of a state, so its target is the value of that state, as if it went on; a return over several steps
+  ends there, too. The policy over options takes R + gamma ** tau V(s'), and its trace runs on into the next decision,
+  which is made in the same state: the same option may be chosen again.
+- the episode ends. ``terminated``: the task is over, so the values of what follows are 0 for both policies.
+  ``truncated``: the episode is cut, at its ``max_episode_steps`` or at its cap. That is no terminal state, so the
+  value of the state counts for both policies, but the trace of the policy over options ends.
+
+With ``restart_options`` (Spec D4) the end of an execution is that of its episode, too: the episode counts as cut.
+With ``experience=shared`` every member of a sub-goal learns from a step, each by its own prediction of the state.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hypogoal.core.arrays import Bools
+from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Step
@@ -76,7 +93,24 @@ class OptionLoop(Resumable):
         self.began, self.age = np.zeros((2, count), int)  # states in which options were chosen; steps since
         self.inside = np.zeros(count, bool)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
+        self._reset()
+
+    def begin_anew(self, chooser: Chooser) -> None:
+        """Begin an episode in every environment, with this chooser; of earlier episodes and options nothing is left."""
+        chooser.begin_anew()
+        self.chooser, self.recorder = chooser, Recorder(self.recorder.options, self.engine)
+        self.option[:] = NONE
+        self._reset()
+
+    def _reset(self) -> None:
         self.engine.reset()
+        self.terminations.rule.begin_episodes(np.arange(self.engine.count))
+
+    def offered(self, ids: Ints) -> Bools:
+        """Which options may begin in states (n,): bool (n, O)."""
+        if not self.config.mask_reached:
+            return np.ones((len(ids), self.terminations.options), bool)
+        return offered_options(self.terminations.of(ids))
 
     def step(self) -> dict[str, float]:
         """One step of every environment, then the updates that are due; returns numbers to log."""
@@ -93,12 +127,12 @@ class OptionLoop(Resumable):
         actions = self.learner.act(ids, option, self.age, explore=learning)
         step = self.engine.step(actions)
         log_odds = self.terminations.log_odds(step.next_ids, option)
-        reached = self.terminations.reached(log_odds, option.copy(), self.age.copy())
-        reached = answer_of(self.terminations, "reached", reached, bool, len(option))
+        reached = self.terminations.rule.reached(log_odds, option.copy(), self.age.copy())
+        reached = answer_of(self.terminations.rule, "reached", reached, bool, len(option))
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
-        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated  # see meta.training
+        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
         ended = reached | timed_out | over  # all that ends an option
         moved = Transitions(
             ids,
@@ -120,6 +154,7 @@ class OptionLoop(Resumable):
             self.visited.see(step.next_ids)
         self.recorder.see(step)
         self._finish_options(step, moved, learning=learning)
+        self.terminations.rule.begin_episodes(np.flatnonzero(step.terminated | step.truncated))
         return moved
 
     def _choose(self, learning: bool) -> None:
@@ -128,9 +163,7 @@ class OptionLoop(Resumable):
         if not count:
             return
         ids = self.engine.ids[free]
-        offered = np.ones((count, self.terminations.options), bool)
-        if self.config.mask_reached:
-            offered = offered_options(self.terminations.of(ids))
+        offered = self.offered(ids)
         chosen = self.chooser.choose(free, ids, offered.copy())
         chosen = answer_of(self.chooser, "choose", chosen, int, count, self.terminations.options - 1)
         if learning and not offered[np.arange(count), chosen].all():
@@ -164,7 +197,7 @@ class OptionLoop(Resumable):
         )
         outcome = every.at(done)
         if learning:
-            self.terminations.finished(done, outcome.options, outcome.reached)
+            self.terminations.rule.finished(done, outcome.options, outcome.reached)
         self.recorder.finished(outcome)
         self.chooser.record(outcome)
         self.option[done] = NONE

@@ -12,7 +12,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import TerminationRule, Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
 
@@ -67,7 +67,7 @@ def plan_of(
     starts: Ints | None = None,
 ) -> Plan:
     """The engine's plan, from these states or where episodes begin; a ``UserError`` where options cannot be planned."""
-    if type(terminations) is not Terminations:
+    if type(terminations.rule) is not TerminationRule:
         fault = "only options that end at a single positive prediction can be planned"
         raise UserError(fault, f"termination={config.termination}", "Give termination=learned.")
     plan = engine.plan(starts)

@@ -30,6 +30,7 @@ class Execution(NamedTuple):
     reached: bool  # its own classifier ended it
     inside_at_start: bool  # its own classifier was positive where it began
     terminated: bool  # it ended in a terminal state of the episode
+    truncated: bool  # it ended because its episode was cut
     began: int  # the id of the state in which it was chosen
     states: list[int]  # the ids of those that it came to, the last one that it ended in
 
@@ -99,6 +100,7 @@ class Recorder(Resumable):
             outcome.reached,
             outcome.inside,
             outcome.terminated,
+            outcome.truncated,
             outcome.began,
         )
         plain = [column.tolist() for column in columns]
@@ -116,7 +118,7 @@ class Recorder(Resumable):
     def recent(self, *, restarted: bool) -> dict[str, float]:
         """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
         if not restarted:
-            return self.episodes.recent() if self.episodes else {}
+            return self.episodes.recent() if self.episodes.rows else {}
         numbers = {}
         if runs := self._executions():
             for name in ("reached", "terminated", "duration"):
@@ -143,7 +145,7 @@ class Recorder(Resumable):
     def write(self, folder: Path) -> None:
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
         self.flush()
-        Episodes.of_rows(self.episodes).write(folder)
+        Episodes.of_rows(self.episodes.rows).write(folder)
         ChoiceCounts.of_rows(self.choices).write(folder)
         with create_hdf5(folder / "terminations.h5") as file:
             for option, stops in enumerate(self.stops):

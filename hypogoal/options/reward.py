@@ -84,13 +84,7 @@ class SubgoalReward:
                 f"by={by!r}",
                 f"Choose one of {', '.join(self.least)}, or a member, 0 to {count - 1}.",
             )
-        thresholds = self.ensemble.thresholds_as_log_odds()
-        self.ends = load_rule(termination)(
-            None,
-            count,
-            thresholds=thresholds,
-            environments=count,
-        )
+        self.rule = load_rule(termination)(self.ensemble.thresholds_as_log_odds(), count)
 
     def __call__(self, observations: Any) -> Floats:
         """The rewards (N,) of observations."""
@@ -98,7 +92,7 @@ class SubgoalReward:
 
     def holds(self, observations: Any) -> Bools:
         """Whether the sub-goal holds in observations: bool (N,)."""
-        return self.decide(self.ends.positive(self.ensemble.log_odds(observations)))
+        return self.decide(self.rule.positive(self.ensemble.log_odds(observations)))
 
     def decide(self, members: Bools) -> Bools:
         """Whether the sub-goal holds where members say so: bool (N, K) to (N,)."""
@@ -162,7 +156,7 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._reader = require_observations(env, reward.ensemble)
         self.reward, self.scale, self.add, self.ends = reward, scale, add, ends
         self.start, self.away = start, away
-        self._rule = copy.deepcopy(reward.ends)
+        self._rule = copy.deepcopy(reward.rule)
         self._age = 0
         self._negatives = 0  # steps in a row
         self._pays = True  # the prediction has been negative since the episode began

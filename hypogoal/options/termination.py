@@ -1,7 +1,7 @@
-"""What decides that an option ends: one object, which every loop that plays options asks (Spec D1, D2, H4).
+"""What decides that an option ends: a rule, which every loop that plays options asks (Spec D1, D2, H4).
 
 An execution ends at the first of three things (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance`` and
-``OptionEnv.step``): its sub-goal is reached, as :meth:`Terminations.reached` says; it has taken ``option_timeout``
+``OptionEnv.step``): its sub-goal is reached, as :meth:`TerminationRule.reached` says; it has taken ``option_timeout``
 steps; its episode ends.
 By default the sub-goal is reached where the prediction of the option's own member is positive: where the member's
 log-odds lie above its threshold. Another rule is another subclass, named by the setting ``termination``; with
@@ -13,12 +13,13 @@ The first prediction stands, for a run and for what resumes it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 
 from hypogoal.core.arrays import Bools, Floats, Ints, tensor
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.own_code import load_class
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
@@ -30,7 +31,7 @@ THRESHOLDS = "thresholds"  # in an artefact: log-odds
 ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
 
 
-class Terminations(Part):
+class TerminationRule(Part):
     """An execution ends at the first state in which its own member's prediction is positive (the paper).
 
     Other rules are subclasses: :meth:`reached`, asked at every step of training, of frozen play and of ``OptionEnv``,
@@ -40,28 +41,15 @@ class Terminations(Part):
     rewards and targets of policies, and which options are offered, go by :meth:`positive`, of one state, all the same.
 
     Args:
-        classify: state ids (n,) -> log-odds float32 (n, O), or predictions, bool (n, O); None without an engine.
-        classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
-        thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
+        thresholds: float32 (O,), log-odds above which a prediction is positive.
         environments: E.
     """
 
-    CHANGING: ClassVar[tuple[str, ...]] = ("judged", THRESHOLDS)
+    CHANGING: ClassVar[tuple[str, ...]] = (THRESHOLDS,)
 
-    def __init__(
-        self,
-        classify: Callable[[Ints], Any] | None,
-        options: int,
-        classify_one: Callable[[Ints, int], Floats] | None = None,
-        thresholds: Floats | None = None,
-        environments: int = 1,
-    ):
-        self.classify: Any = classify
-        self.classify_one = classify_one
-        self.options = options
-        self.thresholds = np.zeros(options, np.float32) if thresholds is None else thresholds
-        self.environments = environments
-        self.judged = np.zeros((0, options), np.float32)  # log-odds of states by id; NaN: not judged yet
+    def __init__(self, thresholds: Floats, environments: int = 1):
+        self.thresholds, self.environments = thresholds, environments
+        self.options = len(thresholds)
 
     def reached(
         self,
@@ -84,17 +72,55 @@ class Terminations(Part):
     ) -> None:
         """Executions (n,) that ended in training, and which of them reached their sub-goals."""
 
+    def begin_episodes(self, environments: Ints) -> None:
+        """Episodes begin in these environments (n,), in training and in play; by default nothing is remembered."""
+
     def positive(self, log_odds: Floats, options: Ints | slice = slice(None)) -> Bools:
         """Predictions by today's thresholds, of options (n,), or of all where the log-odds are (n, O)."""
         return log_odds > self.thresholds[options]
 
+    def state(self) -> dict[str, torch.Tensor]:
+        """What an artefact keeps."""
+        return {THRESHOLDS: torch.from_numpy(self.thresholds.copy())}
+
+    def load(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on with what an artefact kept."""
+        self.thresholds = saved_row(state, THRESHOLDS, self.options)
+
+
+class Terminations(Resumable):
+    """Where the options' sub-goals hold in an engine, by its states' ids; each state is judged once.
+
+    Args:
+        classify: state ids (n,) -> log-odds float32 (n, O).
+        rule: has the thresholds, and ends executions.
+        classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
+    """
+
+    CHANGING = ("judged", "rule")
+
+    def __init__(
+        self,
+        classify: Callable[[Ints], Any],
+        rule: TerminationRule,
+        classify_one: Callable[[Ints, int], Floats] | None = None,
+    ):
+        self.classify, self.rule, self.classify_one = classify, rule, classify_one
+        self.options = rule.options
+        self.judged = np.zeros((0, self.options), np.float32)  # log-odds of states by id; NaN: not judged yet
+
+    @classmethod
+    def of_predictions(cls, predict: Callable[[Ints], Bools], options: int, environments: int = 1) -> Self:
+        """Where predictions say so: state ids (n,) -> bool (n, O)."""
+        return cls(predict, TerminationRule(np.zeros(options, np.float32), environments))
+
     def of(self, ids: Ints) -> Bools:
         """Whether each option's sub-goal holds: bool (n, O) for states (n,)."""
-        return self.positive(self._all(ids))
+        return self.rule.positive(self._all(ids))
 
     def of_running(self, ids: Ints, options: Ints) -> Bools:
         """Whether the sub-goals of the options that run hold: bool (n,), of states (n,)."""
-        return self.positive(self.log_odds(ids, options), options)
+        return self.rule.positive(self.log_odds(ids, options), options)
 
     def log_odds(self, ids: Ints, options: Ints) -> Floats:
         """How sure the options that run are that their sub-goals hold: float32 (n,)."""
@@ -106,14 +132,6 @@ class Terminations(Part):
             fresh = np.unique(ids[unknown & (options == option)])
             self.judged[fresh, option] = self.classify_one(fresh, int(option))
         return self.judged[ids, options]
-
-    def state(self) -> dict[str, torch.Tensor]:
-        """What an artefact keeps."""
-        return {THRESHOLDS: torch.from_numpy(self.thresholds.copy())}
-
-    def load(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on with what an artefact kept."""
-        self.thresholds = saved_row(state, THRESHOLDS, self.options)
 
     def _all(self, ids: Ints) -> Floats:
         """Log-odds (n, O)."""
@@ -137,24 +155,24 @@ class Terminations(Part):
             self.judged = np.pad(self.judged, ((0, more), (0, 0)), constant_values=np.nan)
 
 
-RULES = {"learned": f"{__name__}:Terminations"}
+RULES = {"learned": f"{__name__}:TerminationRule"}
 
 
-def load_rule(name: str) -> type[Terminations]:
+def load_rule(name: str) -> type[TerminationRule]:
     """The class that the setting ``termination`` names; a ``UserError`` where it names none."""
-    return load_class(name, "termination rule", Terminations, RULES)
+    return load_class(name, "termination rule", TerminationRule, RULES)
 
 
-def saved_terminations(termination: str, weights: Mapping[str, torch.Tensor], options: int) -> Terminations:
-    """Those of an artefact with such weights, for one environment that is no engine's."""
-    ends = load_rule(termination)(None, options)
-    ends.load(weights)
-    return ends
+def saved_rule(termination: str, weights: Mapping[str, torch.Tensor], options: int) -> TerminationRule:
+    """That of an artefact with such weights."""
+    rule = load_rule(termination)(np.zeros(options, np.float32))
+    rule.load(weights)
+    return rule
 
 
 def oracle_terminations(engine: Engine, columns: Sequence[int]) -> Terminations:
     """Spec E6: one option for each of these sub-goals, by number, that ends where it is true; an upper bound."""
-    return Terminations(lambda ids: engine.labels(ids)[:, columns], len(columns))
+    return Terminations.of_predictions(lambda ids: engine.labels(ids)[:, columns], len(columns), engine.count)
 
 
 def learned_terminations(
@@ -179,11 +197,9 @@ def learned_terminations(
             logits = stacked.networks[option](as_input(tensor(views, stacked.device)))
             return (logits[:, 1] - logits[:, 0]).cpu().numpy()
 
-    thresholds = [ensemble.thresholds_as_log_odds() for ensemble in ensembles]
-    return load_rule(rule)(
+    thresholds = np.concatenate([ensemble.thresholds_as_log_odds() for ensemble in ensembles])
+    return Terminations(
         lambda ids: stacked.log_odds(engine.images(ids)),
-        len(stacked.networks),
+        load_rule(rule)(thresholds, engine.count),
         classify_one if running_only else None,
-        np.concatenate(thresholds),
-        engine.count,
     )

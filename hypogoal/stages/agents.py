@@ -81,7 +81,7 @@ def learn(work: Training, setup: Setup, loop: OptionLoop, steps: int, until: flo
         loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
         loop.visited.write(folder, setup.source, setup.seed)
-    save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
+    save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.rule.state())
     weights = loop.chooser.state()
     if weights:
         save_tensors(folder / FILE, weights)

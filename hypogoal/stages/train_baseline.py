@@ -64,7 +64,7 @@ def train_baseline(
         kept = work.draft.checkpoints()
         agent = agents.train(env, chosen, config.steps, call.seed, work.log, work.progress, kept, call.device)
         work.progress.update(config.steps)
-        Episodes.of_rows(env.episodes).write(files)
+        Episodes.of_rows(env.episodes.rows).write(files)
         save_tensors(files / "policy.safetensors", agents.weights(agent))
         world.write_layout(files, engine, config, call.seed)
     numbers = env.episodes.counts() | env.episodes.recent()

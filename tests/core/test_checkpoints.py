@@ -1,5 +1,6 @@
 """Spec G1, G3: a state on disk is the state, the last good one stays, and signals wait until it is whole."""
 
+import json
 import resource
 from functools import partial
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save_file
 
 from hypogoal.core.adam import Adam
 from hypogoal.core.checkpoints import Checkpoints, restored, snapshot_of
@@ -37,6 +39,15 @@ def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
     assert all(torch.equal(found["tensors"][name], value) for name, value in state["tensors"].items())
     assert found["numbers"] == [1, 0.1 + 0.2, True, None, "word", float(np.float32(0.1)), [2, 3]]
     assert np.isnan(found["nan"][0]) and np.isnan(found["nan"][1][0]) and found["empty"] == {}
+
+
+def test_another_versions_checkpoint_is_one_line(tmp_path: Path) -> None:
+    """A state as 1.0 wrote it, without a format."""
+    path = tmp_path / "stage.safetensors"
+    text = json.dumps({"loop": {}, "logged": 0})
+    save_file({"json": np.frombuffer(text.encode(), np.uint8)}, path)
+    with pytest.raises(UserError, match="another version of hypogoal wrote this checkpoint"):
+        Checkpoints(path).load()
 
 
 def test_weights_of_half_precision_come_back(tmp_path: Path) -> None:

@@ -26,11 +26,11 @@ def played(succeeded: np.ndarray | None) -> EpisodeRecorder:
 
 def test_success_is_by_reward_or_as_the_domain_says() -> None:
     """Spec F5: a cut episode is none but where the domain says so."""
-    assert [row[4] for row in played(None)] == [1, 0, 0, 0, 0, 0]
+    assert [episode.succeeded for episode in played(None).rows] == [1, 0, 0, 0, 0, 0]
     own = played(np.array([False, True, True]))
-    assert [row[4] for row in own] == [0, 1, 1, 1, 0, 0]
+    assert [episode.succeeded for episode in own.rows] == [0, 1, 1, 1, 0, 0]
     assert own.recent()["success"] == 0.5 and played(None).recent()["success"] == 1 / 6
-    assert own[:2] == [(6, 2, 2.0, 1, 0), (6, 2, 0.0, 1, 1)]
+    assert own.rows[:2] == [(6, 2, 2.0, 1, 0), (6, 2, 0.0, 1, 1)]
 
 
 def test_steps_of_before_are_steps() -> None:
@@ -43,18 +43,18 @@ def test_steps_of_before_are_steps() -> None:
     engine, episodes = Old(1), EpisodeRecorder(1)
     for _ in range(3):
         episodes.see(engine.step(np.array([1])))
-    assert episodes == [(3, 3, 1.0, 1, 1)]
+    assert episodes.rows == [(3, 3, 1.0, 1, 1)]
 
 
 def test_tables_and_checkpoints_keep_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G1: as the domain says, or by reward."""
     for episodes in (played(np.array([False, True, True])), played(None)):
-        Episodes.of_rows(episodes).write(tmp_path)
+        Episodes.of_rows(episodes.rows).write(tmp_path)
         found = Episodes.read(tmp_path / "episodes.csv")
-        assert found.succeeded.tolist() == [bool(row[4]) for row in episodes]
+        assert found.succeeded.tolist() == [bool(row.succeeded) for row in episodes.rows]
         monkeypatch.setattr(tables, "LAST", 2)
         assert found.last().succeeded.tolist() == found.succeeded[-2:].tolist()
-        assert found.rows() == list(episodes)
+        assert found.rows() == episodes.rows
         again = EpisodeRecorder(3)
         again.restore(episodes.snapshot())
-        assert again == episodes and again.steps == 9
+        assert again.rows == episodes.rows and again.steps == 9

@@ -18,7 +18,7 @@ from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
-from hypogoal.options.termination import Terminations, oracle_terminations
+from hypogoal.options.termination import TerminationRule, Terminations, oracle_terminations
 
 LAYOUT, DONE = 70010, 6  # 'done' does nothing
 
@@ -115,7 +115,7 @@ def test_decisions_are_those_of_the_episodes_that_count() -> None:
     assert len(episodes.choices.options) == sum(math.ceil(length / timeout) for length in episodes.length.ravel())
 
 
-class Falling(Terminations):
+class Falling(TerminationRule):
     """Each execution lowers all thresholds."""
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
@@ -127,12 +127,12 @@ def test_play_teaches_nothing() -> None:
     engine = harsh(220, 16)
     config = TrainMetaConfig.of(chooser="ppo", network="planned")
     truth = planted(engine)
-    ends = Falling(truth.classify, 15)
+    rule = Falling(np.full(15, 0.5, np.float32))
+    ends = Terminations(truth.classify, rule)
     learner = PlannedLearner(engine, truth, config, seed=0)
     chooser = RandomChooser(np.random.default_rng(0))
-    ends.thresholds = np.full(15, 0.5, np.float32)
-    before = ends.thresholds.copy()
+    before = rule.thresholds.copy()
     loop = OptionLoop(engine, ends, learner, chooser, Recorder(15, engine), config, GAMMA)
     play(loop, chooser, 3)
-    np.testing.assert_array_equal(ends.thresholds, before)
+    np.testing.assert_array_equal(rule.thresholds, before)
     assert not learner.option_steps.any() and not learner.positives.any()

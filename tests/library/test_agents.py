@@ -31,7 +31,7 @@ from hypogoal.core.tensors import load_tensors
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.env import Options
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import TerminationRule
 
 MEMBERS = 2
 
@@ -146,10 +146,10 @@ def test_agents_without_masks_play_masked_options(options: Options) -> None:
     assert met and not any(met)
 
 
-class Falling(Terminations):
+class Falling(TerminationRule):
     """After twenty executions in all the thresholds of all options fall."""
 
-    CHANGING = (*Terminations.CHANGING, "ended")
+    CHANGING = (*TerminationRule.CHANGING, "ended")
 
     def __init__(self, *arguments: Any, **more: Any):
         super().__init__(*arguments, **more)
@@ -182,8 +182,8 @@ def test_options_end_by_the_rule_they_were_trained_with(made: Path) -> None:
         run(*agent, *ends, *settings("steps=40"))
         later = load_tensors(meta / "options.safetensors")["thresholds"].numpy()
         assert (later <= lowered).all()
-        np.testing.assert_array_equal(agent_of(open_artefact(meta), 0).terminations.thresholds, later)
-        np.testing.assert_array_equal(hypogoal.load_options(out).ends.thresholds, lowered)
+        np.testing.assert_array_equal(agent_of(open_artefact(meta), 0).terminations.rule.thresholds, later)
+        np.testing.assert_array_equal(hypogoal.load_options(out).rule.thresholds, lowered)
     with pytest.raises(UserError, match="names code of its own as its termination rule"):
         hypogoal.load_options(out)
 

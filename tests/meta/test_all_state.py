@@ -15,7 +15,7 @@ from odd_parts import Twice
 from hypogoal.options.choosers import CHOOSERS
 from hypogoal.options.learner import LEARNERS
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import TerminationRule, Terminations
 
 STEPS = 45
 
@@ -68,8 +68,9 @@ def with_rule(case: str) -> OptionLoop:
     loop = loop_of(case)
     if "planned" not in case:
         engine = loop.engine
-        rule = Twice(lambda ids: engine.labels(ids)[:, :2], 2, environments=engine.count)
-        loop.terminations = loop.learner.terminations = rule
+        rule = Twice(np.zeros(2, np.float32), engine.count)
+        terminations = Terminations(lambda ids: engine.labels(ids)[:, :2], rule)
+        loop.terminations = loop.learner.terminations = terminations
     return loop
 
 
@@ -96,7 +97,7 @@ def test_a_fresh_part_that_is_restored_has_all_that_the_other_has(case: str) -> 
 
 def test_what_is_left_out_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """An attribute that changes and is not named as such."""
-    monkeypatch.setattr(Twice, "CHANGING", Terminations.CHANGING)
+    monkeypatch.setattr(Twice, "CHANGING", TerminationRule.CHANGING)
     played, fresh = with_rule("light, shared, ppo"), with_rule("light, shared, ppo")
     assert isinstance(played.engine, Corridor)
     for _ in range(STEPS):

@@ -81,9 +81,12 @@ def test_training_that_succeeds_ends_whatever_breaks_it(
     last = json.loads(one.splitlines()[-1])
     assert (last["step"], last["until_reached"]) == (loop.recorder.steps, reached)
     shares = [
-        sum(row[2] > 0 for row in loop.recorder.episodes[: n + 1][-20:]) / 20 for n in range(19, last["episodes"])
+        sum(episode.reward > 0 for episode in loop.recorder.episodes.rows[: n + 1][-20:]) / 20
+        for n in range(19, last["episodes"])
     ]
-    first = [row[0] for row, share in zip(loop.recorder.episodes[19:], shares, strict=True) if share >= until]
+    first = [
+        episode.step for episode, share in zip(loop.recorder.episodes.rows[19:], shares, strict=True) if share >= until
+    ]
     assert first == ([last["step"]] * len(first) if reached else []) and bool(first) == reached
 
 

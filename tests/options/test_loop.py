@@ -1,11 +1,13 @@
 """The option loop, masks, records, and learners that learn (Spec A3, D1-D3, D6, D8, E5, E6)."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from corridor import LENGTH, Corridor
+from numpy.typing import NDArray
 from option_loops import QUICK, Chosen, Scripted, loop_of, played
 
 from hypogoal.meta.config import MetaConfig
@@ -15,6 +17,7 @@ from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.loop import OptionLoop, offered_options
 from hypogoal.options.networks import apply_to_states
+from hypogoal.options.termination import TerminationRule, Terminations
 
 
 def script(engine: Corridor, action: int, **settings: object) -> OptionLoop:
@@ -39,7 +42,7 @@ def test_reward_inside_an_option_is_discounted_from_its_start_and_the_end_of_the
     loop = played(script(Corridor(1), 1), 3)
     (outcome,) = loop.chooser.outcomes
     assert outcome.returns[0] == pytest.approx(0.9**2) and outcome.terminated[0]
-    assert loop.recorder.episodes == [(3, 3, 1.0, 1, 1)]
+    assert loop.recorder.episodes.rows == [(3, 3, 1.0, 1, 1)]
     assert loop.engine.ids[0] == 2
 
 
@@ -61,9 +64,49 @@ def test_a_task_that_ends_when_time_is_up_was_not_timed_out() -> None:
 def test_a_cut_episode_is_truncated_not_terminated() -> None:
     """Spec D2: the cap is no terminal state."""
     loop = played(script(Corridor(1, max_steps=1), 0), 1)
-    (outcome,) = loop.chooser.outcomes
+    (outcome,), (execution,) = loop.chooser.outcomes, loop.recorder.executions[0]
     assert outcome.truncated[0] and not outcome.terminated[0]
-    assert loop.recorder.episodes == [(1, 1, 0.0, 0, 0)]
+    assert execution.truncated and not execution.terminated
+    assert loop.recorder.episodes.rows == [(1, 1, 0.0, 0, 0)]
+
+
+class Counting(TerminationRule):
+    """At most so many positive ends an episode; afterwards executions only time out."""
+
+    most = 1
+
+    def __init__(self, *arguments: Any, **more: Any):
+        super().__init__(*arguments, **more)
+        self.ends = np.full(self.environments, -1)  # until an episode begins
+
+    def begin_episodes(self, environments: NDArray[np.int64]) -> None:
+        self.ends[environments] = 0
+
+    def reached(self, log_odds: Any, options: Any, age: Any) -> NDArray[np.bool_]:
+        reached = super().reached(log_odds, options, age) & (self.ends < self.most)
+        self.ends += reached
+        return reached
+
+
+def test_a_rule_is_told_where_episodes_begin() -> None:
+    """At first, after an end of the task or of time, and when the loop begins anew; not in between."""
+    engine = Corridor(2, max_steps=7)
+    loop = script(engine, 0, option_timeout=3, mask_reached=False)
+    truth = loop.terminations.classify
+    rule = Counting(np.zeros(2, np.float32), engine.count)
+    loop.terminations = Terminations(truth, rule)
+    loop.begin_anew(loop.chooser)
+    met = []
+    for _ in range(7):
+        met.append(rule.ends.tolist())
+        loop.step()
+    assert met == [[0, 0], [0, 0]] + [[1, 1]] * 5 and rule.ends.tolist() == [0, 0]
+    assert [outcome.reached.all() for outcome in loop.chooser.outcomes] == [True, False, False]
+    loop.step()
+    loop.step()
+    assert rule.ends.tolist() == [1, 1]
+    loop.begin_anew(loop.chooser)
+    assert rule.ends.tolist() == [0, 0] and not loop.recorder.episodes.rows
 
 
 def test_offered_options() -> None:

@@ -114,7 +114,7 @@ def test_a_wrong_member_is_told_from_an_option_that_gets_nowhere() -> None:
 
     def ends(engine: Engine) -> Terminations:
         never = np.array([True, True, True, True, False])
-        return Terminations(lambda ids: engine.labels(ids)[:, [0, 1, 2, 2, 4]] & never, 5)
+        return Terminations.of_predictions(lambda ids: engine.labels(ids)[:, [0, 1, 2, 2, 4]] & never, 5)
 
     loop = planned_loop(ends)
     ways = shortest_ways(loop.engine)

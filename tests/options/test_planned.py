@@ -47,7 +47,7 @@ def test_it_goes_where_its_member_predicts_positive() -> None:
     engine = DoorKeyEngine(3, 1)
     ids = engine.plan().ids
     wrong = ids[engine.origins(ids)["agent_x"] == 1][-1]
-    learner = planned(engine, Terminations(lambda states: (states == wrong)[:, None], 1))
+    learner = planned(engine, Terminations.of_predictions(lambda states: (states == wrong)[:, None], 1))
     state, steps = np.array([START]), 0
     while state[0] != wrong:
         state = engine.follow(state, learner.act(state, np.zeros(1, np.int64), np.array([steps])))

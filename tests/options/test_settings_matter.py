@@ -33,7 +33,7 @@ class Endless(Corridor):
 
 def learned(network: str, **settings: Any) -> dict[str, torch.Tensor]:
     """The weights of options whose sub-goals never hold, after some updates."""
-    never = Terminations(lambda ids: np.zeros((len(ids), 2), np.bool_), 2)
+    never = Terminations.of_predictions(lambda ids: np.zeros((len(ids), 2), np.bool_), 2)
     loop = loop_of(Endless(3), ends=never, network=network, **QUICK | {"option_learning_rate": 5e-4} | settings)
     return {name: value.clone() for name, value in played(loop, 40).learner.state().items()}
 

@@ -50,7 +50,7 @@ def test_every_option_begins_at_a_start_state(tmp_path: Path) -> None:
     assert [outcome.durations[0] for outcome in chooser.outcomes] == [2, 4, 3]
     assert [bool(outcome.truncated[0]) for outcome in chooser.outcomes] == [True, True, False]
     assert [bool(outcome.terminated[0]) for outcome in chooser.outcomes] == [False, False, True]
-    assert recorder.episodes == [(2, 2, 0.0, 0, 0), (6, 4, 0.0, 0, 0), (9, 3, 0.0, 1, 0)]
+    assert recorder.episodes.rows == [(2, 2, 0.0, 0, 0), (6, 4, 0.0, 0, 0), (9, 3, 0.0, 1, 0)]
     assert engine.elapsed[0] == 1, "the fourth runs"
 
     recorder.write_executions(tmp_path, lambda positions, options: 10 * positions[:, 1])

@@ -37,7 +37,7 @@ def test_verdicts_are_asked_once_per_state() -> None:
         asked.extend(ids.tolist())
         return engine.labels(ids)
 
-    verdicts = Terminations(classify, 2)
+    verdicts = Terminations.of_predictions(classify, 2)
     rng = np.random.default_rng(0)
     for _ in range(20):
         ids, options = rng.integers(LENGTH, size=7), rng.integers(2, size=7)
@@ -46,7 +46,7 @@ def test_verdicts_are_asked_once_per_state() -> None:
     assert sorted(asked) == list(range(LENGTH))
     assert verdicts.of_running(ids[:0], options[:0]).shape == (0,)
     far = np.array([5000])
-    assert Terminations(lambda ids: np.ones((len(ids), 2), dtype=bool), 2).of(far).all()
+    assert Terminations.of_predictions(lambda ids: np.ones((len(ids), 2), dtype=bool), 2).of(far).all()
 
 
 class TallCorridor(LongCorridor):

@@ -23,7 +23,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.domains.episodes import EpisodeRecorder
+from hypogoal.domains.episodes import Episode, EpisodeRecorder
 from hypogoal.domains.world import WorldConfig, make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
@@ -48,12 +48,12 @@ def test_solves_an_easy_task(agent, setting, tmp_path):
     chosen = HYPERPARAMETERS[agent, setting]
     env = EngineEnv(Low(chosen.environments, max_steps=4))
     trained = learn(env, chosen, EASY_STEPS[agent, setting], tmp_path)
-    assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.5
+    assert np.mean([episode.terminated for episode in env.episodes.rows[:20]]) < 0.5
     trial = EngineEnv(Low(1))
     observation: Any = trial.reset()
-    while not trial.episodes:
+    while not trial.episodes.rows:
         observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
-    assert trial.episodes == [(3, 3, 1.0, 1, 1)]  # the shortest way, by the greedy policy
+    assert trial.episodes.rows == [(3, 3, 1.0, 1, 1)]  # the shortest way, by the greedy policy
 
 
 def test_a_time_limit_is_not_a_terminal_state():
@@ -69,7 +69,7 @@ def test_a_time_limit_is_not_a_terminal_state():
     last, begin = (corridor.images(np.array([cell]))[0].transpose(2, 0, 1) for cell in (0, 2))
     assert np.array_equal(infos[0]["terminal_observation"], last)
     assert np.array_equal(np.asarray(observations), [begin, begin])  # the next episode's start
-    assert env.episodes == [(6, 3, 0.0, 0, 0), (6, 3, 1.0, 1, 1)]
+    assert env.episodes.rows == [(6, 3, 0.0, 0, 0), (6, 3, 1.0, 1, 1)]
 
 
 @pytest.mark.parametrize("network", list(NETWORKS))
@@ -107,9 +107,9 @@ def test_epsilon_waits_for_the_first_goal():
         episodes.steps = steps
         assert epsilon(paper, episodes) == pytest.approx(wanted)
     episodes.steps = 200_000
-    episodes.append((9_000, 50, 0.0, 0, 0))
+    episodes.rows.append(Episode(9_000, 50, 0.0, 0, 0))
     assert epsilon(tuned, episodes) == 1.0
-    episodes += [(184_000, 40, 1.0, 1, 1), (190_000, 40, 1.0, 1, 1)]
+    episodes.rows += [Episode(184_000, 40, 1.0, 1, 1), Episode(190_000, 40, 1.0, 1, 1)]
     assert epsilon(tuned, episodes) == pytest.approx(0.525)
 
 
@@ -154,7 +154,7 @@ def test_a_break_leaves_no_trace(agent, last, tmp_path):
     def trained(checkpoints):
         env = EngineEnv(DoorKeyEngine(100, chosen.environments, max_steps=40))
         found = learn(env, chosen, 2_560, tmp_path, checkpoints)
-        return env.episodes, found.policy.state_dict()
+        return env.episodes.rows, found.policy.state_dict()
 
     episodes, unbroken = trained(Checkpoints(None))
     path = tmp_path / "checkpoint"

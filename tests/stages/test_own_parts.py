@@ -22,7 +22,7 @@ from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.learner import make_policies
 from hypogoal.options.reward import SubgoalReward
 from hypogoal.options.tables import ChoiceCounts
-from hypogoal.options.termination import learned_terminations, saved_terminations
+from hypogoal.options.termination import learned_terminations, saved_rule
 
 FEW = [*settings("steps=300", "environments=4", "max_episode_steps=30"), "-q"]
 
@@ -120,10 +120,10 @@ def test_other_loops_end_options_as_training_does(rule: str, monkeypatch: pytest
     steps = [loop.advance(learning=False) for _ in range(150)]
     executions = sorted(itertools.chain(*loop.recorder.executions), key=lambda execution: execution.step)
 
-    weights = loop.learner.state() | ends.state()
+    weights = loop.learner.state() | ends.rule.state()
     named = config.model_dump() | {"sub_goals": ["a", "b"], "members": 2}
     policies = make_policies(named, weights, {"observation_shape": engine.observation_shape})
-    options = Options(("a", "b"), 2, ensembles, policies, saved_terminations(rule, weights, 4), timeout, True, "", {})
+    options = Options(("a", "b"), 2, ensembles, policies, saved_rule(rule, weights, 4), timeout, True, "", {})
     played: list[int] = []
     env = OptionEnv(Watched(door_key(), played), options)
     env.reset(seed=0)

@@ -56,7 +56,7 @@ def terminations_of(
     rule = load_rule(setup.config.termination)
     rule.refuse(setup.config, engine)
     edges = log_odds_of(np.array([*policies.values()])).astype(np.float32)
-    return rule(log_odds, len(policies), None, edges, engine.count)
+    return Terminations(log_odds, rule(edges, engine.count))
 
 
 def random_play(
@@ -98,7 +98,7 @@ def findings(
     most frequent kinds a film is put into ``folder``, of pictures.
     """
     engine = loop.engine
-    threshold = expit(loop.terminations.thresholds[option].astype(float))
+    threshold = expit(loop.terminations.rule.thresholds[option].astype(float))
     table = Exploits.read(folder / Exploits.FILE)
     last = table.at(table.option == option)
     executions = loop.recorder.executions[option]
