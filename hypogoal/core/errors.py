@@ -22,8 +22,8 @@ class UserError(Exception):
         super().__init__(printable(line))
 
 
-class Complete(UserError):
-    """The output to resume is complete and as requested: the command line says so and exits with code 0."""
+class Complete(Exception):
+    """No error: the output to resume is complete and as requested. The command line says so and exits with code 0."""
 
 
 class NumericalError(Exception):

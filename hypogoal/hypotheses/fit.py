@@ -45,19 +45,31 @@ from hypogoal.hypotheses.config import LABELS, EnsembleConfig
 
 @dataclass(frozen=True)
 class Losses:
-    """The losses of one step, detached: of labelled states (K,), the disagreement (), and their weighted sum ()."""
+    """The losses of one step, and the logits that they are of, detached."""
 
-    labelled: Tensor
-    disagreement: Tensor
-    loss: Tensor
+    labelled: Tensor  # of labelled states, (K,)
+    disagreement: Tensor  # (), before its weight
+    taught: Tensor | None  # of a teacher's scores, (K,)
+    loss: Tensor  # the weighted sum, ()
+    classes: Tensor  # of the labelled states, (B,)
+    on_labelled: Tensor  # logits (K, B, 2)
+    on_unlabelled: Tensor  # logits (K, N, 2); N may be 0
 
     def numbers(self) -> dict[str, float]:
-        """For a log: ``loss``, ``labelled`` (the mean over members), and ``diversity`` (before its weight)."""
-        return {
+        """For a log: losses, the mean over members of their accuracy, and on how many unlabelled states they differ."""
+        numbers = {
             "loss": self.loss.item(),
             "labelled": self.labelled.mean().item(),
             "diversity": self.disagreement.item(),
+            "accuracy": (self.on_labelled.argmax(2) == self.classes).float().mean().item(),
         }
+        if self.taught is not None:
+            numbers["teacher"] = self.taught.mean().item()
+        positive = self.on_unlabelled.argmax(2).bool()
+        if len(positive) > 1 and positive.numel():
+            differ = positive.any(0) & ~positive.all(0)
+            numbers["disagreement"] = differ.float().mean().item()
+        return numbers
 
 
 def fit(
@@ -100,13 +112,23 @@ def fit(
         labelled_losses = torch.stack([cross_entropy(logits, classes, class_weights) for logits in on_labelled])
         disagreement = disagreement_of(objective, context)
         loss = labelled_losses.sum() + config.diversity_weight * disagreement  # Eq. (1)
+        of_teacher = None
         if taught is not None:
-            loss = loss + taught_losses(on_unlabelled, taught[:, numbers]).sum()
+            of_teacher = taught_losses(on_unlabelled, taught[:, numbers])
+            loss = loss + of_teacher.sum()
 
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        yield Losses(labelled_losses.detach(), disagreement.detach(), loss.detach())
+        yield Losses(
+            labelled_losses.detach(),
+            disagreement.detach(),
+            None if of_teacher is None else of_teacher.detach(),
+            loss.detach(),
+            classes,
+            on_labelled.detach(),
+            on_unlabelled.detach(),
+        )
 
 
 def objective_of(config: EnsembleConfig) -> Objective | None:

@@ -1,5 +1,7 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
@@ -68,16 +70,38 @@ def among(scores: Tensor, offered: Tensor) -> Tensor:
     return scores.masked_fill(~offered, -torch.inf)
 
 
-class CategoricalHead(nn.Module):
-    """How an option is drawn from the actor's scores (N, O) among those offered, bool (N, O): a softmax over these.
+class Head(nn.Module, ABC):
+    """How an option is drawn from the actor's scores (N, O) among those offered, bool (N, O).
 
     Attributes:
         remembered: how many numbers of a draw are remembered, R.
     """
 
-    def __init__(self, options: int):
-        super().__init__()
-        self.remembered = 1
+    remembered: int
+
+    @abstractmethod
+    def draw(
+        self,
+        scores: Tensor,
+        offered: Tensor,
+        generator: torch.Generator,
+    ) -> tuple[Tensor, Tensor]:
+        """Options int64 (N,), and what is remembered of the draw, float32 (N, R)."""
+
+    @abstractmethod
+    def log_prob(
+        self,
+        scores: Tensor,
+        offered: Tensor,
+        drawn: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Log probability of the draws and the entropy of what is drawn, float32 (N,) each."""
+
+
+class CategoricalHead(Head):
+    """A softmax over the options offered; the number of the one drawn is remembered."""
+
+    remembered = 1
 
     def draw(
         self,
@@ -85,7 +109,6 @@ class CategoricalHead(nn.Module):
         offered: Tensor,
         generator: torch.Generator,
     ) -> tuple[Tensor, Tensor]:
-        """Options int64 (N,), and what is remembered of the draw, float32 (N, R): the options' numbers."""
         probabilities = among(scores, offered).log_softmax(1).exp()
         option = torch.multinomial(probabilities, 1, generator=generator)
         return option[:, 0], option.float()
@@ -96,13 +119,12 @@ class CategoricalHead(nn.Module):
         offered: Tensor,
         drawn: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Log probability of the draws and the entropy of what is drawn, float32 (N,) each."""
         log = among(scores, offered).log_softmax(1)
         entropy = -(log.exp() * log.masked_fill(~offered, 0.0)).sum(1)
         return log.gather(1, drawn.long()).squeeze(1), entropy
 
 
-class GaussianHead(CategoricalHead):
+class GaussianHead(Head):
     """The paper's Gaussian policy head: scores (N, O) are drawn, and remembered; the best offered is played.
 
     Its entropy is that of the drawn scores. It depends on their spread alone, so an entropy bonus cannot keep the
@@ -110,7 +132,7 @@ class GaussianHead(CategoricalHead):
     """
 
     def __init__(self, options: int):
-        super().__init__(options)
+        super().__init__()
         self.remembered = options
         self.log_std = nn.Parameter(torch.zeros(options))
 
@@ -138,7 +160,6 @@ class GaussianHead(CategoricalHead):
         return self.log_std.to(scores.device).exp()
 
 
-HEADS = {
-    "categorical": CategoricalHead,
-    "gaussian": GaussianHead,
-}
+def make_head(name: str, options: int) -> Head:
+    """The head that the setting ``head`` names."""
+    return GaussianHead(options) if name == "gaussian" else CategoricalHead()

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hypogoal.core import seeding
 from hypogoal.core.adam import Adam
-from hypogoal.core.arrays import Bools, Columns, Floats, Ints, tensor
+from hypogoal.core.arrays import Bools, Columns, Doubles, Floats, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_into
@@ -26,6 +26,8 @@ GRADIENT_NORM = 0.5
 CLIP = 0.2  # of the ratio of probabilities: Schulman et al. 2017
 VALUE_WEIGHT = 0.5  # of the value loss: Schulman et al. 2017
 ENTROPY_WEIGHT = 0.01  # of the entropy bonus: Table 5
+# What is logged of an update, means over its batches, by stable-baselines3's names.
+HEALTH = ("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction")
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class MetaPolicy(Chooser):
                 self.network: nn.Module = networks.PaperMetaNetwork(shape, options)
             else:
                 self.network = networks.LightMetaNetwork(shape, options, engine.standard, name)
-            self.head = networks.HEADS[config.head](options)
+            self.head = networks.make_head(config.head, options)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head}).to(self.device)
         self.optimiser = Adam(self.policy.parameters(), config.meta_learning_rate, eps=1e-5)
         self.generator = seeding.torch_generator(seed, "meta-draws")
@@ -154,6 +156,7 @@ class MetaPolicy(Chooser):
         offered = tensor(draws.offered, self.device)
         drawn = tensor(draws.drawn, self.device)
         old = tensor(draws.log_prob, self.device)
+        health = []
         for epoch in range(config.epochs):
             order = self.rng.permutation(len(draws))
             for begin in range(0, len(order), config.meta_batch):
@@ -165,13 +168,22 @@ class MetaPolicy(Chooser):
                     offered[pick],
                     drawn[pick],
                 )
-                loss = clipped_surrogate(log_prob, old[pick], scaled[pick], CLIP)
-                loss = loss + VALUE_WEIGHT * (out[:, -1] - goals[pick]).square().mean()
+                policy_loss = clipped_surrogate(log_prob, old[pick], scaled[pick], CLIP)
+                value_loss = (out[:, -1] - goals[pick]).square().mean()
+                loss = policy_loss + VALUE_WEIGHT * value_loss
                 loss = loss - ENTROPY_WEIGHT * entropy.mean()
+                kl, clipped = changes(log_prob.detach(), old[pick], CLIP)
+                losses = policy_loss.detach(), value_loss.detach(), -entropy.detach().mean()
+                health.append(torch.stack([*losses, kl, clipped]))
                 where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"
                 descend(loss, self.optimiser, "the meta-policy", where, GRADIENT_NORM)
         self.updates += 1
-        return {"value": float(values.mean())}
+        means = torch.stack(health).mean(0).tolist()
+        return {
+            "value": float(values.mean()),
+            **dict(zip(HEALTH, means, strict=True)),
+            "explained_variance": explained_variance(values, advantages + values),
+        }
 
     def state(self) -> dict[str, Tensor]:
         return dict(self.policy.state_dict())
@@ -198,3 +210,19 @@ def clipped_surrogate(
     """
     ratio = (log_prob - old).exp()
     return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()
+
+
+def changes(log_prob: Tensor, old: Tensor, clip: float) -> tuple[Tensor, Tensor]:
+    """How far a policy went from the one that drew (n,): the mean of r - 1 - log r, and the share that is clipped.
+
+    The first estimates the Kullback-Leibler divergence without bias (Schulman 2020, "Approximating KL divergence").
+    """
+    ratio = (log_prob - old).exp()
+    kl = (ratio - 1 - (log_prob - old)).mean()
+    return kl, ((ratio - 1).abs() > clip).float().mean()
+
+
+def explained_variance(values: Doubles, returns: Doubles) -> float:
+    """The share of the variance of returns (n,) that their predictions (n,) explain; 0 where returns do not vary."""
+    variance = float(returns.var())
+    return 1 - float((returns - values).var()) / variance if variance > 0 else 0.0

@@ -84,25 +84,34 @@ class Chooser(Part, ABC):
 class RandomChooser(Chooser):
     """Spec E6: uniform choice among the options offered, the lower control and the way of ``train-options``."""
 
+    CHANGING = ("rng",)
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+        return cls(rng_for(seed, "random-choice"))
+
+    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
+        return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
+
+
+class EvenChooser(Chooser):
+    """Spec D4: the offered option that has had the fewest steps so far, ties broken by ``rng``.
+
+    Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
+    """
+
     CHANGING = ("rng", "steps")
 
-    def __init__(self, rng: np.random.Generator, options: int = 0):
+    def __init__(self, rng: np.random.Generator, options: int):
         self.rng = rng
         self.steps = np.zeros(options, int)  # of each option so far
 
     @classmethod
     def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
         return cls(rng_for(seed, "random-choice"), options)
-
-    def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
-        return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
-
-
-class EvenChooser(RandomChooser):
-    """Spec D4: the offered option that has had the fewest steps so far, ties broken by ``rng``.
-
-    Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
-    """
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         """For each environment in turn, int64 (n,); an option that runs counts as one step more."""

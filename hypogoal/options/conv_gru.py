@@ -26,7 +26,7 @@ from hypogoal.domains.base import Engine
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import saved
 from hypogoal.options.config import STACK, PaperConfig
-from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch
+from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch, Updated
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay
 
@@ -236,22 +236,22 @@ class PaperLearner(Learner):
 
     def learn(self) -> dict[str, float]:
         """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
-        numbers = {}
+        last = None
         for option, member in enumerate(self.members):
             if member.replay.size < min(self.config.warm_up, self.config.replay):
                 member.due = 0
             while member.due >= self.config.update_interval:
                 member.due -= self.config.update_interval
-                numbers["option_loss"] = self._update(option, member)
-        return numbers
+                last = self._update(option, member) or last
+        return self.health(last, sum(member.replay.size for member in self.members)) if last else {}
 
-    def _update(self, option: int, member: Member) -> float:
-        """One update of a member's policy; returns the loss, 0 where all steps drawn are forgotten."""
+    def _update(self, option: int, member: Member) -> Updated | None:
+        """One update of a member's policy; None where all steps drawn are forgotten."""
         indices, weights = member.replay.sample(self.config.option_batch, self.rng)
         steps = member.replay.data.at(indices)
         kept = self.engine.remembers(steps.path).all(axis=1)
         if not kept.any():
-            return 0.0
+            return None
         indices, weights, steps = indices[kept], weights[kept], steps.at(kept)
 
         path, length = steps.path.astype(int), steps.length
@@ -281,7 +281,7 @@ class PaperLearner(Learner):
             np.ones_like(reached),
             weights,
         )
-        loss, errors = member.update(
+        updated = member.update(
             values[:, None],
             next_online[:, None],
             next_target[:, None],
@@ -289,8 +289,8 @@ class PaperLearner(Learner):
             [option],
             self.option_steps[option],
         )
-        member.replay.set_priorities(indices, errors)
-        return loss
+        member.replay.set_priorities(indices, updated.errors)
+        return updated
 
     def weights(self) -> dict[str, Tensor]:
         tensors = {}

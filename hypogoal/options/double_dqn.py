@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -64,6 +64,14 @@ class ReplayBatch:
     weights: Floats  # (n,)
 
 
+class Updated(NamedTuple):
+    """What one update found."""
+
+    loss: float
+    q: float  # the mean value of the actions taken
+    errors: Floats  # each transition's largest absolute TD error, (n,)
+
+
 class DoubleDQN(Resumable):
     """An online network of values (n, O, A), its optimiser, and the target network that follows it.
 
@@ -88,12 +96,11 @@ class DoubleDQN(Resumable):
         batch: ReplayBatch,
         options: Sequence[int],
         step: int,
-    ) -> tuple[float, Floats]:
+    ) -> Updated:
         """Spec D2: a step down the Huber loss of a batch; then the target network follows.
 
         ``values`` are the online network's in the states, with gradients; ``next_online`` and ``next_target`` both
-        networks' in the next states; all float (n, O, A). ``options`` (O,) and ``step`` are for errors. Returns the
-        loss, and each transition's largest absolute error (n,).
+        networks' in the next states; all float (n, O, A). ``options`` (O,) and ``step`` are for errors.
         """
         actions, steps, reached, terminated, learns, weights = (
             tensor(array, values.device) for array in vars(batch).values()
@@ -114,7 +121,8 @@ class DoubleDQN(Resumable):
         descend(loss, self.optimiser, f"options {list(options)}", where, self.largest)
         self.updates += 1
         self._follow()
-        return float(loss.detach()), errors.detach().abs().amax(1).cpu().numpy()
+        largest = errors.detach().abs().amax(1).cpu().numpy()
+        return Updated(float(loss.detach()), float(taken.detach().mean()), largest)
 
     @torch.no_grad()
     def _follow(self) -> None:

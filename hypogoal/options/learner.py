@@ -16,7 +16,7 @@ from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
 from hypogoal.options.config import LearnerConfig
-from hypogoal.options.double_dqn import linear_epsilon
+from hypogoal.options.double_dqn import Updated, linear_epsilon
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.parts import Part, answer_of, saved_row
 from hypogoal.options.saved import Policies, SavedOptions
@@ -124,6 +124,16 @@ class Learner(Part, ABC):
         """Every option's exploration, float (O,)."""
         steps = self.steps_since_positive if self.config.epsilon_from == "first-positive" else self.option_steps
         return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
+
+    def health(self, last: Updated, replay: int) -> dict[str, float]:
+        """Numbers to log of the last update, and of a replay with so many transitions."""
+        return {
+            "option_loss": last.loss,
+            "option_q": last.q,
+            "option_td_error": float(last.errors.mean()),
+            "exploration_rate": float(self.epsilon().mean()),
+            "replay_size": replay,
+        }
 
     def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""

@@ -20,7 +20,7 @@ from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
 from hypogoal.options import networks, saved
 from hypogoal.options.config import STACK, LightConfig
-from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch
+from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch, Updated
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay, Steps, StepsAhead
 
@@ -125,14 +125,14 @@ class LightLearner(Learner):
     def learn(self) -> dict[str, float]:
         if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
             self.due = 0
-        numbers = {}
+        last = None
         while self.due >= self.config.update_interval:
             self.due -= self.config.update_interval
-            numbers = {"option_loss": self._update()}
-        return numbers
+            last = self._update()
+        return self.health(last, self.replay.size) if last else {}
 
-    def _update(self) -> float:
-        """One update of all policies; returns the loss."""
+    def _update(self) -> Updated:
+        """One update of all policies."""
         lessons, indices, weights = self._batch()
         learns, reached = self._judged(lessons)
         batch = ReplayBatch(
@@ -151,14 +151,14 @@ class LightLearner(Learner):
             lessons.next_state,
             self.device,
         )
-        loss, errors = self.networks.update(
+        updated = self.networks.update(
             *values,
             batch,
             range(self.options),
             self.steps,
         )
-        self.replay.set_priorities(indices, errors[: len(indices)])
-        return loss
+        self.replay.set_priorities(indices, updated.errors[: len(indices)])
+        return updated
 
     def _batch(self) -> tuple[Lessons, Ints, Floats]:
         """Transitions, the first of them drawn from the replay at indices int64 (m,), and weights float32 (n,)."""

@@ -10,8 +10,7 @@ from hypogoal.core.arrays import Bytes, Ints, tensor
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
-from hypogoal.hypotheses.views import FullView
-from hypogoal.observations import NUMBERS, PICTURE, Shape, Standard, standardised
+from hypogoal.observations import Shape, Standard, standardised
 
 CELL = 8  # pixels
 WIDTH = 128  # of dense layers
@@ -103,24 +102,30 @@ class PictureEmbedding(nn.Module):
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
-class NumberEmbedding(FullView):
+class NumberEmbedding(nn.Module):
     """Observations that are no pictures: each number's deviations from a mean."""
 
-    @property
-    def features(self) -> int:
-        """How many."""
-        return self.mean.numel()
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, standard: Standard):
+        super().__init__()
+        keep_standard(self, standard)
+        self.features = self.mean.numel()
 
     def forward(self, observations: Tensor) -> Any:
         """float32 (N, *shape) -> float32 (N, features)."""
         return standardised(observations, self.mean, self.deviation).flatten(1)
 
 
-class OwnEmbedding(FullView):
+class OwnEmbedding(nn.Module):
     """A member network by name (see :mod:`hypogoal.hypotheses.networks`) up to its last hidden layer, or an encoder.
 
     It stays in evaluation mode: what BatchNorm and Dropout make of a state depends on no other state.
     """
+
+    mean: Tensor
+    deviation: Tensor
 
     def __init__(
         self,
@@ -128,7 +133,10 @@ class OwnEmbedding(FullView):
         observation_shape: Shape,
         standard: Standard | None,
     ):
-        super().__init__(observation_shape, NUMBERS if standard else PICTURE, standard)
+        super().__init__()
+        self.standardises = standard is not None
+        if standard:
+            keep_standard(self, standard)
         network = build_network(name, observation_shape, None)
         last = network[-1]
         assert isinstance(last, nn.Linear)
@@ -136,9 +144,15 @@ class OwnEmbedding(FullView):
 
     def forward(self, observations: Tensor) -> Any:
         """uint8 (N, H, W, C), or float32 (N, *shape) where there is a standard -> float32 (N, features)."""
-        if self.dtype != PICTURE:
+        if self.standardises:
             observations = standardised(observations, self.mean, self.deviation)
         return self.encoder(as_input(observations))
+
+
+def keep_standard(embedding: nn.Module, standard: Standard) -> None:
+    """Keep mean and deviation of numbers among an embedding's weights."""
+    for name, values in zip(("mean", "deviation"), standard, strict=True):
+        embedding.register_buffer(name, torch.from_numpy(values.copy()))
 
 
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
@@ -153,7 +167,7 @@ def embedding_for(observation_shape: Shape, standard: Standard | None, name: str
     if name != AUTO:
         return OwnEmbedding(name, observation_shape, standard)
     if standard is not None:
-        return NumberEmbedding(observation_shape, NUMBERS, standard)
+        return NumberEmbedding(standard)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:

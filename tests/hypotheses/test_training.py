@@ -1,6 +1,7 @@
 """Training: the toy where diversity is needed, both schedules, determinism, NaN (Spec C1-C4, C6, G1-G3)."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,24 @@ def test_diversity_finds_the_feature_that_is_hidden(schedule: str) -> None:
     easy, hard = follows(diverse)
     assert easy.max() > 0.9
     assert hard.max() > 0.9
+
+
+def test_the_log_tells_accuracy_and_disagreement_by_hand() -> None:
+    """Two members: one right of two labelled states, one of both; they differ on one of four unlabelled states."""
+    positive, negative = [0.0, 1.0], [1.0, 0.0]
+    losses = fit.Losses(
+        labelled=torch.tensor([0.2, 0.4]),
+        disagreement=torch.tensor(0.5),
+        taught=torch.tensor([1.0, 3.0]),
+        loss=torch.tensor(0.7),
+        classes=torch.tensor([1, 0]),
+        on_labelled=torch.tensor([[positive, positive], [positive, negative]]),
+        on_unlabelled=torch.tensor([[positive, negative, negative, negative], [negative] * 4]),
+    )
+    wanted = {"loss": 0.7, "labelled": 0.3, "diversity": 0.5, "accuracy": 0.75, "teacher": 2.0, "disagreement": 0.25}
+    assert losses.numbers() == pytest.approx(wanted)
+    alone = replace(losses, taught=None, on_labelled=losses.on_labelled[:1], on_unlabelled=losses.on_unlabelled[:1])
+    assert alone.numbers().keys() == wanted.keys() - {"teacher", "disagreement"}
 
 
 def test_a_single_member_is_the_plain_cnn() -> None:

@@ -1,5 +1,6 @@
 """SMDP returns and the meta-policy's loss (Spec E1-E3)."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -8,11 +9,12 @@ import pytest
 import torch
 from corridor import Corridor
 from numpy.typing import NDArray
+from stable_baselines3.common.utils import explained_variance as theirs
 
 from hypogoal.meta import smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, among
-from hypogoal.meta.ppo import Draws, MetaPolicy, clipped_surrogate
+from hypogoal.meta.ppo import HEALTH, Draws, MetaPolicy, changes, clipped_surrogate, explained_variance
 from hypogoal.meta.smdp import scaled_advantages, smdp_advantages
 from hypogoal.options.choosers import Outcome
 
@@ -81,19 +83,43 @@ def test_the_clipped_surrogate_by_hand() -> None:
     assert float(loss) == pytest.approx(-(1.2 - 0.8 + 2.2) / 3)
 
 
+def test_what_an_update_changed_by_hand() -> None:
+    """Ratios 1, 2 and .5: of two of three the policy went further than .2; the estimate is never below 0."""
+    kl, clipped = changes(torch.tensor([0.0, math.log(2), -math.log(2)]), torch.zeros(3), 0.2)
+    assert kl.item() == pytest.approx(((2 - 1 - math.log(2)) + (0.5 - 1 + math.log(2))) / 3)
+    assert clipped.item() == pytest.approx(2 / 3)
+    rng = np.random.default_rng(0)
+    values, returns = rng.random((2, 50))
+    assert explained_variance(values, returns) == pytest.approx(theirs(values, returns))
+    assert explained_variance(values, np.ones(50)) == 0.0
+
+
+def test_an_update_tells_its_health() -> None:
+    """Each number by stable-baselines3's name; a single batch is of the policy that drew."""
+    policy = MetaPolicy(Corridor(2), 2, MetaConfig(decisions=6, meta_batch=6, epochs=1), 0)
+    outcomes = replace(
+        Outcome.zeros(6), environments=np.repeat([0, 1], 3), returns=np.arange(6) / 6, terminated=np.ones(6, np.bool_)
+    )
+    told = policy.update(draws_in(np.arange(6) % 5), outcomes)
+    assert told["approx_kl"] == pytest.approx(0, abs=1e-3) and told["clip_fraction"] == 0
+    assert told["entropy_loss"] == pytest.approx(-math.log(2), abs=1e-3)
+    assert told["value_loss"] == pytest.approx(((outcomes.returns - told["value"]) ** 2).mean(), abs=0.05)
+    assert told.keys() == {"value", *HEALTH, "explained_variance"}
+
+
 def test_masked_options_are_never_drawn() -> None:
     """Spec D6, E2: neither head draws an option that is not offered, and the categorical gives it no probability."""
     scores = torch.tensor([[50.0, 0.0, 0.0, 1.0]]).repeat(500, 1)
     offered = torch.tensor([[False, True, False, True]]).repeat(500, 1)
     generator = torch.Generator().manual_seed(0)
-    for head in (CategoricalHead(4), GaussianHead(4)):
+    for head in (CategoricalHead(), GaussianHead(4)):
         options, drawn = head.draw(scores, offered, generator)
         assert set(options.tolist()) == {1, 3}
         log_prob, entropy = head.log_prob(scores, offered, drawn)
         assert torch.isfinite(log_prob).all() and torch.isfinite(entropy).all()
         assert log_prob.shape == entropy.shape == (500,)
         assert int(among(scores, offered).argmax(1)[0]) == 3
-    log_prob, entropy = CategoricalHead(4).log_prob(scores[:1], offered[:1], torch.tensor([[3.0]]))
+    log_prob, entropy = CategoricalHead().log_prob(scores[:1], offered[:1], torch.tensor([[3.0]]))
     assert float(log_prob.detach()) == pytest.approx(1 - np.log(np.exp(1) + 1))
     p = np.exp(1) / (1 + np.exp(1))
     assert float(entropy.detach()) == pytest.approx(-(p * np.log(p) + (1 - p) * np.log(1 - p)), rel=1e-5)

@@ -3,11 +3,13 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 import torch
 from corridor import LongCorridor
 
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.learner import Transitions
 from hypogoal.options.light import Lessons, LightLearner
 from hypogoal.options.networks import values_of
 from hypogoal.options.termination import oracle_terminations
@@ -43,6 +45,25 @@ def test_values_and_gradients_are_those_of_every_row() -> None:
     assert not next_online.requires_grad
     assert not next_target.requires_grad
     assert not torch.allclose(next_online, next_target)
+
+
+def test_learning_tells_its_health() -> None:
+    """After an update: the replay's size, exploration, and finite numbers of the last batch; before it nothing."""
+    engine = LongCorridor(4)
+    config = OptionConfig.of(environments=4, warm_up=8, update_interval=4, epsilon_from="start", epsilon_steps=100)
+    learner = LightLearner(engine, oracle_terminations(engine, [0, 1]), config, 0)
+    told = []
+    for _ in range(4):
+        ids = engine.ids.copy()
+        step = engine.step(np.ones(4, int))
+        no = np.zeros(4, np.bool_)
+        learner.observe(
+            Transitions(ids, np.ones(4, int), step.next_ids, step.rewards, np.zeros(4, int), no, no, no, no)
+        )
+        told.append(learner.learn())
+    assert told[0] == {} and told[-1]["replay_size"] == 16
+    assert told[-1]["exploration_rate"] == pytest.approx((learner.epsilon()[0] + 1) / 2)
+    assert np.isfinite([*told[-1].values()]).all() and told[-1]["option_td_error"] > 0
 
 
 def test_what_reached_is_drawn_while_its_states_are_remembered() -> None:

@@ -212,13 +212,20 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+HEALTH = {  # of a training, logged since 1.1
+    *("accuracy", "disagreement", "teacher", "option_q", "option_td_error", "exploration_rate", "replay_size"),
+    *("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction", "explained_variance"),
+}
+
+
 def log_of(artefact: Path) -> Table:
     """Numbers of a training's log: line, name, value."""
     lines = (artefact / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
     rows: Table = []
     for place, line in enumerate(lines):
         for key, value in sorted(json.loads(line).items()):
-            rows.append((f"log {place}", key, number(value)))
+            if key not in HEALTH:
+                rows.append((f"log {place}", key, number(value)))
     return rows
 
 
