@@ -25,6 +25,7 @@ from benchmarks.options import config_of, played, update  # noqa: E402
 from benchmarks.training import states  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.domains.base import settings_of  # noqa: E402
+from hypogoal.hypotheses.config import TrainEnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.training import EnsembleTraining  # noqa: E402
 
 ROWS = 1_024
@@ -51,7 +52,8 @@ def measured(work: Callable[[], object], repeats: int) -> tuple[float, int]:
 def ensemble_step(domain: str, folder: Path) -> Callable[[], object]:
     """A step of an ensemble's training."""
     split, unlabelled = states(domain, folder)
-    config = settings_of("train-ensemble", domain, typed={"members": MEMBERS, "steps": 1_000})
+    chosen = settings_of(TrainEnsembleConfig, "train-ensemble", domain, typed={"members": MEMBERS, "steps": 1_000})
+    config = chosen.training(float(chosen.diversity_weight), "labels")
     steps = EnsembleTraining(split.observations, split.labels, unlabelled, config, 0).steps()
     return lambda: next(steps)
 

@@ -132,10 +132,10 @@ def update(loop: OptionLoop) -> float:
     """CPU seconds of one update."""
     learner = loop.learner
     if isinstance(learner, PaperLearner):
-        learner.members[0].due = learner.config.update_interval
+        learner.members[0].due = learner.settings.update_interval
     else:
         assert isinstance(learner, LightLearner)
-        learner.due = learner.config.update_interval
+        learner.due = learner.settings.update_interval
     return timing.cpu_seconds(learner.learn)
 
 

@@ -30,7 +30,7 @@ from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.data import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
 from hypogoal.domains.base import settings_of  # noqa: E402
-from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
+from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
 from hypogoal.hypotheses.training import EnsembleTraining  # noqa: E402
 
@@ -99,7 +99,8 @@ def ours(split: States, unlabelled: np.ndarray, config: EnsembleConfig) -> float
 
 def compared(split: States, unlabelled: np.ndarray, domain: str, members: int, steps: int, repeats: int) -> Any:
     """All ways, in turn."""
-    config = settings_of("train-ensemble", domain, typed={"members": members, "steps": steps + 1})
+    chosen = settings_of(TrainEnsembleConfig, "train-ensemble", domain, typed={"members": members, "steps": steps + 1})
+    config = chosen.training(float(chosen.diversity_weight), "labels")
     candidates = {
         "plain loop": lambda: plain(split, unlabelled, config, steps),
         "hypogoal": lambda: ours(split, unlabelled, config),

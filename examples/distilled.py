@@ -24,7 +24,6 @@ in place of `Deep` takes a third of the time and carries over less. Measured: do
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +31,8 @@ from torch import Tensor, nn
 
 import hypogoal
 from hypogoal.core.arrays import Ints, tensor
-from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
+from hypogoal.meta.config import PlayConfig
+from hypogoal.options.config import OptionConfig, OwnLearnerConfig
 from hypogoal.options.double_dqn import DoubleDQN, descend
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.learner import Learner as AnyLearner
@@ -117,20 +117,22 @@ class Learner(LightLearner):
     """
 
     CHANGING = (*AnyLearner.CHANGING, "networks", "best", "kind", "steps", "due")
+    settings: OwnLearnerConfig
 
-    def build(self, config: Any, seed: int) -> None:
-        assert isinstance(config, TrainOptionsConfig | TrainMetaConfig)
+    def build(self, config: OptionConfig, seed: int) -> None:
+        assert isinstance(config, PlayConfig)
+        self.settings = settings = config.part(OwnLearnerConfig)
         self.last = config.steps
         self.actions = plan_of(self.engine, self.terminations, config, self.engine.ids[:1]).actions
-        self.exploration = Exploration(config, self.engine.count, len(self.actions), self.rng)
-        self.networks = DoubleDQN(self.network(config, seed), config, GRADIENT_NORM)  # the target's is not used
+        self.exploration = Exploration(settings, self.engine.count, len(self.actions), self.rng)
+        self.networks = DoubleDQN(self.network(settings, seed), settings, GRADIENT_NORM)  # the target's is not used
         self.best = np.zeros((0, self.options), np.min_scalar_type(2**self.engine.n_actions - 1))
         self.kind = np.zeros(0, np.uint8)
         self.steps = self.due = 0
         self.loaded = False
 
     @staticmethod
-    def reach(config: Any, options: int) -> int:
+    def reach(config: OptionConfig, options: int) -> int:
         return 0
 
     def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
@@ -157,8 +159,8 @@ class Learner(LightLearner):
 
     def learn(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
-        while self.due >= self.config.update_interval:
-            self.due -= self.config.update_interval
+        while self.due >= self.settings.update_interval:
+            self.due -= self.settings.update_interval
             numbers = self._update()
         return numbers
 
@@ -201,7 +203,7 @@ class Learner(LightLearner):
         of_best = scores.masked_fill(tensor(~best, self.device), -torch.inf).logsumexp(2)
         loss = of_best.neg().sum() / max(1, int(leads.sum()))
         fallen = min(1.0, self.steps / self.last)
-        networks.optimiser.lr = self.config.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
+        networks.optimiser.lr = self.settings.option_learning_rate * (1 - (1 - LOWEST_RATE) * fallen)
         where = f"in the batch of update {networks.updates}, step {self.steps}"
         descend(loss, networks.optimiser, "the options", where, GRADIENT_NORM)
         networks.updates += 1
@@ -210,9 +212,9 @@ class Learner(LightLearner):
 
     def _batch(self) -> Ints:
         """States int64 (n,), a share of them visited, the others out of all plans."""
-        some = round(UNIFORM * self.config.option_batch)
+        some = round(UNIFORM * self.settings.option_batch)
         visited, planned = np.flatnonzero(self.kind == VISITED), np.flatnonzero(self.kind >= PLANNED)
-        of_play = visited[self.rng.integers(len(visited), size=self.config.option_batch - some)]
+        of_play = visited[self.rng.integers(len(visited), size=self.settings.option_batch - some)]
         of_plans = planned[self.rng.integers(len(planned), size=some)]
         return np.concatenate([of_play, of_plans])
 

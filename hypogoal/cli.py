@@ -326,6 +326,7 @@ def check(
     from hypogoal.core import config as settings
     from hypogoal.data import open_dataset
     from hypogoal.domains import base as domains
+    from hypogoal.hypotheses.config import TrainEnsembleConfig
 
     checks = []
     observations: tuple[Any, ...] = ()
@@ -333,11 +334,11 @@ def check(
     assigned = settings.assigned(set_ or ())
     if domain is not None and domain.endswith(".h5"):
         in_file = open_dataset(Path(domain)).domain
-        training = domains.settings_of("train-ensemble", in_file, typed=assigned)
+        training = domains.settings_of(TrainEnsembleConfig, "train-ensemble", in_file, typed=assigned)
         checks.append(contracts.check_data(Path(domain), training, seed=seed))
     elif domain is not None:
         loaded = domains.load_domain(domain)
-        chosen = domains.settings_of("collect", domain, typed=assigned)
+        chosen = domains.settings_of(settings.Config, "collect", domain, typed=assigned)
         checks.append(contracts.check_domain(loaded, chosen, seed=seed))
         observations = loaded.observation_shape, loaded.observation_dtype
     parts: list[Any] = [

@@ -9,7 +9,7 @@ from statistics import fmean
 from typing import Any
 
 from hypogoal.cells import read_plan, status_lines
-from hypogoal.core.artefacts import LOG, MANIFEST, SUMMARY, Artefact, Draft
+from hypogoal.core.artefacts import LOG, MANIFEST, SUMMARY, Artefact, Draft, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_log, reading, visible
 from hypogoal.core.progress import say
@@ -94,7 +94,7 @@ def outcome(details: Details) -> list[str]:
         return count_lines(numbers)
     if kind not in SUMMARISED:
         return []
-    path = Path(details["path"]) / SUMMARY
+    path = open_artefact(Path(details["path"])).path / SUMMARY
     with reading(path, SUMMARISED[kind], "the summary"):
         return path.read_text(encoding="utf-8").splitlines()
 

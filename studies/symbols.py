@@ -35,6 +35,7 @@ from hypogoal.evaluation.curves import budget_of, run_numbers
 from hypogoal.experiments.built_in import SOLVABLE
 from hypogoal.meta import symbols
 from hypogoal.options.choosers import Chooser, Outcome
+from hypogoal.options.config import OptionConfig
 from hypogoal.options.tables import Episodes
 from studies.cells import Jobs, Row, amount, importable, parser_of, printed, read_rows, run_cells, table
 
@@ -148,7 +149,7 @@ class Thompson(Chooser):
         self.used = np.zeros((environments, options), np.bool_)
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
         return cls(engine.count, options, rng_for(seed, "thompson"))
 
     def choose(self, environments: Ints, ids: Ints, offered: Bools) -> Ints:

@@ -1,7 +1,8 @@
 """Settings: a pydantic model for each stage, whose fields have default, meaning, unit, source and limits.
 
 Precedence: ``--set`` > option > preset > the domain's default > default. The settings that only one learner or chooser
-has are a part of the stage's model: a model of their own, which is there where a setting chooses it.
+has are a model of their own, a field of the stage's model, see :func:`part`. Their names are flat all the same: on the
+command line, in presets, in manifests.
 """
 
 import difflib
@@ -14,7 +15,7 @@ from functools import cache
 from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, ClassVar, TypeVar, Union, get_args, get_origin
+from typing import Any, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -22,7 +23,6 @@ from pydantic import (
     Field,
     ValidationError,
     ValidationInfo,
-    create_model,
     field_validator,
 )
 from pydantic.fields import FieldInfo
@@ -48,25 +48,38 @@ MOST = 10_000  # integers that one range may stand for
 
 
 class Config(BaseModel):
-    """The settings of a stage or of a part of it; names that it lacks and values that it does not allow are refused.
-
-    Attributes:
-        PARTS: by setting and its value, the model of the settings that this value brings. Values of one's own, ``OWN``,
-            bring all of them.
-    """
+    """The settings of a stage or of a part of it; names that it lacks and values that it does not allow are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    PARTS: ClassVar[dict[str, dict[str, type["Config"]]]] = {}
 
     @classmethod
-    def of(cls, **values: Any) -> Any:
+    def of(cls, **values: Any) -> Self:
         """The settings with these values, of the parts that they choose; those of other parts have no effect."""
         return resolve(cls, values, {}, stage=cls.__name__)
+
+    def part(self, kind: type[C]) -> C:
+        """The part of this kind; a ``TypeError`` where the settings have chosen none."""
+        for name in parts_of(type(self)):
+            found = getattr(self, name)
+            if isinstance(found, kind):
+                return found
+        raise TypeError(f"these settings have no {kind.__name__}")
+
+    def flat(self) -> dict[str, Any]:
+        """All settings by name, those of parts too, as JSON has them."""
+        parts = parts_of(type(self))
+        values = self.model_dump(mode="json", exclude={*parts})
+        for name in parts:
+            chosen = getattr(self, name)
+            values |= chosen.flat() if chosen else {}
+        return values
 
     @field_validator("*", mode="wrap")
     @classmethod
     def _read(cls, raw: Any, as_field: Callable[[Any], Any], info: ValidationInfo) -> Any:
         field = cls.model_fields[str(info.field_name)]
+        if info.field_name in parts_of(cls):
+            return as_field(raw)
         value = as_field(_typed(raw, field.annotation))
         for item in value if isinstance(value, tuple) else (value,):
             if not _details(field).allow(item):
@@ -111,6 +124,38 @@ class Details:
             return "|".join(choices)
         numbers = [f"{self.low} .. {self.high}"] if self.is_bounded else []
         return "|".join([*self.words, *numbers])
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a part is, by the value of a setting: the model of those that this value brings.
+
+    Values of one's own, ``OWN``, bring those of all.
+    """
+
+    by: str
+    models: Mapping[str, type[Config]]
+
+    def model(self, value: str) -> type[Config] | None:
+        """The model that a value brings."""
+        return self.models.get(OWN if ":" in value else value)
+
+    @property
+    def whole(self) -> type[Config]:
+        """The model of all."""
+        return self.models[OWN]
+
+
+def part(by: str, models: Mapping[str, type[Config]]) -> Any:
+    """A field of a ``Config`` that is a part, see :class:`Choice`; None where the setting's value brings none."""
+    return Field(None, json_schema_extra={"part": Choice(by, models)})  # type: ignore[dict-item]
+
+
+@cache
+def parts_of(model: type[Config]) -> dict[str, Choice]:
+    """The fields of a model that are parts."""
+    extras: dict[str, Any] = {name: field.json_schema_extra or {} for name, field in model.model_fields.items()}
+    return {name: extra["part"] for name, extra in extras.items() if "part" in extra}
 
 
 def setting(default: Any, meaning: str, **details: Any) -> Any:
@@ -173,46 +218,71 @@ def resolve(model: type[C], *layers: Values, stage: str) -> C:
     values: dict[str, Any] = {}
     for layer in layers:
         values |= {name: value for name, value in layer.items() if value is not None}
-    chosen = _with_parts(model, values)
-    whole = _with_parts(model)
-    idle = whole.model_fields.keys() - chosen.model_fields.keys()
-    for name in idle.difference(*layers[-1:]):
-        values.pop(name, None)
+    for field, choice in parts_of(model).items():
+        given = {name: values.pop(name) for name in choice.whole.model_fields if name in values}
+        chosen = choice.model(str(values.get(choice.by, model.model_fields[choice.by].default)))
+        names = chosen.model_fields if chosen else {}
+        for name in given:
+            if name not in names and layers[-1].get(name) is not None:
+                fault = f"{stage} has this setting only beside another choice"
+                raise UserError(fault, name, f"See 'hypogoal config {stage}'.")
+        if chosen:
+            of_part = {name: value for name, value in given.items() if name in names}
+            values[field] = _validated(chosen, of_part, model, stage)
+    return _validated(model, values, model, stage)
+
+
+def _validated(kind: type[C], values: Values, model: type[Config], stage: str) -> C:
+    """Settings of this kind, ``model`` itself or a part of it."""
     try:
-        return chosen.model_validate(values)
+        return kind.model_validate(values)
     except ValidationError as error:
-        raise _refusal(chosen, whole, error, stage) from None
+        raise _refusal(kind, model, error, stage) from None
+
+
+def homes_of(model: type[Config]) -> list[type[Config]]:
+    """The model, then those of all its parts."""
+    return [model, *(choice.whole for choice in parts_of(model).values())]
+
+
+def names_of(model: type[Config]) -> list[str]:
+    """All settings of the model and of its parts."""
+    names = [name for home in homes_of(model) for name in home.model_fields]
+    return [name for name in names if name not in parts_of(model)]
 
 
 def known(model: type[Config], values: Values) -> dict[str, Any]:
     """The values of a manifest or data file that the model or a part of it has: earlier versions had others, too."""
-    return {name: values[name] for name in _with_parts(model).model_fields if name in values}
+    return {name: values[name] for name in names_of(model) if name in values}
 
 
 def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str, Any]]:
     """Every setting of the model, then of its parts; a layer has values that replace defaults, and their source."""
-    every = _with_parts(model)
-    defaults = resolve(every, *(values for values, _ in layers), {}, stage="").model_dump(mode="json")
+    given: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for values, source in layers:
+        given |= {name: value for name, value in values.items() if value is not None}
         sources |= dict.fromkeys(values, source)
     rows = {}
-    for home in (*model.__mro__, *every.__mro__):
-        for name in inspect.get_annotations(home):
-            field = every.model_fields.get(name)
-            if field is None or name in rows:
-                continue
-            details = _details(field)
-            rows[name] = {
-                "name": name,
-                "type": _type_text(field.annotation),
-                "default": defaults[name],
-                "unit": details.unit,
-                "meaning": field.description or "",
-                "source": sources.get(name, details.source),
-                "allowed": str(details),
-                "part": (home.__doc__ or "").partition(".")[0],
-            }
+    for home in homes_of(model):
+        own = {name: value for name, value in given.items() if name in home.model_fields}
+        defaults = _validated(home, own, model, "").model_dump(mode="json")
+        for origin in home.__mro__:
+            for name in inspect.get_annotations(origin):
+                field = home.model_fields.get(name)
+                if field is None or name in rows or name in parts_of(home):
+                    continue
+                details = _details(field)
+                rows[name] = {
+                    "name": name,
+                    "type": _type_text(field.annotation),
+                    "default": defaults[name],
+                    "unit": details.unit,
+                    "meaning": field.description or "",
+                    "source": sources.get(name, details.source),
+                    "allowed": str(details),
+                    "part": (origin.__doc__ or "").partition(".")[0],
+                }
     return [*rows.values()]
 
 
@@ -270,42 +340,18 @@ def _details(field: FieldInfo) -> Details:
     return extra.get("details", Details())
 
 
-def _with_parts(model: type[C], values: Values | None = None) -> type[C]:
-    """The model with the parts that ``values`` choose; without ``values`` with all parts."""
-    parts = []
-    for name, models in model.PARTS.items():
-        value = OWN if values is None else str(values.get(name, model.model_fields[name].default))
-        part = models.get(OWN if ":" in value else value)
-        if part:
-            parts.append(part)
-    return _joined(model, *parts)
-
-
-@cache
-def _joined(model: type[C], *parts: type[Config]) -> Any:
-    """One model of all fields, ``model``'s first; a part may derive from ``model``."""
-    if not parts:
-        return model
-    bases = parts
-    if not any(issubclass(part, model) for part in parts):
-        bases = (model, *parts)
-    return create_model(model.__name__, __base__=bases, __doc__=model.__doc__)
-
-
-def _refusal(model: type[Config], whole: type[Config], error: ValidationError, stage: str) -> UserError:
-    """What is said of the first fault in settings of ``model``, which ``whole`` is with all its parts."""
+def _refusal(kind: type[Config], model: type[Config], error: ValidationError, stage: str) -> UserError:
+    """What is said of the first fault in settings of this kind, ``model`` itself or a part of it."""
     fault = error.errors()[0]
     name = str(fault["loc"][0])
     advice = f"See 'hypogoal config {stage}'."
-    if name in model.model_fields:
-        allowed = str(_details(model.model_fields[name]))
+    if name in kind.model_fields:
+        allowed = str(_details(kind.model_fields[name]))
         where = f"{name}={fault['input']!r:.200} in {stage}"
         do = f"Allowed: {allowed}." if allowed else advice
         return UserError(fault["msg"].removeprefix("Value error, "), where, do)
-    if name in whole.model_fields:
-        return UserError(f"{stage} has this setting only beside another choice", name, advice)
     if stage == "run":
         advice = f"Of a stage: --set STAGE.{name}=VALUE. {advice}"
-    for close in difflib.get_close_matches(name, [*whole.model_fields], n=1):
+    for close in difflib.get_close_matches(name, names_of(model), n=1):
         advice = f"Did you mean {close!r}? {advice}"
     return UserError(f"{stage} has no setting", name, advice)

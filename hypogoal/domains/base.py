@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core import own_code
 from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import Resumable, State
-from hypogoal.core.config import Config, Values, model_of, preset, resolve
+from hypogoal.core.config import C, Config, Values, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
 from hypogoal.observations import PICTURE, DType, Observations, Shape, Standard
@@ -412,17 +412,20 @@ def layers_of(stage: str, domain: str, preset_name: str | None) -> list[tuple[Va
 
 
 def settings_of(
+    kind: type[C],
     stage: str,
     domain: str,
     preset_name: str | None = None,
     typed: Values | None = None,
     *,
     inherited: Values | None = None,
-) -> Any:
+) -> C:
     """The settings of a stage on a domain: its defaults, a preset's, those ``inherited``, then what the user typed.
 
     ``inherited`` are of the options that the stage continues. What is unknown or not allowed is a ``UserError``.
     """
     model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
     layers = [values for values, _ in layers_of(stage, domain, preset_name)]
-    return resolve(model, *layers, inherited or {}, typed or {}, stage=stage)
+    settings = resolve(model, *layers, inherited or {}, typed or {}, stage=stage)
+    assert isinstance(settings, kind)
+    return settings

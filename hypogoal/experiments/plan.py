@@ -51,8 +51,8 @@ def plan(
     of_preset = read_preset(preset, "run", domain) if domain else {}
     config = resolve(experiment.model, of_preset, experiment.given, of_run, stage="run")
 
-    def settings(stage: str) -> Any:
-        return settings_of(stage, domain or DOMAIN, preset, of_stage.get(stage, {}))
+    def settings(stage: str) -> Config:
+        return settings_of(Config, stage, domain or DOMAIN, preset, of_stage.get(stage, {}))
 
     values = {**config.model_dump(), STAGE: settings}
     for name in NEEDED:
@@ -152,9 +152,9 @@ def _with_shared(
         if device != "auto" and values.get("device") == "auto":
             more += ["--device", device]
         shared = settings.get(stage, {})
-        config = settings_of(stage, domain, values["preset"] or preset, typed, inherited=shared)
-        _check_names(config, settings_of(stage, domain))
+        config = settings_of(Config, stage, domain, values["preset"] or preset, typed, inherited=shared)
+        _check_names(config, settings_of(Config, stage, domain))
         for name, value in shared.items():
-            if name in type(config).model_fields and name not in typed:
+            if name in config.flat() and name not in typed:
                 more += ["--set", f"{name}={value}"]
     return [*words, *more], domain

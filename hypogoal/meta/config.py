@@ -3,9 +3,9 @@
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from hypogoal.core.config import MOST, OWN, Config, integers, setting
+from hypogoal.core.config import MOST, OWN, Config, integers, part, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.world import WorldConfig
 from hypogoal.options.config import OptionConfig
@@ -61,6 +61,10 @@ class OwnChooserConfig(MetaConfig, SymbolsConfig):
 class PlayConfig(OptionConfig, WorldConfig):
     """Where options are played."""
 
+    gamma: ClassVar[float] = 1.0  # discount per environment step of what options return
+
+    steps: int = setting(1, "environment steps", unit="steps", low=1)
+    chooser: str = setting("random", "who chooses options", own=True)
     layouts: str = setting(
         "",
         "layouts to draw episodes from: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: that one",
@@ -121,9 +125,7 @@ class TrainOptionsConfig(PracticeConfig):
 class TrainMetaConfig(PlayConfig):
     """How options are learned and chosen, and for how long."""
 
-    PARTS: ClassVar[Any] = OptionConfig.PARTS | {
-        "chooser": {"symbols": SymbolsConfig, "ppo": MetaConfig, OWN: OwnChooserConfig}
-    }
+    gamma: ClassVar[float] = GAMMA
 
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
@@ -134,6 +136,9 @@ class TrainMetaConfig(PlayConfig):
         source="ours (DEV-54); paper: ppo",
         choices=("symbols", "ppo", "random"),
         own=True,
+    )
+    choosing: MetaConfig | SymbolsConfig | None = part(
+        "chooser", {"symbols": SymbolsConfig, "ppo": MetaConfig, OWN: OwnChooserConfig}
     )
 
 

@@ -19,6 +19,7 @@ from hypogoal.meta import networks, smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.observations import PICTURE
 from hypogoal.options.choosers import FILE, Chooser, Outcome
+from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.double_dqn import descend
 from hypogoal.options.networks import apply_to_states
 
@@ -79,9 +80,9 @@ class MetaPolicy(Chooser):
         self.updates = 0
 
     @classmethod
-    def refuse(cls, config: Any, engine: Engine) -> None:
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """The paper's network sees pictures only."""
-        if config.meta_network == "paper" and engine.observation_dtype != PICTURE:
+        if config.part(MetaConfig).meta_network == "paper" and engine.observation_dtype != PICTURE:
             raise UserError(
                 "the paper's networks see pictures only",
                 "meta_network=paper",
@@ -93,11 +94,17 @@ class MetaPolicy(Chooser):
         cls,
         engine: Engine,
         options: int,
-        config: Any,
+        config: OptionConfig,
         seed: int,
         device: str,
     ) -> Self:
-        return cls(engine, options, config, seed, device)
+        return cls(engine, options, config.part(MetaConfig), seed, device)
+
+    @staticmethod
+    def reach(config: OptionConfig) -> int:
+        """The states in which decisions were made that wait for the next update, and those that they led to."""
+        decisions = config.part(MetaConfig).decisions
+        return (decisions + config.environments) * config.option_timeout + STACK * config.environments
 
     def choose(self, environments: Ints, ids: Ints, offered: Bools) -> Ints:
         mask = torch.from_numpy(offered)
@@ -178,7 +185,7 @@ class MetaPolicy(Chooser):
                 where = f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}"
                 descend(loss, self.optimiser, "the meta-policy", where, GRADIENT_NORM)
         self.updates += 1
-        means = torch.stack(health).mean(0).tolist()
+        means = torch.stack(health).mean(0).cpu().tolist()
         return {
             "value": float(values.mean()),
             **dict(zip(HEALTH, means, strict=True)),

@@ -10,10 +10,10 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains import world
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import MetaConfig, PracticeConfig, TrainMetaConfig, layout_seeds
+from hypogoal.meta.config import PlayConfig, layout_seeds
 from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options import termination as ends
-from hypogoal.options.config import STACK
+from hypogoal.options.choosers import load_chooser
 from hypogoal.options.learner import load_learner
 
 
@@ -33,7 +33,7 @@ class Setup:
     domain: Domain
     source: Mapping[str, Any]
     folder: Path
-    config: PracticeConfig | TrainMetaConfig
+    config: PlayConfig
     seed: int
     device: str = "cpu"
 
@@ -72,15 +72,12 @@ def make_engine(setup: Setup, layouts: Layouts | None = None) -> Engine:
     return world.make_engine(domain, setup.world, config, config.environments, **begins)
 
 
-def frames_kept(config: PracticeConfig | TrainMetaConfig, options: int) -> int:
+def frames_kept(config: PlayConfig, options: int) -> int:
     """How many states back an engine must remember: those in replays and in the meta-policy's decisions."""
-    reach = load_learner(config.network).reach(config, options)
-    if not isinstance(config, MetaConfig):
-        return reach
-    return max(reach, (config.decisions + config.environments) * config.option_timeout + STACK * config.environments)
+    return max(load_learner(config.network).reach(config, options), load_chooser(config.chooser).reach(config))
 
 
-def require_memory(engine: Engine, config: PracticeConfig | TrainMetaConfig, options: int) -> None:
+def require_memory(engine: Engine, config: PlayConfig, options: int) -> None:
     """Refuse (``UserError``) an engine that forgets states which replays or the meta-policy's decisions still need."""
     needed = frames_kept(config, options)
     if engine.memory is not None and needed > engine.memory:

@@ -39,8 +39,9 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
-from hypogoal.meta.config import GAMMA
+from hypogoal.meta.config import GAMMA, SymbolsConfig
 from hypogoal.options.choosers import FILE, Chooser, Offered, Outcome
+from hypogoal.options.config import OptionConfig
 
 PRIOR = 0.1  # executions that an unknown outcome weighs
 HOPE = 0.2  # the share of these that is rewarded
@@ -147,9 +148,10 @@ class SymbolsChooser(Chooser):
         self.past = np.full((environments, history), END)  # the last options
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        settings = config.part(SymbolsConfig)
         keep = 1.0 if config.network == "planned" else 0.5 ** (1 / HALF_LIFE)  # what is planned does not change
-        return cls(engine.count, options, rng_for(seed, "symbols"), config.history, config.carried, keep)
+        return cls(engine.count, options, rng_for(seed, "symbols"), settings.history, settings.carried, keep)
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
         chosen = np.empty(len(environments), np.int64)

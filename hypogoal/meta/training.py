@@ -15,7 +15,6 @@ from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Engine, Layouts
-from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.meta.setup import Setup, make_engine, of_ensemble, require_memory
 from hypogoal.options.choosers import load_chooser
 from hypogoal.options.learner import load_learner
@@ -44,9 +43,8 @@ def assemble(
     require_memory(engine, config, terminations.options)
     chooser = load_chooser(config.chooser).create(engine, terminations.options, config, seed, device)
     recorder = Recorder(terminations.options, engine)
-    gamma = GAMMA if isinstance(config, TrainMetaConfig) else 1.0
     visited = Visited(engine, config.save_visited, seed) if config.save_visited else None
-    return OptionLoop(engine, terminations, learner, chooser, recorder, config, gamma, visited)
+    return OptionLoop(engine, terminations, learner, chooser, recorder, config, config.gamma, visited)
 
 
 def train(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from hypogoal.domains.base import Engine
+    from hypogoal.options.config import OptionConfig
 
 CHOOSERS = {
     "random": f"{__name__}:RandomChooser",
@@ -51,9 +52,14 @@ class Chooser(Part, ABC):
     """A policy over options."""
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
         """A fresh one that chooses among so many options; ``seed`` is of weights and draws."""
         return cls()
+
+    @staticmethod
+    def reach(config: OptionConfig) -> int:
+        """How many states back the chooser looks; by default none."""
+        return 0
 
     @abstractmethod
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
@@ -90,7 +96,7 @@ class RandomChooser(Chooser):
         self.rng = rng
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
         return cls(rng_for(seed, "random-choice"))
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
@@ -110,7 +116,7 @@ class EvenChooser(Chooser):
         self.steps = np.zeros(options, int)  # of each option so far
 
     @classmethod
-    def create(cls, engine: Engine, options: int, config: Any, seed: int, device: str) -> Self:
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
         return cls(rng_for(seed, "random-choice"), options)
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:

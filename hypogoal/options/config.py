@@ -1,46 +1,11 @@
 """Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
 
-from hypogoal.core.config import OWN, Config, setting
+from hypogoal.core.config import OWN, Config, part, setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
 
 
-class OptionConfig(Config):
-    """How the intra-option policies are executed and learned."""
-
-    network: str = setting(
-        "light",
-        "Q-network: light, a small one on cells; paper, a conv-GRU; or, where an engine knows what each action leads "
-        "to: planned, the shortest path",
-        source="paper, appendix; the others: ours",
-        choices=("light", "paper", "planned"),
-        own=True,
-    )
-    termination: str = setting(
-        "learned",
-        "where options end: learned, at the first positive prediction; oracle, at true sub-goals (upper bound); or a "
-        "rule of your own",
-        source="paper: learned",
-        choices=("learned", "oracle"),
-        own=True,
-    )
-    experience: str = setting(
-        "shared",
-        "which members learn from a step: its own, or all of them (shared)",
-        source="own: paper",
-        choices=("own", "shared"),
-    )
-    option_timeout: int = setting(
-        10, "an option ends after this many steps", unit="steps", source="paper", low=1, high=32_000
-    )
-    restart_options: bool = setting(
-        False, "every option begins a new episode, at a start state", source="paper, policy learning"
-    )
-    mask_reached: bool = setting(True, "do not offer options where their sub-goal already holds", source="ours")
-    environments: int = setting(16, "environments stepped together", low=1, high=4096)
-
-
-class LearnerConfig(OptionConfig):
+class LearnerConfig(Config):
     """How option policies learn, with network=light or paper."""
 
     bounded_values: bool = setting(
@@ -116,4 +81,37 @@ class OwnLearnerConfig(LightConfig, PaperConfig):
     """All that an option learner of one's own may heed."""
 
 
-OptionConfig.PARTS = {"network": {"light": LightConfig, "paper": PaperConfig, OWN: OwnLearnerConfig}}
+class OptionConfig(Config):
+    """How the intra-option policies are executed and learned."""
+
+    network: str = setting(
+        "light",
+        "Q-network: light, a small one on cells; paper, a conv-GRU; or, where an engine knows what each action leads "
+        "to: planned, the shortest path",
+        source="paper, appendix; the others: ours",
+        choices=("light", "paper", "planned"),
+        own=True,
+    )
+    termination: str = setting(
+        "learned",
+        "where options end: learned, at the first positive prediction; oracle, at true sub-goals (upper bound); or a "
+        "rule of your own",
+        source="paper: learned",
+        choices=("learned", "oracle"),
+        own=True,
+    )
+    experience: str = setting(
+        "shared",
+        "which members learn from a step: its own, or all of them (shared)",
+        source="own: paper",
+        choices=("own", "shared"),
+    )
+    option_timeout: int = setting(
+        10, "an option ends after this many steps", unit="steps", source="paper", low=1, high=32_000
+    )
+    restart_options: bool = setting(
+        False, "every option begins a new episode, at a start state", source="paper, policy learning"
+    )
+    mask_reached: bool = setting(True, "do not offer options where their sub-goal already holds", source="ours")
+    environments: int = setting(16, "environments stepped together", low=1, high=4096)
+    learner: LearnerConfig | None = part("network", {"light": LightConfig, "paper": PaperConfig, OWN: OwnLearnerConfig})

@@ -25,7 +25,7 @@ from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import saved
-from hypogoal.options.config import STACK, PaperConfig
+from hypogoal.options.config import STACK, OptionConfig, PaperConfig
 from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch, Updated
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay
@@ -157,10 +157,11 @@ class PaperLearner(Learner):
     """The intra-option policies of all O options, each on its own; arguments as of :class:`Learner`."""
 
     policies = PaperPolicies
+    settings: PaperConfig
     CHANGING = (*Learner.CHANGING, "members", "windows", "lengths")
 
     @classmethod
-    def refuse(cls, config: PaperConfig, engine: Engine) -> None:
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """It sees pictures only, and learns single steps of its members' own executions."""
         if config.experience != "own":
             fault = "network=paper needs experience=own"
@@ -172,24 +173,26 @@ class PaperLearner(Learner):
         if engine.observation_dtype != PICTURE:
             raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
 
-    def build(self, config: PaperConfig, seed: int) -> None:
+    def build(self, config: OptionConfig, seed: int) -> None:
+        self.settings = settings = config.part(PaperConfig)
         self.members = []
         shape, actions = self.engine.observation_shape, self.engine.n_actions
         for option in range(self.options):
             with DrawsFrom(torch_generator(seed, "option-weights", option)):
                 network = PaperQNetwork(shape, actions)
-            self.members.append(Member(network.to(self.device), config))
-        self.windows = np.zeros((self.engine.count, config.recurrence), int)  # of running executions
+            self.members.append(Member(network.to(self.device), settings))
+        self.windows = np.zeros((self.engine.count, settings.recurrence), int)  # of running executions
         self.lengths = np.zeros(self.engine.count, int)  # theirs; the places behind have states of the window
 
     @staticmethod
-    def reach(config: PaperConfig, options: int) -> int:
+    def reach(config: OptionConfig, options: int) -> int:
         """How many states back the replays hold when each has had as many steps as another.
 
         Of what a member that had fewer has stored, the oldest may be forgotten nevertheless; it is left out of its
         batches.
         """
-        return options * config.replay + (config.recurrence + STACK) * config.environments
+        settings = config.part(PaperConfig)
+        return options * settings.replay + (settings.recurrence + STACK) * config.environments
 
     @torch.no_grad()
     def greedy(
@@ -200,10 +203,10 @@ class PaperLearner(Learner):
     ) -> Ints:
         """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
         windows = self.windows
-        begun, full = age == 0, age >= self.config.recurrence
+        begun, full = age == 0, age >= self.settings.recurrence
         windows[begun] = ids[begun, None]
         windows[full, :-1] = windows[full, 1:]
-        self.lengths = np.minimum(age + 1, self.config.recurrence)
+        self.lengths = np.minimum(age + 1, self.settings.recurrence)
         windows[np.arange(len(ids)), self.lengths - 1] = ids
         chosen = np.empty_like(ids)
         for option in np.unique(options):
@@ -238,16 +241,16 @@ class PaperLearner(Learner):
         """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
         last = None
         for option, member in enumerate(self.members):
-            if member.replay.size < min(self.config.warm_up, self.config.replay):
+            if member.replay.size < min(self.settings.warm_up, self.settings.replay):
                 member.due = 0
-            while member.due >= self.config.update_interval:
-                member.due -= self.config.update_interval
+            while member.due >= self.settings.update_interval:
+                member.due -= self.settings.update_interval
                 last = self._update(option, member) or last
         return self.health(last, sum(member.replay.size for member in self.members)) if last else {}
 
     def _update(self, option: int, member: Member) -> Updated | None:
         """One update of a member's policy; None where all steps drawn are forgotten."""
-        indices, weights = member.replay.sample(self.config.option_batch, self.rng)
+        indices, weights = member.replay.sample(self.settings.option_batch, self.rng)
         steps = member.replay.data.at(indices)
         kept = self.engine.remembers(steps.path).all(axis=1)
         if not kept.any():
@@ -255,7 +258,7 @@ class PaperLearner(Learner):
         indices, weights, steps = indices[kept], weights[kept], steps.at(kept)
 
         path, length = steps.path.astype(int), steps.length
-        most = self.config.recurrence
+        most = self.settings.recurrence
         now, shifted = path[:, :-1], path[:, 1:]
         following = np.where(length[:, None] < most, now, shifted)
         lengths = tensor(length, self.device)

@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from hypogoal.core.arrays import Bools, Doubles, Floats, Ints, tensor
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.tensors import load_into
+from hypogoal.options.config import LearnerConfig
 
 SOFT = 0.01  # how far a target network follows at an update where it is not copied now and then
 
@@ -75,12 +76,12 @@ class Updated(NamedTuple):
 class DoubleDQN(Resumable):
     """An online network of values (n, O, A), its optimiser, and the target network that follows it.
 
-    ``config`` is a ``LearnerConfig``; gradients are cut to the norm ``largest``.
+    Gradients are cut to the norm ``largest``.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("online", "target", "optimiser", "updates")
 
-    def __init__(self, online: nn.Module, config: Any, largest: float = math.inf):
+    def __init__(self, online: nn.Module, config: LearnerConfig, largest: float = math.inf):
         self.online, self.config, self.largest = online, config, largest
         self.target = copy.deepcopy(online).requires_grad_(False).eval()
         self.optimiser = Adam(online.parameters(), config.option_learning_rate)

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
-from hypogoal.options.config import LearnerConfig
+from hypogoal.options.config import LearnerConfig, OptionConfig
 from hypogoal.options.double_dqn import Updated, linear_epsilon
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.parts import Part, answer_of, saved_row
@@ -48,6 +48,8 @@ class Learner(Part, ABC):
     """The intra-option policies of all O options.
 
     Attributes:
+        config: how options are executed.
+        settings: how these policies learn, the part ``config.learner``.
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
         steps_since_positive: int64 (O,), those since the first one of these, also in a run that this one continues.
@@ -63,24 +65,26 @@ class Learner(Part, ABC):
         self,
         engine: Engine,
         terminations: Terminations,
-        config: Any,
+        config: OptionConfig,
         seed: int,
         device: torch.device | str = "cpu",
     ):
         self.refuse(config, engine)
         self.engine, self.terminations, self.config = engine, terminations, config
+        self.settings = config.learner
         self.options, self.device = terminations.options, torch.device(device)
         self.rng = rng_for(seed, "options")
-        if isinstance(config, LearnerConfig):
-            self.exploration = Exploration(config, engine.count, engine.n_actions, self.rng)
+        if config.learner:
+            self.exploration = Exploration(config.learner, engine.count, engine.n_actions, self.rng)
         self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), int)
         self.build(config, seed)
         reach = self.reach(config, self.options)
         if engine.memory is not None and reach > engine.memory:  # Spec D3
+            replay = config.part(LearnerConfig).replay
             raise UserError(
                 f"the replay reaches back {reach} states, the engine remembers {engine.memory}",
-                f"replay={config.replay}",
-                f"Give --set replay={max(100, config.replay - (reach - engine.memory))} or less.",
+                f"replay={replay}",
+                f"Give --set replay={max(100, replay - (reach - engine.memory))} or less.",
             )
 
     @classmethod
@@ -93,12 +97,12 @@ class Learner(Part, ABC):
         )
 
     @abstractmethod
-    def build(self, config: Any, seed: int) -> None:
+    def build(self, config: OptionConfig, seed: int) -> None:
         """The policies, once all above is there."""
 
     @staticmethod
     @abstractmethod
-    def reach(config: Any, options: int) -> int:
+    def reach(config: OptionConfig, options: int) -> int:
         """How many states back the learner looks."""
 
     @abstractmethod
@@ -122,8 +126,9 @@ class Learner(Part, ABC):
 
     def epsilon(self) -> Doubles:
         """Every option's exploration, float (O,)."""
-        steps = self.steps_since_positive if self.config.epsilon_from == "first-positive" else self.option_steps
-        return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
+        settings = self.config.part(LearnerConfig)
+        steps = self.steps_since_positive if settings.epsilon_from == "first-positive" else self.option_steps
+        return linear_epsilon(steps, settings.epsilon_steps, settings.epsilon_final)
 
     def health(self, last: Updated, replay: int) -> dict[str, float]:
         """Numbers to log of the last update, and of a replay with so many transitions."""
@@ -139,7 +144,7 @@ class Learner(Part, ABC):
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
         chosen = self.greedy(ids, options.copy(), age.copy())
         chosen = answer_of(self, "greedy", chosen, int, len(ids), self.engine.n_actions - 1)
-        if explore and isinstance(self.config, LearnerConfig):
+        if explore and self.settings:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen
 

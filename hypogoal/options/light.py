@@ -19,7 +19,7 @@ from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
 from hypogoal.options import networks, saved
-from hypogoal.options.config import STACK, LightConfig
+from hypogoal.options.config import STACK, LightConfig, OptionConfig
 from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch, Updated
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay, Steps, StepsAhead
@@ -41,27 +41,30 @@ class LightLearner(Learner):
     """The intra-option policies of all O options, acting and learning together; arguments as of :class:`Learner`."""
 
     policies = saved.LightPolicies
+    settings: LightConfig
     CHANGING = (*Learner.CHANGING, "networks", "replay", "ahead", "positive", "steps", "due")
 
     @classmethod
-    def refuse(cls, config: LightConfig, engine: Engine) -> None:
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Other members' sub-goals may lie between the first and the last of several steps."""
-        if config.n_step > 1 and config.experience != "own":
+        steps = config.part(LightConfig).n_step
+        if steps > 1 and config.experience != "own":
             raise UserError(
                 "several steps at once are for an option's own member: others' sub-goals may lie among them",
-                f"n_step={config.n_step}, experience={config.experience}",
+                f"n_step={steps}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
 
-    def build(self, config: LightConfig, seed: int) -> None:
+    def build(self, config: OptionConfig, seed: int) -> None:
+        self.settings = settings = config.part(LightConfig)
         self.running_only = config.experience == "own"
-        self.networks = DoubleDQN(self.network(config, seed), config, GRADIENT_NORM)
-        self.ahead = StepsAhead(self.engine.count, config.n_step)
-        self.replay = PrioritisedReplay(Lessons.zeros(config.replay))
+        self.networks = DoubleDQN(self.network(settings, seed), settings, GRADIENT_NORM)
+        self.ahead = StepsAhead(self.engine.count, settings.n_step)
+        self.replay = PrioritisedReplay(Lessons.zeros(settings.replay))
         self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
         self.steps = self.due = 0
 
-    def network(self, config: LightConfig, seed: int) -> networks.LightQNetwork:
+    def network(self, settings: LightConfig, seed: int) -> networks.LightQNetwork:
         """One with fresh weights."""
         engine = self.engine
         with DrawsFrom(torch_generator(seed, "option-weights")):
@@ -70,14 +73,15 @@ class LightLearner(Learner):
                 self.options,
                 engine.n_actions,
                 engine.standard,
-                config.embedding,
+                settings.embedding,
             )
         return network.to(self.device)
 
     @staticmethod
-    def reach(config: LightConfig, options: int) -> int:
+    def reach(config: OptionConfig, options: int) -> int:
         """A transition waits n steps, and its turn in the ring n more."""
-        return config.replay + (2 * config.n_step + STACK) * config.environments
+        settings = config.part(LightConfig)
+        return settings.replay + (2 * settings.n_step + STACK) * config.environments
 
     @torch.no_grad()
     def greedy(
@@ -123,11 +127,11 @@ class LightLearner(Learner):
         return owner & ~inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
-        if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
+        if self.steps < self.settings.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
             self.due = 0
         last = None
-        while self.due >= self.config.update_interval:
-            self.due -= self.config.update_interval
+        while self.due >= self.settings.update_interval:
+            self.due -= self.settings.update_interval
             last = self._update()
         return self.health(last, self.replay.size) if last else {}
 
@@ -168,7 +172,7 @@ class LightLearner(Learner):
             kept &= self.engine.remembers(self.positive.next_state)
         counts = kept.sum(1)
         have = np.flatnonzero(counts)
-        size = self.config.option_batch
+        size = self.settings.option_batch
         extra = round(size * POSITIVE_SHARE) if len(have) else 0
         extra = min(extra, size - 1)  # priorities need one drawn by them
         indices, weights = self.replay.sample(size - extra, self.rng)

@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from hypogoal.domains.base import Engine
+    from hypogoal.options.config import OptionConfig
 
 
 class Part(Resumable):
     """A part of an agent. Its class knows which settings and engines it works with."""
 
     @classmethod
-    def refuse(cls, config: Any, engine: Engine) -> None:
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
 
 

@@ -27,6 +27,7 @@ from hypogoal.core.progress import MetricsLog, Progress, say
 
 if TYPE_CHECKING:
     from hypogoal.core.artefacts import Draft
+    from hypogoal.core.config import C
     from hypogoal.look import Made
 
 Place = str | os.PathLike[str]
@@ -80,11 +81,11 @@ class Call:
     resume: Resume = False
     quiet: Quiet = False
 
-    def settings(self, domain: str, inherited: Mapping[str, Any] | None = None) -> Any:
+    def settings(self, kind: type["C"], domain: str, inherited: Mapping[str, Any] | None = None) -> "C":
         """The stage's settings: defaults, the domain's, the preset's, those of continued options, the typed ones."""
         from hypogoal.domains.base import settings_of
 
-        return settings_of(self.stage, domain, self.preset, self.typed, inherited=inherited)
+        return settings_of(kind, self.stage, domain, self.preset, self.typed, inherited=inherited)
 
     def draft(
         self,

@@ -11,6 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.domains.world import write_layout
+from hypogoal.meta.config import PlayConfig
 from hypogoal.meta.nearness import nearness
 from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import train
@@ -32,9 +33,10 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
         held = {name: practice.config[name] for name in fixed if name in practice.config}
         if practice.config["layouts"]:  # options of many layouts may be played in any
             held.pop("layout_seed", None)
-    config = call.settings(source.config["domain"], held)
+    config = call.settings(PlayConfig, source.config["domain"], held)
+    settings = config.flat()
     for name, value in held.items():
-        wanted = getattr(config, name, value)  # a part's, where the network has that part
+        wanted = settings.get(name, value)  # a part's, where the network has that part
         if wanted != value:
             fault = f"these options were trained with {name}={value}, not {wanted}"
             raise UserError(fault, None, f"Give --set {name}={value}, or leave it out.")
@@ -58,7 +60,7 @@ def require_ensemble(trained: Artefact, ensemble: Path) -> None:
 
 def description(setup: Setup, **more: Any) -> dict[str, Any]:
     """An artefact's configuration: the stage's, what it takes from its ensemble's, and ``more``."""
-    return setup.config.model_dump(mode="json") | {
+    return setup.config.flat() | {
         "sub_goals": setup.source["sub_goals"],
         "members": setup.members,
         "domain": setup.source["domain"],

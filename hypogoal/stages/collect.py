@@ -5,6 +5,7 @@ from typing import Annotated, Any
 from typer import Argument
 
 from hypogoal.core.artefacts import DATA
+from hypogoal.core.config import Config
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress, say
 from hypogoal.stages import DOMAINS, NO_TRAINING, Call, Done, stage
@@ -28,7 +29,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     name = _name_of(domain)
     played = load_domain(name)
     require_names(played.sub_goals)  # before play, not when the file is written
-    config = call.settings(name)
+    config = call.settings(Config, name)
     settings = config.model_dump(mode="json")
     with call.draft(DATA, settings | {"domain": name}) as draft:
         with Progress(f"collect {name}", total=1, quiet=call.quiet) as progress:

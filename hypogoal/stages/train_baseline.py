@@ -27,7 +27,7 @@ def train_baseline(
     """
     from hypogoal.baselines import agents
     from hypogoal.baselines.engine_env import EngineEnv
-    from hypogoal.baselines.settings import HYPERPARAMETERS
+    from hypogoal.baselines.settings import HYPERPARAMETERS, BaselineConfig
     from hypogoal.core.tensors import save_tensors
     from hypogoal.data import open_dataset
     from hypogoal.domains import world
@@ -35,7 +35,7 @@ def train_baseline(
     from hypogoal.observations import PICTURE, standard_of
     from hypogoal.options.tables import Episodes
 
-    config = call.settings(domain)
+    config = call.settings(BaselineConfig, domain)
     played = load_domain(domain)
     dataset = None
     collected = {}

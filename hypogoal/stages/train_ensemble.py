@@ -41,12 +41,13 @@ def train_ensemble(
     from hypogoal.core.processes import allowed, in_processes
     from hypogoal.data import open_dataset
     from hypogoal.domains.base import installed_domain
+    from hypogoal.hypotheses.config import TrainEnsembleConfig
     from hypogoal.hypotheses.sub_goals import Trained, checked, log_of, train_sub_goal
     from hypogoal.observations import type_text
     from hypogoal.options.visited import unlabelled_file
 
     dataset = open_dataset(data)
-    config, sub_goals = checked(call.settings(dataset.domain), dataset)
+    config, sub_goals = checked(call.settings(TrainEnsembleConfig, dataset.domain), dataset)
     others = [unlabelled_file(path, dataset) for path in unlabelled or ()]
     settings = config.model_dump(mode="json") | {
         "sub_goals": sub_goals,

@@ -27,12 +27,14 @@ def train_options(
     ``options``, an artefact, are trained further.
     """
     from hypogoal.meta import training
+    from hypogoal.meta.config import TrainOptionsConfig
     from hypogoal.meta.nearness import distances_of
     from hypogoal.stages import agents
 
     practice = open_artefact(options, "options") if options else None
     setup = agents.setup_of(call, ensemble, practice, FIXED)
-    config: Any = setup.config
+    config = setup.config
+    assert isinstance(config, TrainOptionsConfig)
     steps = config.steps
     if config.restart_options:
         steps *= setup.options

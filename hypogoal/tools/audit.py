@@ -3,13 +3,16 @@
 import json
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.progress import say
 from hypogoal.stages import Call, Done, stage
+
+if TYPE_CHECKING:
+    from hypogoal.meta.config import AuditConfig
 
 REPORT = "audit.json"
 WHERE = "Where to play; without it, look at recorded data."
@@ -69,13 +72,14 @@ def _in_play(
     from hypogoal.domains.base import load_domain
     from hypogoal.domains.world import columns_of
     from hypogoal.evaluation.page import lines_of
+    from hypogoal.meta.config import AuditConfig
     from hypogoal.meta.setup import Setup
     from hypogoal.meta.training import assemble
     from hypogoal.stages import agents
     from hypogoal.tools.audits import played
     from hypogoal.tools.audits.classifiers import classifier_of
 
-    config = call.settings(domain)
+    config = call.settings(AuditConfig, domain)
     world = load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
     audited, source = classifier_of(classifier, sub_goal, call.device)
@@ -112,7 +116,7 @@ def _in_play(
     return lines_of("played.txt", **findings), played.shares_of(findings)
 
 
-def _policies(config: Any, threshold: float) -> dict[str, float]:
+def _policies(config: "AuditConfig", threshold: float) -> dict[str, float]:
     """The probability above which predictions are positive for each policy that is wanted."""
     if config.termination == "oracle":
         raise UserError("an audit takes one classifier only", "termination=oracle", "Leave it out.")

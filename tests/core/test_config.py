@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 
@@ -19,13 +19,18 @@ from hypogoal.core.config import (
     integers,
     known,
     model_of,
+    part,
     preset,
     resolve,
     setting,
 )
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import settings_of
+from hypogoal.domains.doorkey.domain import DoorKeyConfig
 from hypogoal.experiments.experiment import config_class_of
+from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.meta.config import MetaConfig, TrainMetaConfig
+from hypogoal.options.config import PaperConfig
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 
@@ -61,7 +66,7 @@ class Either(Slow, Fast):
 class Staged(Example):
     """A stage with parts."""
 
-    PARTS: ClassVar[Any] = {"code": {"a": Slow, "b": Fast, OWN: Either}}
+    pace: Slow | Fast | None = part("code", {"a": Slow, "b": Fast, OWN: Either})
 
 
 def resolved(*assignments: str) -> Any:
@@ -118,11 +123,13 @@ def test_later_layers_win_and_none_is_not_given() -> None:
 
 def test_a_part_has_its_settings_where_it_is_chosen() -> None:
     """Flat names; a part's setting without the part is dropped from presets and refused where typed."""
-    assert resolve(Staged, {"patience": 5}, stage="staged").model_dump() == Example().model_dump() | {"patience": 5}
+    assert resolve(Staged, {"patience": 5}, stage="staged").flat() == Example().flat() | {"patience": 5}
     fast = resolve(Staged, {"patience": 5}, {"code": "b", "speed": 3}, stage="staged")
-    assert fast.speed == 3.0 and isinstance(fast, Fast) and not hasattr(fast, "patience")
+    assert fast.pace == Fast(speed=3.0) and fast.part(Fast) is fast.pace and "patience" not in fast.flat()
+    with pytest.raises(TypeError, match="these settings have no Slow"):
+        fast.part(Slow)
     own = resolve(Staged, {"patience": 5, "speed": 1, "code": "mine:Class"}, stage="staged")
-    assert isinstance(own, Either) and (own.patience, own.speed) == (5, 1)
+    assert own.pace == Either(patience=5, speed=1)
     with pytest.raises(UserError) as caught:
         resolve(Staged, {"code": "b"}, {"patience": 5}, stage="staged")
     told = "staged has this setting only beside another choice: patience. See 'hypogoal config staged'."
@@ -133,7 +140,7 @@ def test_a_part_has_its_settings_where_it_is_chosen() -> None:
         resolve(Staged, {"code": "c", "patience": 5}, {}, stage="staged")
     of_a_manifest = known(Staged, {"steps": 7, "gone": 1, "speed": 9.0, "patience": 2})
     read = resolve(Staged, of_a_manifest, {}, stage="staged")
-    assert (read.steps, read.patience) == (7, 2) and not hasattr(read, "speed")
+    assert (read.steps, read.pace) == (7, Slow(patience=2))
 
 
 def test_settings_are_described_with_their_parts() -> None:
@@ -172,8 +179,8 @@ def test_a_broken_preset_is_one_line(tmp_path: Path, text: str | None, words: st
 def test_the_presets_resolve_for_every_stage(domain: str, name: str) -> None:
     """Every table of a preset is a stage, every key a setting, with a value in range; a manifest gives it back."""
     for stage in STAGES:
-        config = settings_of(stage, domain, name)
-        assert resolve(config_class_of(stage, domain), config.model_dump(mode="json"), stage=stage) == config
+        config = settings_of(Config, stage, domain, name)
+        assert resolve(config_class_of(stage, domain), config.flat(), stage=stage) == config
     assert resolve(config_class_of("run", domain), preset(name, "run", domain), stage="run")
 
 
@@ -182,26 +189,27 @@ def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> N
     """'hypogoal config' says something of each setting."""
     model = config_class_of(stage)
     assert all(row["meaning"] for row in described(model))
-    assert resolve(model, model().model_dump(mode="json"), {}, stage=stage) == resolve(model, stage=stage)
+    assert resolve(model, resolve(model, stage=stage).flat(), {}, stage=stage) == resolve(model, stage=stage)
 
 
 def test_the_paper_preset_has_the_papers_tables() -> None:
     """Spec C6, D3, E3: Tables 3, 4 and 5 to the letter."""
-    ensemble = settings_of("train-ensemble", "doorkey", "paper")
+    ensemble = settings_of(TrainEnsembleConfig, "train-ensemble", "doorkey", "paper")
     assert (ensemble.learning_rate, ensemble.diversity_weight, ensemble.members) == (2e-4, 1e-4, 3)
     assert (ensemble.l2_weight, ensemble.batch_size) == (1e-4, 64)
     assert (ensemble.class_weight_negative, ensemble.class_weight_positive) == (0.5, 0.5)
-    meta = settings_of("train-meta", "doorkey", "paper")
-    assert (meta.replay, meta.update_interval, meta.target_interval) == (100_000, 4, 10)
-    assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
-    assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
-    assert (meta.decisions, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.97, 64, 10)
+    meta = settings_of(TrainMetaConfig, "train-meta", "doorkey", "paper")
+    learner, ppo = meta.part(PaperConfig), meta.part(MetaConfig)
+    assert (learner.replay, learner.update_interval, learner.target_interval) == (100_000, 4, 10)
+    assert (learner.epsilon_steps, learner.epsilon_final, learner.epsilon_from) == (8_000, 0.01, "start")
+    assert (learner.option_learning_rate, learner.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
+    assert (ppo.decisions, ppo.gae_lambda, ppo.meta_batch, ppo.epochs) == (100, 0.97, 64, 10)
     assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
-    assert (meta.meta_network, meta.head) == ("paper", "gaussian")
+    assert (ppo.meta_network, ppo.head) == ("paper", "gaussian")
     run: Any = resolve(config_class_of("run"), preset("paper", "run"), stage="run")
     assert not run.pretrain
     assert len(set(run.layout_seeds)) == len(set(run.seeds)) == 10, "ten agents, each with an ensemble of its own"
-    assert settings_of("collect", "doorkey", "paper").door_label == "in-front"
+    assert settings_of(DoorKeyConfig, "collect", "doorkey", "paper").door_label == "in-front"
 
 
 def test_the_paper_preset_has_the_papers_ladders() -> None:
@@ -209,7 +217,7 @@ def test_the_paper_preset_has_the_papers_ladders() -> None:
     run: Any = resolve(config_class_of("run", "montezuma"), preset("paper", "run", "montezuma"), stage="run")
     assert run.groups == run.option_groups == tuple(range(1, 8))
     assert len(set(run.seeds)) == 10 and run.ladders
-    ensemble = settings_of("train-ensemble", "montezuma", "paper")
+    ensemble = settings_of(TrainEnsembleConfig, "train-ensemble", "montezuma", "paper")
     assert (ensemble.view, ensemble.threshold, ensemble.unlabelled_bn) == ("full", "0.5", False)
 
 

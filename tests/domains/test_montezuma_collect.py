@@ -6,7 +6,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from hypogoal.core.config import model_of
+from hypogoal.core.config import Config, model_of, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
@@ -212,6 +212,6 @@ def test_picture_and_pixel(room: int) -> None:
 def test_the_domains_defaults_are_those_of_its_stages() -> None:
     """Spec B6, D4: each is another than without the domain."""
     for stage in ("train-ensemble", "train-options"):
-        config, plain = settings_of(stage, "montezuma"), model_of(stage)()
+        config, plain = settings_of(Config, stage, "montezuma").flat(), resolve(model_of(stage), stage=stage).flat()
         own = DOMAIN.defaults[stage]
-        assert all(getattr(config, key) == value != getattr(plain, key, None) for key, value in own.items())
+        assert all(config[key] == value != plain.get(key) for key, value in own.items())

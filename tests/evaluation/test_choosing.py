@@ -14,7 +14,7 @@ from hypogoal.evaluation.choosing import judge, qualities, with_choosers
 from hypogoal.evaluation.frozen import Choices, play
 from hypogoal.evaluation.names import UNIFORM
 from hypogoal.evaluation.selection import numbers_of_choices
-from hypogoal.meta.config import GAMMA, TrainMetaConfig
+from hypogoal.meta.config import GAMMA, MetaConfig, TrainMetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
@@ -31,9 +31,8 @@ def agent(layout_seed: int, steps: int) -> OptionLoop:
     engine, config = harsh(layout_seed, 16), TrainMetaConfig.of(chooser="ppo", network="planned")
     terminations = planted(engine)
     learner = PlannedLearner(engine, terminations, config, seed=0)
-    loop = OptionLoop(
-        engine, terminations, learner, MetaPolicy(engine, 15, config, 0), Recorder(15, engine), config, GAMMA
-    )
+    chooser = MetaPolicy(engine, 15, config.part(MetaConfig), 0)
+    loop = OptionLoop(engine, terminations, learner, chooser, Recorder(15, engine), config, GAMMA)
     while loop.recorder.steps < steps:
         loop.step()
     return loop

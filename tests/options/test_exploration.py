@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import LearnerConfig
 from hypogoal.options.exploration import Exploration
 
 GREEDY = 99  # no random action
@@ -11,7 +11,7 @@ GREEDY = 99  # no random action
 
 def played(mode: str, epsilon: float, steps: int, age=lambda t: t, count: int = 1) -> np.ndarray:
     """The actions (steps, count) of an exploration among 50, or GREEDY."""
-    exploration = Exploration(OptionConfig.of(exploration=mode), count, 50, np.random.default_rng(0))
+    exploration = Exploration(LearnerConfig(exploration=mode), count, 50, np.random.default_rng(0))
     policy, chance = np.full(count, GREEDY), np.full(count, epsilon)
     return np.array([exploration.mix(policy, chance, np.full(count, age(t))) for t in range(steps)])
 
@@ -52,7 +52,7 @@ def test_persistent_actions_are_kept_for_zeta_many_steps() -> None:
 
 def test_a_kept_action_ends_with_its_execution() -> None:
     """Spec D3: at the first step of an execution nothing is left of the last one's."""
-    exploration = Exploration(OptionConfig.of(exploration="persistent"), 2000, 50, np.random.default_rng(1))
+    exploration = Exploration(LearnerConfig(exploration="persistent"), 2000, 50, np.random.default_rng(1))
     policy = np.full(2000, GREEDY)
     ones, none = np.ones(2000), np.zeros(2000)
     first = exploration.mix(policy, ones, np.zeros(2000))

@@ -161,7 +161,7 @@ def test_forgotten_states_are_not_learned_from() -> None:
     assert not engine.remembers(learner.positive.next_state[learner.positive.next_state > 0]).any()
     batch, indices, weights = learner._batch()
     assert engine.remembers(batch.state).all() and engine.remembers(batch.next_state).all()
-    assert len(indices) == len(weights) == loop.config.option_batch, "all of it from the replay"
+    assert len(indices) == len(weights) == learner.settings.option_batch, "all of it from the replay"
 
 
 def test_the_replay_never_outlives_the_memory() -> None:
