@@ -247,7 +247,9 @@ def homes_of(model: type[Config]) -> list[type[Config]]:
 
 def names_of(model: type[Config]) -> list[str]:
     """All settings of the model and of its parts."""
-    names = [name for home in homes_of(model) for name in home.model_fields]
+    names: list[str] = []
+    for home in homes_of(model):
+        names += home.model_fields
     return [name for name in names if name not in parts_of(model)]
 
 

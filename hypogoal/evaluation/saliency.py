@@ -14,16 +14,8 @@ from matplotlib.figure import Figure
 from hypogoal.core.arrays import Bools, Bytes, Floats, Ints
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import open_dataset
-from hypogoal.evaluation import plots
-from hypogoal.evaluation.judging import (
-    Judged,
-    Judgement,
-    Work,
-    place_of,
-    states_of,
-)
+from hypogoal.evaluation import judging, pictures, plots
 from hypogoal.evaluation.page import Drawn
-from hypogoal.evaluation.pictures import SIGNED, attribution_image, coloured
 from hypogoal.evaluation.table import melted
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
@@ -36,19 +28,14 @@ AVERAGED = 64  # states over which attributions to features are averaged
 PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 
 
-def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
+def look(work: judging.Work, judgement: judging.Judgement) -> Iterator[pd.DataFrame]:
     """What members look at in a few held-out states, of the ensemble whose options were learned most often.
 
     ``saliency/SUB_GOAL`` is written: states with what members predict, ``seen``, what members saw of the first of them,
     and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
     numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
     """
-    from hypogoal.hypotheses.deep_lift import (
-        DEEP_LIFT,
-        attributed,
-        mean_state,
-        method_of,
-    )
+    from hypogoal.hypotheses import deep_lift
     from hypogoal.hypotheses.ensemble import read_ensemble
 
     artefact, data, sub_goal, judged = judgement
@@ -57,17 +44,17 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     place, sub_goals = work.place_of(judgement), artefact.config["sub_goals"]
     looked_at = work.facts.setdefault("looked_at", {"ensemble": place, "sub_goals": {}})
     dataset, ensemble = open_dataset(data), read_ensemble(artefact.path, artefact.config, sub_goal)
-    heldout, unlabelled = states_of(data)
+    heldout, unlabelled = judging.states_of(data)
     observations = heldout[sub_goal].observations
     are_pictures = dataset.observation_dtype == PICTURE
     kinds: list[str] = []
     states = explained = spread_rows(len(judged.labels), AVERAGED)
     if are_pictures:
         kinds, states = states_to_show(judged, sub_goal, GALLERY // len(sub_goals))
-        few = EXPLAINED if method_of(ensemble.members[0]) == DEEP_LIFT else INTEGRATED
+        few = EXPLAINED if deep_lift.method_of(ensemble.members[0]) == deep_lift.DEEP_LIFT else INTEGRATED
         explained = states[: max(len(kinds), few // len(sub_goals))]
     seen = ensemble.see(observations[explained])
-    attributions = attributed(ensemble, seen, mean_state(ensemble.see(unlabelled)))
+    attributions = deep_lift.attributed(ensemble, seen, deep_lift.mean_state(ensemble.see(unlabelled)))
     error = attributions.completeness_error()
     facts = {"kinds": kinds, "how": attributions.method, "completeness_error": error.max()}
     looked_at["sub_goals"][sub_goal] = facts
@@ -76,7 +63,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
     if are_pictures:
         default = 3 if dataset.observation_shape[-1] == 3 else 1
         facts["colours"] = dataset.channels.get("", (1, default))[1]  # of each frame of a stack
-        facts["places"] = [place_of(judged.origins, state) for state in states]
+        facts["places"] = [judging.place_of(judged.origins, state) for state in states]
         group["observations"] = observations[states]
         group["labels"] = judged.labels[states]
         group["probabilities"] = judged.probabilities[states]
@@ -95,7 +82,7 @@ def look(work: Work, judgement: Judgement) -> Iterator[pd.DataFrame]:
 
 
 def states_to_show(
-    judged: Judged,
+    judged: judging.Judged,
     sub_goal: str,
     most: int,
 ) -> tuple[list[str], Ints]:
@@ -228,9 +215,9 @@ def attributions_of_members(state: Mapping[str, Any]) -> Figure:
     """Figure 2: a state and what each member goes by in it; of a stack of frames the last."""
     colours = state["colours"]
     truth = "positive" if state["labels"] else "negative"
-    shown = [(f"truth\n{truth}", coloured(state["observations"], colours))]
+    shown = [(f"truth\n{truth}", pictures.coloured(state["observations"], colours))]
     for title, values in _members(state):
-        shown.append((title, attribution_image(values, state["seen"], colours)))
+        shown.append((title, pictures.attribution_image(values, state["seen"], colours)))
     return with_key(shown, min(4, len(shown)))
 
 
@@ -242,10 +229,10 @@ def attributions_of_channels(state: Mapping[str, Any]) -> Figure:
         frames = channels // state["colours"]
         names = [f"{age} before" for age in range(frames - 1, 0, -1)] + ["newest frame"]
     frames = np.split(seen, len(names), axis=-1)
-    shown = [*zip(names, map(coloured, frames), strict=True)]
+    shown = [*zip(names, map(pictures.coloured, frames), strict=True)]
     for title, values in _members(state):
         for frame, part in zip(frames, np.split(values, len(names), axis=-1), strict=True):
-            shown.append((title, attribution_image(part, frame)))
+            shown.append((title, pictures.attribution_image(part, frame)))
             title = ""
     return with_key(shown, len(names))
 
@@ -265,7 +252,7 @@ def with_key(shown: Sequence[tuple[str, Bytes]], columns: int) -> Figure:
     Each picture has a scale of its own, so the key has no numbers.
     """
     figure, places = plots.panels(shown, columns, titles=0.5)
-    key = ScalarMappable(Normalize(-1, 1), SIGNED)
+    key = ScalarMappable(Normalize(-1, 1), pictures.SIGNED)
     bar = figure.colorbar(key, ax=places, location="bottom", fraction=0.05, shrink=0.6, aspect=40)
     bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
     bar.set_label("attribution in log-odds, each picture on its own scale")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hypogoal.core import seeding
 from hypogoal.core.adam import Adam
-from hypogoal.core.arrays import Bools, Columns, Doubles, Floats, Ints, tensor
+from hypogoal.core.arrays import Bools, Columns, Floats, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_into
@@ -18,7 +18,7 @@ from hypogoal.domains.base import Engine
 from hypogoal.meta import networks, smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.observations import PICTURE
-from hypogoal.options.choosers import FILE, Chooser, Outcome
+from hypogoal.options import choosers
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.double_dqn import descend
 from hypogoal.options.networks import apply_to_states
@@ -41,7 +41,7 @@ class Draws(Columns):
     log_prob: Floats
 
 
-class MetaPolicy(Chooser):
+class MetaPolicy(choosers.Chooser):
     """Chooses among O options for every environment and learns from what they return.
 
     ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
@@ -76,7 +76,7 @@ class MetaPolicy(Chooser):
             drawn=np.zeros((count, self.head.remembered), np.float32),
         )
         self.draws: list[Draws] = []  # decisions since the last update, as they ended,
-        self.outcomes: list[Outcome] = []  # and what came of them
+        self.outcomes: list[choosers.Outcome] = []  # and what came of them
         self.updates = 0
 
     @classmethod
@@ -123,7 +123,7 @@ class MetaPolicy(Chooser):
         )
         return options.numpy()
 
-    def record(self, outcome: Outcome) -> None:
+    def record(self, outcome: choosers.Outcome) -> None:
         self.draws.append(self.running.at(outcome.environments))
         self.outcomes.append(outcome)
 
@@ -133,7 +133,7 @@ class MetaPolicy(Chooser):
     def learn(self) -> dict[str, float]:
         if sum(map(len, self.draws)) < self.config.decisions:
             return {}
-        draws, outcomes = Draws.joined(self.draws), Outcome.joined(self.outcomes)
+        draws, outcomes = Draws.joined(self.draws), choosers.Outcome.joined(self.outcomes)
         self.begin_anew()
         order = np.argsort(outcomes.environments, kind="stable")
         return self.update(draws.at(order), outcomes.at(order))
@@ -141,7 +141,7 @@ class MetaPolicy(Chooser):
     def _outputs(self, ids: Ints) -> Tensor:
         return apply_to_states(self.network, self.engine, ids, self.device)
 
-    def update(self, draws: Draws, outcomes: Outcome) -> dict[str, float]:
+    def update(self, draws: Draws, outcomes: choosers.Outcome) -> dict[str, float]:
         """Learn from decisions, those of an environment side by side in the order in which they were taken."""
         config = self.config
         with torch.no_grad():
@@ -189,7 +189,7 @@ class MetaPolicy(Chooser):
         return {
             "value": float(values.mean()),
             **dict(zip(HEALTH, means, strict=True)),
-            "explained_variance": explained_variance(values, advantages + values),
+            "explained_variance": smdp.explained_variance(values, advantages + values),
         }
 
     def state(self) -> dict[str, Tensor]:
@@ -197,12 +197,12 @@ class MetaPolicy(Chooser):
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
-        load_into(self.policy, state, FILE)
+        load_into(self.policy, state, choosers.FILE)
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
         self.draws = [Draws(**part) for part in snapshot["draws"]]
-        self.outcomes = [Outcome(**part) for part in snapshot["outcomes"]]
+        self.outcomes = [choosers.Outcome(**part) for part in snapshot["outcomes"]]
 
 
 def clipped_surrogate(
@@ -227,9 +227,3 @@ def changes(log_prob: Tensor, old: Tensor, clip: float) -> tuple[Tensor, Tensor]
     ratio = (log_prob - old).exp()
     kl = (ratio - 1 - (log_prob - old)).mean()
     return kl, ((ratio - 1).abs() > clip).float().mean()
-
-
-def explained_variance(values: Doubles, returns: Doubles) -> float:
-    """The share of the variance of returns (n,) that their predictions (n,) explain; 0 where returns do not vary."""
-    variance = float(returns.var())
-    return 1 - float((returns - values).var()) / variance if variance > 0 else 0.0

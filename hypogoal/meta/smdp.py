@@ -53,3 +53,9 @@ def scaled_advantages(advantages: Doubles, floor: float) -> Doubles:
         floor,
         1e-8,
     )
+
+
+def explained_variance(values: Doubles, returns: Doubles) -> float:
+    """The share of the variance of returns (n,) that their predictions (n,) explain; 0 where returns do not vary."""
+    variance = float(returns.var())
+    return 1 - float((returns - values).var()) / variance if variance > 0 else 0.0

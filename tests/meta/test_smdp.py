@@ -14,8 +14,8 @@ from stable_baselines3.common.utils import explained_variance as theirs
 from hypogoal.meta import smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, among
-from hypogoal.meta.ppo import HEALTH, Draws, MetaPolicy, changes, clipped_surrogate, explained_variance
-from hypogoal.meta.smdp import scaled_advantages, smdp_advantages
+from hypogoal.meta.ppo import HEALTH, Draws, MetaPolicy, changes, clipped_surrogate
+from hypogoal.meta.smdp import explained_variance, scaled_advantages, smdp_advantages
 from hypogoal.options.choosers import Outcome
 
 
