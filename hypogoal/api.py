@@ -1,12 +1,13 @@
 """The functions of the Python interface that are no stages: compare runs, load ensembles and options.
 
-The functions of the stages do what their commands do, see :mod:`hypogoal.stages`. They take ``out``, a command's
+The functions of the stages do what their commands do, see :mod:`hypogoal.command.stage`. They take ``out``, a command's
 options (``preset``, ``seed``, ``device``, ``force``, ``resume``, ``quiet``, inputs such as ``options``) and any setting
 by name. What would end a command is a ``UserError``.
 """
 
 from pathlib import Path
 
+from hypogoal.command.call import Place
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.processes import own_settings
 from hypogoal.core.tensors import load_tensors
@@ -16,7 +17,6 @@ from hypogoal.options.env import Options
 from hypogoal.options.learner import make_policies
 from hypogoal.options.reward import ensemble_at
 from hypogoal.options.termination import saved_rule
-from hypogoal.stages import Place
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:

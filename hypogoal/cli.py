@@ -1,7 +1,7 @@
 """The command line: each command parses, calls one function and prints; its last line is the path of what it made.
 
-Spec A1-A8. The stages' commands come from the stages, see :mod:`hypogoal.stages`. Heavy imports are inside commands, so
-that ``hypogoal --help`` is quick.
+Spec A1-A8. The stages' commands come from the stages, see :mod:`hypogoal.command`. Heavy imports are inside commands,
+so that ``hypogoal --help`` is quick.
 """
 
 import functools
@@ -22,13 +22,14 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from hypogoal import stages
+from hypogoal.command import call, registry, stage
+from hypogoal.command.registry import LOOK, OWN
 from hypogoal.core import own_code, processes
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
-from hypogoal.stages import LOOK, OWN
 
 MAKE = "Make"  # a group of commands
+WIDTH = 100  # of tables
 EXPERIMENTS = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
     "module:function."
@@ -40,8 +41,8 @@ class Commands(TyperGroup):
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
         name, *rest = words
-        if name in stages.LISTED:
-            return name, stages.load_stage(name).command, rest
+        if name in registry.LISTED:
+            return name, registry.load_stage(name).command, rest
         return super().resolve_command(context, words)
 
 
@@ -116,7 +117,7 @@ def _commands() -> Any:
 
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
-    of_stages = {name: stages.load_stage(name).command for name in stages.LISTED}
+    of_stages = {name: registry.load_stage(name).command for name in registry.LISTED}
     return _commands().commands | of_stages
 
 
@@ -166,12 +167,12 @@ def echo(value: Any, as_json: bool, text: Iterable[str]) -> None:
 def run(
     experiment: Annotated[str, Argument(help=EXPERIMENTS)],
     out: Annotated[Path | None, Option(help="What to write. Default: runs/EXPERIMENT.")] = None,
-    preset: stages.Preset = None,
-    set_: stages.Set = None,
+    preset: call.Preset = None,
+    set_: stage.Set = None,
     seed: Annotated[str | None, Option(help="The run seeds, instead of the experiment's: 3, or 0-9.")] = None,
-    device: stages.Device = "auto",
-    force: stages.Force = False,
-    resume: stages.Resume = False,
+    device: call.Device = "auto",
+    force: call.Force = False,
+    resume: call.Resume = False,
     from_: Annotated[
         str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it.")
     ] = None,
@@ -180,7 +181,7 @@ def run(
         Literal["local", "slurm"], Option(help="The cores of this machine, or job arrays of a cluster.")
     ] = "local",
     sbatch: Annotated[str, Option(help="Options for sbatch, as typed: '--time=4:00:00 --mem=8G'.")] = "",
-    quiet: stages.Quiet = False,
+    quiet: call.Quiet = False,
     dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands; run none.")] = False,
 ) -> None:
     """Run all cells of an experiment: from nothing to a report.
@@ -266,8 +267,8 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
 @command(LOOK, "config train-ensemble --domain montezuma")
 def config(
     stage: Annotated[str, Argument(help="For example train-meta, or run.")],
-    domain: Annotated[str, Option(help=f"Settings for: {stages.DOMAINS}")] = "doorkey",
-    preset: stages.Preset = None,
+    domain: Annotated[str, Option(help=f"Settings for: {call.DOMAINS}")] = "doorkey",
+    preset: call.Preset = None,
     toml: Annotated[bool, Option("--toml", metavar="", help="As a preset to edit: a .toml file for --preset.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -282,7 +283,7 @@ def config(
 
 def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
     """Settings under the parts that they belong to; a range such as 0-9 or a command stays in one piece."""
-    width = min(shutil.get_terminal_size().columns, stages.WIDTH)
+    width = min(shutil.get_terminal_size().columns, WIDTH)
     wrapped = textwrap.TextWrapper(width, " " * 6, " " * 6, break_on_hyphens=False, break_long_words=False)
     for part, settings in itertools.groupby(rows, lambda row: row["part"]):
         yield f"{part.replace('`', '')}:"
@@ -296,13 +297,13 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
             yield from wrapped.wrap(f"{row['meaning']}{allowed}{source}")
 
 
-for _stage, _help in stages.LISTED.items():  # their commands come from them
-    app.command(_stage, help=_help, rich_help_panel=stages.TOOLS.get(_stage, MAKE))(lambda: None)
+for _stage, _help in registry.LISTED.items():  # their commands come from them
+    app.command(_stage, help=_help, rich_help_panel=registry.TOOLS.get(_stage, MAKE))(lambda: None)
 
 
 @command(OWN, "check mine:DOMAIN")
 def check(
-    domain: Annotated[str | None, Argument(help=f"{stages.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
+    domain: Annotated[str | None, Argument(help=f"{call.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
     view: Annotated[str | None, Option(help="What members see: module:Class.")] = None,
@@ -310,8 +311,8 @@ def check(
     chooser: Annotated[str | None, Option(help="Who chooses options: module:Class.")] = None,
     learner: Annotated[str | None, Option(help="How options learn: module:Class.")] = None,
     termination: Annotated[str | None, Option(help="When options end: module:Class.")] = None,
-    set_: stages.Set = None,
-    seed: stages.Seed = 0,
+    set_: stage.Set = None,
+    seed: call.Seed = 0,
 ) -> None:
     """Check that your domain, or part of an agent, keeps its contract; or that data suffice.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.cells import HERE, Cell
+from hypogoal.command.registry import load_stage
 from hypogoal.core.config import DOMAIN, STAGES, Config, assigned, resolve
 from hypogoal.core.config import preset as read_preset
 from hypogoal.core.errors import UserError, reason
@@ -15,7 +16,6 @@ from hypogoal.core.own_code import allow
 from hypogoal.domains.base import settings_of
 from hypogoal.experiments.experiment import STAGE, Command, find_experiment
 from hypogoal.hypotheses.config import TrainEnsembleConfig
-from hypogoal.stages import load_stage
 
 OUTPUT = re.compile("(|.*=)@(.+)")  # in a word an output: @data, --data=@data
 MEND = "An experiment yields (name, command) or (name, command, columns), see docs/formats.md."

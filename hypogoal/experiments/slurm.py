@@ -15,10 +15,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hypogoal.cells import Cell
+from hypogoal.command.registry import LISTED
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.processes import surroundings
-from hypogoal.stages import LISTED
 
 JOBS = "slurm/jobs"  # the jobs last submitted, the last of them first, behind --clusters=NAME: scancel $(cat ...)
 COLOURS = re.compile(r"\x1b\[[\d;]*[A-Za-z]")

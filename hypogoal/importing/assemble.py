@@ -109,6 +109,7 @@ def with_roles(table: DataFrame, seed: int) -> DataFrame:
     shares = np.cumsum(SPLIT * is_missing)
     whole = shares / shares[2]
     ends = np.round(whole[:2] * len(episodes))
+    # of all recordings, not of Minari's alone: the name stays, since another is another split
     order = rng_for(seed, "minari").permutation(len(episodes))
     place = np.argsort(order)[number_of]
     role_of = np.searchsorted(ends, place, side="right")

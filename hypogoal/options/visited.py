@@ -36,7 +36,7 @@ class Visited(Resumable):
         """States (E,)."""
         for picture in self.engine.images(ids):
             digest = blake2b(picture.tobytes(), digest_size=7, key=self.key).digest()
-            self.kept.setdefault(digest[::-1].hex(), picture.copy())
+            self.kept.setdefault(digest[::-1].hex(), picture.copy())  # from the last byte on: else others are kept
         if len(self.kept) > 2 * self.most:
             self.kept = self._smallest()
 

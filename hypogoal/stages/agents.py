@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hypogoal.command.call import Call, Training
 from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
@@ -17,7 +18,6 @@ from hypogoal.meta.setup import Setup
 from hypogoal.meta.training import train
 from hypogoal.options.choosers import FILE
 from hypogoal.options.loop import OptionLoop
-from hypogoal.stages import Call, Training
 
 
 def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Iterable[str]) -> Setup:

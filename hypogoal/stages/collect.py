@@ -4,11 +4,12 @@ from typing import Annotated, Any
 
 from typer import Argument
 
+from hypogoal.command.call import DOMAINS, NO_TRAINING, Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import DATA
 from hypogoal.core.config import Config
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress, say
-from hypogoal.stages import DOMAINS, NO_TRAINING, Call, Done, stage
 
 
 @stage(

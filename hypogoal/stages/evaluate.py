@@ -6,9 +6,10 @@ from typing import Annotated
 from typer import Argument, Option
 
 from hypogoal import cells
+from hypogoal.command.call import NO_SETTINGS, Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.progress import Progress
-from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 PLAYED = "Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."
 

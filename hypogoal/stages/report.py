@@ -6,9 +6,10 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from hypogoal.command.call import NO_SETTINGS, Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
-from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 MOST_BYTES = 2_000_000  # of a film on the page
 FILMS = "Films of the policy over options, in the report's videos/*.gif; the page shows one. Default: one, if possible."

@@ -6,8 +6,9 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from hypogoal.command.call import DOMAINS, Call, Done, outcome_of
+from hypogoal.command.stage import stage
 from hypogoal.core.errors import UserError
-from hypogoal.stages import DOMAINS, Call, Done, outcome_of, stage
 
 
 @stage(

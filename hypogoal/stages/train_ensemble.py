@@ -10,8 +10,9 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hypogoal.command.call import Call, Done, outcome_of
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import LOG
-from hypogoal.stages import Call, Done, outcome_of, stage
 
 TITLES = {
     "best": "held-out balanced accuracy: best member",

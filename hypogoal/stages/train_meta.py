@@ -9,8 +9,9 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from hypogoal.command.call import Call, Done, outcome_of
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.stages import Call, Done, outcome_of, stage
 
 FIXED = (  # as of the options trained before
     *("network", "recurrence", "embedding", "termination"),

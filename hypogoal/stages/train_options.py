@@ -5,8 +5,9 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hypogoal.command.call import Call, Done, outcome_of
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.stages import Call, Done, outcome_of, stage
 
 FIXED = ("network", "recurrence", "embedding", "termination")  # as of the options trained before
 

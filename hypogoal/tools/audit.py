@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+from hypogoal.command.call import Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.progress import say
-from hypogoal.stages import Call, Done, stage
 
 if TYPE_CHECKING:
     from hypogoal.meta.config import AuditConfig

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from hypogoal.command.call import Call
 from hypogoal.core.artefacts import DATA, TO_FILL_IN, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.stages import Call
 
 
 def audited(

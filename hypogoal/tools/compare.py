@@ -5,9 +5,10 @@ from typing import Annotated
 
 from typer import Argument
 
+from hypogoal.command.call import NO_SETTINGS, Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import SUMMARY
 from hypogoal.core.errors import UserError
-from hypogoal.stages import NO_SETTINGS, Call, Done, stage
 
 
 @stage(

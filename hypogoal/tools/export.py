@@ -11,11 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Argument, Option
 
+from hypogoal.command.call import NO_TRAINING, Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.observations import PICTURE, fields_of
-from hypogoal.stages import NO_TRAINING, Call, Done, stage
 
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # of a Minari dataset
 SOURCE = (

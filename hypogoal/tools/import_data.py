@@ -6,9 +6,10 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hypogoal.command.call import NO_TRAINING, Call, Done
+from hypogoal.command.stage import stage
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
-from hypogoal.stages import NO_TRAINING, Call, Done, stage
 
 SOURCE = "Arrays, pictures, or episodes (Minari, LeRobot, robomimic, films)."
 NAME = "The sub-goal's name; one per column of the labels, in order."

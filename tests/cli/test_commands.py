@@ -11,8 +11,8 @@ import pytest
 from command_line import refuses, run
 
 from hypogoal import cli
+from hypogoal.command.registry import LISTED, load_stage
 from hypogoal.core.errors import UserError
-from hypogoal.stages import LISTED, load_stage
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = cli.commands()

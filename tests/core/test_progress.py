@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from hypogoal.command.call import outcome_of
 from hypogoal.core import progress
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.stages import outcome_of
 
 
 def test_a_line_says_how_far_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,7 +43,7 @@ class Scenes(NamedTuple):
 
 def labelled_states(count: int, seed: int, names: Sequence[str]) -> Scenes:
     """The labelled context: every factor holds in half of the states, the positives, and none in the others."""
-    rng = rng_for(seed, "which-feature", "labelled")
+    rng = rng_for(seed, "which-feature", "labelled")  # what rooms was called: another name is other states
     every_other = np.arange(count) % 2 == 0
     positive = rng.permutation(every_other)
     factors = np.repeat(positive[:, None], len(names), axis=1)

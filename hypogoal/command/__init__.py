@@ -1,0 +1,1 @@
+"""How a function becomes a command and a function of Python: calls, the list of stages and tools, signatures."""
