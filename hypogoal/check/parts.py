@@ -17,8 +17,7 @@ from hypogoal.core.arrays import Floats, Ints
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.domains.base import Domain, Engine, load_domain
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.setup import Setup
-from hypogoal.meta.training import assemble
+from hypogoal.meta.setup import Setup, assemble
 from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.termination import Terminations, load_rule

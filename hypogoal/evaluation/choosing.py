@@ -17,11 +17,10 @@ import pandas as pd
 from hypogoal.core.arrays import Doubles, Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.domains.base import load_domain
+from hypogoal.evaluation import statistics, table
 from hypogoal.evaluation.names import UNIFORM
 from hypogoal.evaluation.run import choice_of
 from hypogoal.evaluation.selection import engine_on
-from hypogoal.evaluation.statistics import DIGITS, above, at_least, tables_of
-from hypogoal.evaluation.table import melted, options_of, per_run, tidy
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
@@ -93,9 +92,9 @@ def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     several = counts > 1
     taken, among = choices.options[several], of_goal[several]
     shares = among / counts[several][:, None]
-    expected = shares.sum(axis=0).round(DIGITS)  # in any order of decisions
+    expected = shares.sum(axis=0).round(statistics.DIGITS)  # in any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
-    preference = chosen / np.where(at_least(expected, LEAST), expected, np.nan)
+    preference = chosen / np.where(statistics.at_least(expected, LEAST), expected, np.nan)
     return {
         "preference": preference,
         "within_rho": _within_rho(quality, preference, goals),
@@ -108,7 +107,7 @@ def _within_rho(quality, preference, goals):
     both = pd.DataFrame({"quality": quality, "preference": preference}).dropna()
     rhos = []
     for _, alike in both.groupby(goals[both.index]):
-        differ = at_least(np.ptp(alike["quality"]), DIFFERENCE)
+        differ = statistics.at_least(np.ptp(alike["quality"]), DIFFERENCE)
         if differ and alike["preference"].nunique() > 1:
             ranks = alike.rank()  # whose correlation is Spearman's
             rhos.append(ranks["quality"].corr(ranks["preference"]))
@@ -119,7 +118,7 @@ def _better_of_two(quality, taken, among, goals):
     better, both = 0, 0
     for pair in combinations(range(len(quality)), 2):
         bad, good = sorted(pair, key=quality.__getitem__)
-        if goals[bad] == goals[good] and at_least(quality[good] - quality[bad], DIFFERENCE):
+        if goals[bad] == goals[good] and statistics.at_least(quality[good] - quality[bad], DIFFERENCE):
             of_both = taken[among[:, good] & among[:, bad]]
             better += (of_both == good).sum()
             both += np.isin(of_both, pair).sum()
@@ -133,7 +132,7 @@ def _score(quality, taken, among):
     average = offered.mean(axis=1)
     gain = (offered.max(axis=1) - average)[compared].sum()
     gained = (own - average)[compared].sum()
-    return gained / gain if above(gain, 0.0) else math.nan
+    return gained / gain if statistics.above(gain, 0.0) else math.nan
 
 
 def rows(work):
@@ -147,9 +146,9 @@ def rows(work):
             continue
         place = work.place(artefact) | {"scope": FROZEN}
         agent, uniform, members = played
-        yield tidy(agent, **place)
-        yield tidy(uniform, **place | {"method": UNIFORM})
-        yield melted(members, options_of(artefact.config), **place)
+        yield table.tidy(agent, **place)
+        yield table.tidy(uniform, **place | {"method": UNIFORM})
+        yield table.melted(members, table.options_of(artefact.config), **place)
 
 
 def is_playable(artefact: Artefact) -> bool:
@@ -177,7 +176,7 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
     if not is_playable(artefact) or engine_on(config, [config["layout_seed"]]).plan() is None:
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
-    of_options = options_of(config).get_level_values("sub_goal")
+    of_options = table.options_of(config).get_level_values("sub_goal")
     goals = of_options.map(load_domain(config["domain"]).sub_goals.index).to_numpy()
     of_both = play_both(loop, seed)
     quality = qualities(loop, goals, of_both[0].choices.states)  # where the agent itself decides
@@ -192,8 +191,8 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
 
 def context(results):
     """Each agent (``chooser`` its own), and uniform-random choice among its own options."""
-    runs = per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN)
-    return tables_of(with_choosers(runs), BY)
+    runs = table.per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN)
+    return statistics.tables_of(with_choosers(runs), BY)
 
 
 def with_choosers(runs: pd.DataFrame) -> pd.DataFrame:

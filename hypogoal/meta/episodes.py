@@ -12,8 +12,8 @@ from hypogoal.core.config import known, resolve
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.setup import Setup
-from hypogoal.meta.training import assemble, continue_with
+from hypogoal.meta.setup import Setup, assemble
+from hypogoal.meta.training import continue_with
 from hypogoal.observations import Observations
 from hypogoal.options.choosers import FILE
 from hypogoal.options.learner import Transitions

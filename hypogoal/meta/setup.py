@@ -1,6 +1,6 @@
-"""Whose options are played, in which environments, and where these options end."""
+"""An agent put together: whose options are played, in which environments, where they end, who learns and chooses."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,9 @@ from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options import termination as ends
 from hypogoal.options.choosers import load_chooser
 from hypogoal.options.learner import load_learner
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.recording import Recorder
+from hypogoal.options.visited import Visited
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,27 @@ class Setup:
             self.source["domain_config"],
             self.config,
         )
+
+
+def assemble(
+    setup: Setup,
+    terminations_of: Callable[[Setup, Engine], ends.Terminations] | None = None,
+    layouts: Layouts | None = None,
+) -> OptionLoop:
+    """Environments, options in them, fresh policies of these and over these; each part refuses what it cannot do.
+
+    ``terminations_of`` says where options end, by default as the ensemble predicts; ``layouts`` replace the setting.
+    """
+    config, seed, device = setup.config, setup.seed, setup.device
+    engine = make_engine(setup, layouts)
+    load_chooser(config.chooser).refuse(config, engine)
+    terminations = (terminations_of or of_ensemble)(setup, engine)
+    learner = load_learner(config.network)(engine, terminations, config, seed, device)
+    require_memory(engine, config, terminations.options)
+    chooser = load_chooser(config.chooser).create(engine, terminations.options, config, seed, device)
+    recorder = Recorder(terminations.options, engine)
+    visited = Visited(engine, config.save_visited, seed) if config.save_visited else None
+    return OptionLoop(engine, terminations, learner, chooser, recorder, config, config.gamma, visited)
 
 
 def make_engine(setup: Setup, layouts: Layouts | None = None) -> Engine:

@@ -1,4 +1,4 @@
-"""Options set up in a domain and trained for a number of steps: what ``train-options`` and ``train-meta`` share.
+"""An agent trained for a number of steps: what ``train-options`` and ``train-meta`` share.
 
 - step: one primitive action in one environment. Budgets, logs and curves count these.
 - joint step: a step in each of the E environments at once, so E steps: one call of ``OptionLoop.step``.
@@ -8,43 +8,13 @@
 What an option's end means for each of those that learn stands in :mod:`hypogoal.options.loop`.
 """
 
-from collections.abc import Callable
-
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.base import Engine, Layouts
-from hypogoal.meta.setup import Setup, make_engine, of_ensemble, require_memory
-from hypogoal.options.choosers import load_chooser
-from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import Recorder
-from hypogoal.options.termination import Terminations
-from hypogoal.options.visited import Visited
 
 LOG_INTERVAL = 2_000  # environment steps
-
-
-def assemble(
-    setup: Setup,
-    terminations_of: Callable[[Setup, Engine], Terminations] = of_ensemble,
-    layouts: Layouts | None = None,
-) -> OptionLoop:
-    """Environments, options in them, fresh policies of these and over these; each part refuses what it cannot do.
-
-    ``terminations_of`` says where options end; ``layouts`` replace the setting.
-    """
-    config, seed, device = setup.config, setup.seed, setup.device
-    engine = make_engine(setup, layouts)
-    load_chooser(config.chooser).refuse(config, engine)
-    terminations = terminations_of(setup, engine)
-    learner = load_learner(config.network)(engine, terminations, config, seed, device)
-    require_memory(engine, config, terminations.options)
-    chooser = load_chooser(config.chooser).create(engine, terminations.options, config, seed, device)
-    recorder = Recorder(terminations.options, engine)
-    visited = Visited(engine, config.save_visited, seed) if config.save_visited else None
-    return OptionLoop(engine, terminations, learner, chooser, recorder, config, config.gamma, visited)
 
 
 def train(

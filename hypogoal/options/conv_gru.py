@@ -24,9 +24,8 @@ from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.observations import PICTURE, Observations
-from hypogoal.options import saved
+from hypogoal.options import double_dqn, saved
 from hypogoal.options.config import STACK, OptionConfig, PaperConfig
-from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch, Updated
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay
 
@@ -112,10 +111,10 @@ class Lived(Columns):
     terminated: Bools  # the task is over
 
 
-class Member(DoubleDQN):
+class Member(double_dqn.DoubleDQN):
     """One member's policy: networks, optimiser, replay, and the steps since its last update."""
 
-    CHANGING = (*DoubleDQN.CHANGING, "replay", "due")
+    CHANGING = (*double_dqn.DoubleDQN.CHANGING, "replay", "due")
     online: PaperQNetwork
     target: PaperQNetwork
 
@@ -248,7 +247,7 @@ class PaperLearner(Learner):
                 last = self._update(option, member) or last
         return self.health(last, sum(member.replay.size for member in self.members)) if last else {}
 
-    def _update(self, option: int, member: Member) -> Updated | None:
+    def _update(self, option: int, member: Member) -> double_dqn.Updated | None:
         """One update of a member's policy; None where all steps drawn are forgotten."""
         indices, weights = member.replay.sample(self.settings.option_batch, self.rng)
         steps = member.replay.data.at(indices)
@@ -276,7 +275,7 @@ class PaperLearner(Learner):
         next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]
         ones = np.ones_like(length)
-        batch = ReplayBatch(
+        batch = double_dqn.ReplayBatch(
             steps.action,
             ones,
             reached,

@@ -39,6 +39,7 @@ def train_meta(
     from hypogoal.core.tensors import load_tensors
     from hypogoal.domains.episodes import Episode
     from hypogoal.meta import training
+    from hypogoal.meta.setup import assemble
     from hypogoal.options.choosers import FILE
     from hypogoal.options.tables import Episodes
     from hypogoal.stages import agents
@@ -56,7 +57,7 @@ def train_meta(
     if agent:
         agents.require_ensemble(open_artefact(agent, "meta"), ensemble)
     with call.training("meta", settings, inputs, steps) as work:
-        loop = training.assemble(setup)
+        loop = assemble(setup)
         if practice:
             training.continue_with(loop, practice)
             begun_at = spent.get("options_ended_at", spent["options_steps"])

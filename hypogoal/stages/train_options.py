@@ -30,6 +30,7 @@ def train_options(
     from hypogoal.meta import training
     from hypogoal.meta.config import TrainOptionsConfig
     from hypogoal.meta.nearness import distances_of
+    from hypogoal.meta.setup import assemble
     from hypogoal.stages import agents
 
     practice = open_artefact(options, "options") if options else None
@@ -42,7 +43,7 @@ def train_options(
     settings = agents.description(setup, steps=steps)
     inputs = [ensemble, options] if options else [ensemble]
     with call.training("options", settings, inputs, steps) as work:
-        loop = training.assemble(setup)
+        loop = assemble(setup)
         if practice:
             training.continue_with(loop, practice)
         solved = agents.learn(work, setup, loop, steps, config.until)

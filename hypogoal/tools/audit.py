@@ -74,8 +74,7 @@ def _in_play(
     from hypogoal.domains.world import columns_of
     from hypogoal.evaluation.page import lines_of
     from hypogoal.meta.config import AuditConfig
-    from hypogoal.meta.setup import Setup
-    from hypogoal.meta.training import assemble
+    from hypogoal.meta.setup import Setup, assemble
     from hypogoal.stages import agents
     from hypogoal.tools.audits import played
     from hypogoal.tools.audits.classifiers import classifier_of

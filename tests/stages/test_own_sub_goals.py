@@ -12,8 +12,7 @@ from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.env import SUB_GOALS
 from hypogoal.evaluation.run import read_evaluation
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.meta.setup import Setup
-from hypogoal.meta.training import assemble
+from hypogoal.meta.setup import Setup, assemble
 
 FEW = [*settings("steps=400", "environments=4", "max_episode_steps=30"), "-q"]
 
