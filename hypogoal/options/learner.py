@@ -15,11 +15,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_class
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine
+from hypogoal.options import double_dqn, saved
 from hypogoal.options.config import LearnerConfig, OptionConfig
-from hypogoal.options.double_dqn import Updated, linear_epsilon
 from hypogoal.options.exploration import Exploration
 from hypogoal.options.parts import Part, answer_of, saved_row
-from hypogoal.options.saved import Policies, SavedOptions
 from hypogoal.options.termination import ORACLE, Terminations
 
 LEARNERS = {
@@ -88,7 +87,7 @@ class Learner(Part, ABC):
             )
 
     @classmethod
-    def policies(cls, options: SavedOptions) -> Policies:
+    def policies(cls, options: saved.SavedOptions) -> saved.Policies:
         """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
         raise UserError(
             "these options need their domain's engine, which is not in the artefact",
@@ -128,9 +127,9 @@ class Learner(Part, ABC):
         """Every option's exploration, float (O,)."""
         settings = self.config.part(LearnerConfig)
         steps = self.steps_since_positive if settings.epsilon_from == "first-positive" else self.option_steps
-        return linear_epsilon(steps, settings.epsilon_steps, settings.epsilon_final)
+        return double_dqn.linear_epsilon(steps, settings.epsilon_steps, settings.epsilon_final)
 
-    def health(self, last: Updated, replay: int) -> dict[str, float]:
+    def health(self, last: double_dqn.Updated, replay: int) -> dict[str, float]:
         """Numbers to log of the last update, and of a replay with so many transitions."""
         return {
             "option_loss": last.loss,
@@ -173,7 +172,7 @@ def load_learner(name: str) -> type[Learner]:
     return load_class(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]
 
 
-def make_policies(config: Values, weights: Mapping[str, Tensor], ensemble_config: Values) -> Policies:
+def make_policies(config: Values, weights: Mapping[str, Tensor], ensemble_config: Values) -> saved.Policies:
     """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration."""
     if config["termination"] == ORACLE:
         raise UserError(
@@ -182,4 +181,4 @@ def make_policies(config: Values, weights: Mapping[str, Tensor], ensemble_config
             "Load options that were trained with learned members.",
         )
     shape = tuple(ensemble_config["observation_shape"])
-    return load_learner(config["network"]).policies(SavedOptions(config, weights, shape))
+    return load_learner(config["network"]).policies(saved.SavedOptions(config, weights, shape))
