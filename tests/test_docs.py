@@ -123,6 +123,12 @@ def test_equations_lead_to_code() -> None:
                 assert hasattr(module, name), (row, name)
 
 
+def test_readme_and_the_sites_first_page_are_one_text() -> None:
+    """``python docs/home.py`` would change nothing; pictures are drawn as they were."""
+    page = runpy.run_path(str(DOCS / "home.py"))
+    assert page["home"]() == (DOCS / "index.md").read_text(encoding="utf-8")
+
+
 def test_the_picture_of_the_stages_is_drawn_from_their_code() -> None:
     """``python docs/stages.py`` would change nothing; each stage reads and writes what it declares."""
     picture = runpy.run_path(str(DOCS / "stages.py"))

@@ -161,10 +161,9 @@ def test_no_pickle_in_the_package() -> None:
     assert not [path for path in sources if UNSAFE.search(path.read_text(encoding="utf-8"))]
 
 
-def test_the_readme_is_short_and_its_targets_exist() -> None:
+def test_the_targets_that_the_readme_names_exist() -> None:
     """Every ``make X`` is a target of the Makefile; of other commands see ``test_docs``."""
     text = text_of("README.md")
-    assert len(text.split()) <= 900
     targets = {*re.findall(r"^([a-z]+):", text_of("Makefile"), re.M)}
     assert {"demo", "test"} <= {*re.findall(r"(?:^|`)\s*make ([a-z]+)", text, re.M)} <= targets
 
