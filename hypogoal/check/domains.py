@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from hypogoal.check.verdict import Verdict, promise, verdicts
-from hypogoal.core.config import resolve
+from hypogoal.core.config import Config, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import place_of
 from hypogoal.core.progress import Progress
@@ -28,7 +28,7 @@ STEP_KINDS = {"next_ids": "iu", "rewards": "iuf", "terminated": "b", "truncated"
 SEEDED = "All randomness must come from the seed, also from 0: Gymnasium's from self.np_random. Labels keep nothing."
 
 
-def check_domain(domain: Domain, config: Any = None, *, seed: int = 0) -> Iterator[Verdict]:
+def check_domain(domain: Domain, config: Config | None = None, *, seed: int = 0) -> Iterator[Verdict]:
     """Whether a domain keeps the promises that the stages rely on.
 
     Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
@@ -45,7 +45,7 @@ def check_domain(domain: Domain, config: Any = None, *, seed: int = 0) -> Iterat
     return verdicts(laws[first:], _Played(domain, config, seed))
 
 
-def collected(domain: Domain, config: Any, seed: int) -> Collected:
+def collected(domain: Domain, config: Config | None, seed: int) -> Collected:
     """States of a domain, collected with a config of its; None: with the defaults."""
     settings = config or resolve(domain.config_class, stage="collect")
     progress = Progress("check", total=1, quiet=True)
@@ -57,7 +57,7 @@ class _Played:
     """A domain, and how it is played."""
 
     domain: Domain
-    config: Any
+    config: Config | None
     seed: int
 
     def gymnasium(self) -> None:

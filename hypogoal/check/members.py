@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hypogoal.check.domains import SEEDED, collected
 from hypogoal.check.verdict import Verdict, promise, verdicts
+from hypogoal.core.config import Config
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import stored
 from hypogoal.data import Collected
@@ -30,7 +31,9 @@ CLOSE = 1e-4  # between probabilities that are the same up to rounding
 ANEW = "Make new layers at every call, with weights from PyTorch's generator."
 
 
-def check_view(name: str, domain: Domain | None = None, config: Any = None, seed: int = 0) -> Iterator[Verdict]:
+def check_view(
+    name: str, domain: Domain | None = None, config: Config | None = None, seed: int = 0
+) -> Iterator[Verdict]:
     """Whether a view, by its ``module:Class``, can be learned, used and stored on states of a domain, or of rooms.
 
     They are collected with ``config``, an instance of the domain's ``config_class`` (None: the defaults).
@@ -40,7 +43,9 @@ def check_view(name: str, domain: Domain | None = None, config: Any = None, seed
     return verdicts(laws, view)
 
 
-def check_teacher(name: str, domain: Domain | None = None, config: Any = None, seed: int = 0) -> Iterator[Verdict]:
+def check_teacher(
+    name: str, domain: Domain | None = None, config: Config | None = None, seed: int = 0
+) -> Iterator[Verdict]:
     """Whether a teacher, by its ``module:function``, gives scores that members can learn; as :func:`check_view`."""
     teacher = _Trained("teacher", name, domain or load_domain("rooms"), config, seed)
     return verdicts([_Trained.trains], teacher)
@@ -53,7 +58,7 @@ class _Trained:
     setting: str
     name: str
     domain: Domain
-    config: Any
+    config: Config | None
     seed: int
 
     @cached_property

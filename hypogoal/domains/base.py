@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core import own_code
 from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import Resumable, State
-from hypogoal.core.config import C, Config, Values, model_of, preset, resolve
+from hypogoal.core.config import C, Values, model_of, preset, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
 from hypogoal.observations import PICTURE, DType, Observations, Shape, Standard
@@ -280,7 +280,7 @@ class TurnEngine(Engine):
         return Step(following, rewards.astype(np.float32), *others)
 
 
-class Domain(ABC):
+class Domain(ABC, Generic[C]):
     """What hypogoal needs to know about a domain; :class:`hypogoal.GymnasiumDomain` makes one from an environment.
 
     ``hypogoal check`` tests it. Required members come first, then optional ones.
@@ -300,7 +300,7 @@ class Domain(ABC):
 
     name: str
     sub_goals: tuple[str, ...]
-    config_class: type[Config]
+    config_class: type[C]
     engine_settings: tuple[str, ...] = ()
     defaults: Mapping[str, Values] = {}
     sources: Mapping[str, str] = {}
@@ -321,7 +321,7 @@ class Domain(ABC):
         return PICTURE
 
     @abstractmethod
-    def collect(self, config: Any, seed: int, progress: Any) -> Collected:
+    def collect(self, config: C, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states."""
 
     @abstractmethod

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from pandas import DataFrame
 
+from hypogoal.core.config import Values
 from hypogoal.core.files import reading
 
 EVALUATE_AGAIN = "Evaluate the run again, with --force."
@@ -66,7 +67,7 @@ def melted(
     return rows.assign(**place)
 
 
-def options_of(config: Any) -> pd.MultiIndex:
+def options_of(config: Values) -> pd.MultiIndex:
     """The sub-goal and the member of each option of an artefact's ``config``, in order: an index of (G*K,) rows."""
     goals, members = config["sub_goals"], range(config["members"])
     return pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])

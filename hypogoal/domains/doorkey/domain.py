@@ -75,7 +75,7 @@ def _sweep(config: DoorKeyConfig, layout_seeds: Iterable[int], progress: Any) ->
     return joined(swept)
 
 
-class DoorKeyDomain(Domain):
+class DoorKeyDomain(Domain[DoorKeyConfig]):
     """Spec B6: three-key DoorKey."""
 
     name = "doorkey"

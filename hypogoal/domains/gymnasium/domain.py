@@ -43,7 +43,7 @@ class GymnasiumConfig(Config):
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)
 
 
-class GymnasiumDomain(Domain):
+class GymnasiumDomain(Domain[GymnasiumConfig]):
     """Spec B6: all that hypogoal needs to know about a problem, from a Gymnasium environment.
 
     Args:

@@ -138,7 +138,7 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
     return Collected(game.OBSERVATION_SHAPE, names, for_labels, without_labels, heldout)
 
 
-class MontezumaDomain(Domain):
+class MontezumaDomain(Domain[MontezumaConfig]):
     """Spec B6: Montezuma's Revenge; the defaults are Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"

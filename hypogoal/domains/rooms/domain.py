@@ -27,7 +27,7 @@ DEFAULTS = {
 }
 
 
-class RoomsDomain(Domain):
+class RoomsDomain(Domain[RoomsConfig]):
     """Spec H1: a domain in which one labelled context cannot say what the sub-goal is."""
 
     name = "rooms"
