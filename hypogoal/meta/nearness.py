@@ -1,6 +1,7 @@
 """How near executions of options come to their true sub-goals, where the domain knows them (Spec F3, H5)."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
     return near
 
 
-def distances_of(domain: Domain, sub_goals: Sequence[str], members: int) -> Distances:
+def distances_of(domain: Domain[Any], sub_goals: Sequence[str], members: int) -> Distances:
     """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
 
     def away(positions: Ints, options: Ints) -> Ints:

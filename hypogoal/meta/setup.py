@@ -33,7 +33,7 @@ class Setup:
         device: of the networks.
     """
 
-    domain: Domain
+    domain: Domain[Any]
     source: Mapping[str, Any]
     folder: Path
     config: PlayConfig
