@@ -1,4 +1,4 @@
-"""The cells of a run (Spec A6, G4): a cell is one command of hypogoal with an output of its own.
+"""The cells of a run: a cell is one command of hypogoal with an output of its own.
 
 The plan is ``sweep.json``. A cell is done when its output is there, runs while its draft is locked, and has failed if
 its last attempt did (``logs/NAME.code``). Nothing else is recorded: a run may be killed and started again anywhere.

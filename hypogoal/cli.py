@@ -1,6 +1,6 @@
 """The command line: each command parses, calls one function and prints; its last line is the path of what it made.
 
-Spec A1-A8. The stages' commands come from the stages, see :mod:`hypogoal.command`. Heavy imports are inside commands,
+The stages' commands come from the stages, see :mod:`hypogoal.command`. Heavy imports are inside commands,
 so that ``hypogoal --help`` is quick.
 """
 

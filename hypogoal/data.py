@@ -1,4 +1,4 @@
-"""The HDF5 file of collected states: labelled, unlabelled, held-out (Spec A1, A8).
+"""The HDF5 file of collected states: labelled, unlabelled, held-out.
 
 ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``, ``heldout/<sub-goal>/{observations,labels}``
 and, beside each, ``origin/*`` per state. Sub-goals with the same states share one dataset on disk (hard links). The
@@ -94,7 +94,7 @@ class Unmet(UserError):
 
 
 def leave_out(states: States, *training: Observations) -> States:
-    """Spec B3: the states without those that look like one of ``training``, observations (M, ...) each."""
+    """The states without those that look like one of ``training``, observations (M, ...) each."""
     digests = set(map(digest, chain(*training)))
     apart = [digest(observation) not in digests for observation in states.observations]
     return states.where(np.array(apart, bool))

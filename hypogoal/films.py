@@ -1,4 +1,4 @@
-"""Films of a run's agent, played from its saved weights (Spec E1, F7)."""
+"""Films of a run's agent, played from its saved weights."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def agent_to_film(run: Path) -> Artefact | None:
 
 
 def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
-    """Spec E1: the first ``count`` episodes of an agent, whose ``path`` in the run names them.
+    """The first ``count`` episodes of an agent, whose ``path`` in the run names them.
 
     None: one, the first that :func:`_telling` finds within ``MOST_FRAMES``, else the first of all. Without pictures a
     ``UserError``.

@@ -1,4 +1,4 @@
-"""What is there, is it whole, is it up to date: for ``show``, ``verify``, ``status`` and notebooks (Spec A8, G2)."""
+"""What is there, is it whole, is it up to date: for ``show``, ``verify``, ``status`` and notebooks."""
 
 import shlex
 import textwrap

@@ -1,1 +1,1 @@
-"""Comparison agents with the primitive actions (Spec E7): stable-baselines3's PPO and DQN on an engine."""
+"""Comparison agents with the primitive actions: stable-baselines3's PPO and DQN on an engine."""

@@ -111,7 +111,7 @@ class Watch(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm, step: int) -> None:
-    """Spec G3: a ``NumericalError`` where a weight of the agent is NaN or infinite."""
+    """A ``NumericalError`` where a weight of the agent is NaN or infinite."""
     for name, weight in model.policy.named_parameters():
         if not torch.isfinite(weight).all():
             raise NumericalError(f"NaN or Inf in {type(model).__name__}'s {name} at step {step}")
@@ -184,9 +184,9 @@ def train(
     checkpoints: Checkpoints,
     device: str = "cpu",
 ) -> BaseAlgorithm:
-    """Spec E7: train a fresh agent for ``steps`` environment steps of all environments, rounded up to whole rollouts.
+    """Train a fresh agent for ``steps`` environment steps of all environments, rounded up to whole rollouts.
 
-    ``env.episodes`` is filled; ``log`` and ``progress`` are told of every ``LOG_INTERVAL`` steps. Checkpoints (spec G1)
+    ``env.episodes`` is filled; ``log`` and ``progress`` are told of every ``LOG_INTERVAL`` steps. Checkpoints
     are of no use where the engine cannot be resumed. NaN or Inf in a weight is a ``NumericalError``.
     """
     if not env.engine.resumes:
@@ -210,7 +210,7 @@ def train(
 
 
 def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> State:
-    """An agent before a rollout, its environments, and the global generators that it draws from (Spec G1).
+    """An agent before a rollout, its environments, and the global generators that it draws from.
 
     The library saves its agents as pickles, without their environments and random numbers. Here what it knows between
     two rollouts is written down field by field; within a rollout (under a second) it cannot be interrupted.

@@ -1,4 +1,4 @@
-"""Spec E7: every number of the four baselines in one table: PPO and DQN, in the paper's setting and in a tuned one.
+"""Every number of the four baselines in one table: PPO and DQN, in the paper's setting and in a tuned one.
 
 The paper gives Tables 4 and 5 only for the agents it trains itself and says no more of its PPO and DQN baselines; we
 read the two tables as theirs too. Where it is silent the value is stable-baselines3's default or ours, and says so.

@@ -1,4 +1,4 @@
-"""The contracts of domains, objectives, networks and other parts, as laws that users check theirs by (Spec B6, C1).
+"""The contracts of domains, objectives, networks and other parts, as laws that users check theirs by.
 
 ``hypogoal check`` prints a line for each law. In your own test suite: ``require(check_domain(DOMAIN))``.
 """

@@ -1,4 +1,4 @@
-"""The contract of a domain (Spec B6; see ``hypogoal.domains.base``)."""
+"""The contract of a domain (see ``hypogoal.domains.base``)."""
 
 import warnings
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The contracts of member networks, views (what members see) and teachers (what they are told) (Spec C5)."""
+"""The contracts of member networks, views (what members see) and teachers (what they are told)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

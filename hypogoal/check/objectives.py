@@ -1,4 +1,4 @@
-"""The laws of a diversity objective (Spec C1, C2; see ``hypogoal.diversity``)."""
+"""The laws of a diversity objective (see ``hypogoal.diversity``)."""
 
 from collections.abc import Iterator
 

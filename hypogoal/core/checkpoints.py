@@ -1,4 +1,4 @@
-"""Checkpoints: all that a stage needs to resume, saved while it works (Spec G1, G3).
+"""Checkpoints: all that a stage needs to resume, saved while it works.
 
 A state is nested dicts and lists of arrays, tensors and plain JSON values; objects give it as ``snapshot()`` and take
 it back with ``restore(snapshot)``. One state is one safetensors file with its JSON part as bytes; no pickle.
@@ -54,7 +54,7 @@ class Checkpoints:
     def save(self, state: State) -> None:
         """Write ``state``. If that fails, a ``UserError``; the previous checkpoint stays.
 
-        A state with NaN or Inf in a tensor is not written: the last good one stays (Spec G3).
+        A state with NaN or Inf in a tensor is not written: the last good one stays.
         """
         from safetensors import SafetensorError
         from safetensors.numpy import save_file

@@ -1,4 +1,4 @@
-"""Errors for users: one line that says what is wrong, where and what to do (Spec G2, G3)."""
+"""Errors for users: one line that says what is wrong, where and what to do."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ class Complete(Exception):
 
 
 class NumericalError(Exception):
-    """NaN or Inf in training (Spec G3): names the member and the step; nothing was overwritten."""
+    """NaN or Inf in training: names the member and the step; nothing was overwritten."""
 
 
 def printable(text: str) -> str:

@@ -1,4 +1,4 @@
-"""User code, named ``module:object``: when it is loaded, and where an error of it lies (Spec H8).
+"""User code, named ``module:object``: when it is loaded, and where an error of it lies.
 
 A name that the user typed, on the command line or in a call from Python, is loaded. A name in a file (a manifest, a
 data file, a preset, an experiment in TOML) is loaded only with ``--trust``, or with ``HYPOGOAL_TRUST=1`` in the

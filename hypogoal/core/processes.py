@@ -1,4 +1,4 @@
-"""Where work runs: in processes of their own, on a device, with one thread of torch's; how it is stopped (Spec G5)."""
+"""Where work runs: in processes of their own, on a device, with one thread of torch's; how it is stopped."""
 
 import multiprocessing
 import os

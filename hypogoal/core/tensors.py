@@ -1,4 +1,4 @@
-"""Weights on disk: safetensors only, no pickle is ever loaded (Spec G2)."""
+"""Weights on disk: safetensors only, no pickle is ever loaded."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def stored(tensors: Mapping[str, Any], owner: str) -> bytes:
-    """Tensors or arrays by name as a file has them. NaN or Inf is a ``NumericalError`` (Spec G3)."""
+    """Tensors or arrays by name as a file has them. NaN or Inf is a ``NumericalError``."""
     import torch
     from safetensors.torch import save
 

@@ -1,4 +1,4 @@
-"""Spec C1: diversity objectives, one per file; the file's name is the name on the command line.
+"""Diversity objectives, one per file; the file's name is the name on the command line.
 
 An objective is one of two functions:
 

@@ -8,7 +8,7 @@ def pair_loss(
     logits_a: Tensor,
     logits_b: Tensor,
 ) -> Tensor:
-    """Eq. (1), second term, Spec C2: ``-log(p_a (1 - p_b) + (1 - p_a) p_b)``, mean over unlabelled states.
+    """Eq. (1), second term: ``-log(p_a (1 - p_b) + (1 - p_a) p_b)``, mean over unlabelled states.
 
     Eq. (1) as printed multiplies matching classes, which literally rewards agreement. D-BAT's term is the log
     probability that two members, each drawing its class from its own p, draw different ones. It is computed from

@@ -12,7 +12,7 @@ def pair_loss(
     logits_a: Tensor,
     logits_b: Tensor,
 ) -> Tensor:
-    """Spec C1: mutual information of two members' classes over the unlabelled states, to be minimised.
+    """Mutual information of two members' classes over the unlabelled states, to be minimised.
 
     ``KL(mean_n p_a(y|n) p_b(z|n)  ||  mean_n p_a(y|n) x mean_n p_b(z|n))``: the joint distribution of both members'
     classes over the batch against the product of their marginals. It is 0 if one member's predictions carry no

@@ -7,7 +7,7 @@ def pair_loss(
     logits_a: Tensor,
     logits_b: Tensor,
 ) -> Tensor:
-    """Spec C1: 0, but a function of both members, so that it can be differentiated like the others.
+    """0, but a function of both members, so that it can be differentiated like the others.
 
     Takes two members' logits (..., N, 2) on N unlabelled states; returns float (...,), 0 with gradients of 0.
     """

@@ -1,4 +1,4 @@
-"""The interface of a domain (Spec B6), and how to find one by name."""
+"""The interface of a domain, and how to find one by name."""
 
 from __future__ import annotations
 

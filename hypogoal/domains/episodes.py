@@ -1,4 +1,4 @@
-"""The episodes played so far: how long each was, what it earned, how it ended (Spec E7, F5)."""
+"""The episodes played so far: how long each was, what it earned, how it ended."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypogoal.core.checkpoints import Resumable
 if TYPE_CHECKING:
     from hypogoal.domains.base import Step
 
-LAST = 100  # an agent is judged by its last so many episodes, an option by its last so many executions (Spec F3)
+LAST = 100  # an agent is judged by its last so many episodes, an option by its last so many executions
 
 
 class Episode(NamedTuple):

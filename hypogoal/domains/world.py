@@ -1,4 +1,4 @@
-"""The world that an agent plays in, with options or with primitive actions (Spec D4, E5, F5)."""
+"""The world that an agent plays in, with options or with primitive actions."""
 
 import json
 import math
@@ -108,7 +108,7 @@ def write_layout(
     seed: int,
     layouts: str = "",
 ) -> None:
-    """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
+    """``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
     Both are null where the engine does not know them. ``layouts`` are those of many.
     """

@@ -1,1 +1,1 @@
-"""Numbers and pictures (Spec F): pure functions on arrays; figures are apart from numbers, files are the stages'."""
+"""Numbers and pictures: pure functions on arrays; figures are apart from numbers, files are the stages'."""

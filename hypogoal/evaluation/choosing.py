@@ -1,4 +1,4 @@
-"""What choosing is worth: how good options are, whether the better one is taken, and what random choice does (Spec H2).
+"""What choosing is worth: how good options are, whether the better one is taken, and what random choice does.
 
 An option is good where its execution brings about the true sub-goal; how well its classifier matches the truth on all
 states says little of that. Choice is judged among the members of the sub-goal that was chosen, since which sub-goal is

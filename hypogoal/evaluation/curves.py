@@ -1,4 +1,4 @@
-"""Figure 6: what agents achieve on layouts that no data came from, over training and at its end (Spec E6, E7, F5)."""
+"""Figure 6: what agents achieve on layouts that no data came from, over training and at its end."""
 
 import json
 from collections.abc import Mapping
@@ -117,7 +117,7 @@ def episode_numbers(succeeded: Bools) -> dict[str, float]:
 
 
 def run_numbers(episodes: Episodes, shortest_path: int | None) -> dict[Any, float]:
-    """Spec F5: the numbers of one run, over its last ``LAST`` training episodes at most; NaN without episodes.
+    """The numbers of one run, over its last ``LAST`` training episodes at most; NaN without episodes.
 
     ``shortest_path``: primitive steps from the start to the goal at least; None or 0 where unknown. ``steps_to_95``:
     the first step at which 95 % of the last ``LAST`` had succeeded; NaN: never, or too few.

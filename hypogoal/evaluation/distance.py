@@ -1,4 +1,4 @@
-"""Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders (Spec F3, F4)."""
+"""Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders."""
 
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -41,7 +41,7 @@ STOP = ["room", "column", "row", "fate"]  # where an execution stopped, in the p
 
 
 def last_executions(executions: Executions) -> DataFrame:
-    """Spec F3: the last executions of each option, a row each, with what they count.
+    """The last executions of each option, a row each, with what they count.
 
     ``counted``, the distance, is 300 where it began inside its own termination set; ``reached_base``: it stopped within
     4 of a true base and did not begin inside; ``timed_out``: neither classifier nor death ended it; ``fate`` as in
@@ -60,7 +60,7 @@ def last_executions(executions: Executions) -> DataFrame:
 
 
 def option_numbers(executions: Executions) -> DataFrame:
-    """Spec F3: a row for each option with the numbers of its last executions; no deviation of one execution.
+    """A row for each option with the numbers of its last executions; no deviation of one execution.
 
     Units: the domain's; duration in steps; shares of executions.
     """
@@ -74,7 +74,7 @@ def option_numbers(executions: Executions) -> DataFrame:
 
 
 def rows(work):
-    """Spec F3: every member's option on every ladder; where the first seed's stop, for Figure 5, goes to the arrays."""
+    """Every member's option on every ladder; where the first seed's stop, for Figure 5, goes to the arrays."""
     ladders = work.ranked(work.contents.ladders)
     first = min((artefact.seed for artefact in ladders), default=0)
     for artefact in ladders:
@@ -98,10 +98,10 @@ def rows_of_ladder(
     validated: Mapping[str, float | None],
     place: Mapping[str, Any],
 ) -> Iterator[DataFrame]:
-    """Spec F3: one options artefact, trained from one start (a ladder) on G sub-goals with K members each.
+    """One options artefact, trained from one start (a ladder) on G sub-goals with K members each.
 
     Per sub-goal each member's numbers; the best member (the least mean distance), the worst, and the validated one.
-    Where ``mask_reached``, options that would begin inside were not offered (Spec D6): they count 300.
+    Where ``mask_reached``, options that would begin inside were not offered: they count 300.
     """
     options = options_of(config)
     every = option_numbers(executions).reindex(range(len(options))).set_axis(options)
@@ -136,7 +136,7 @@ def _write_stops(
 
 
 def context(results):
-    """Spec F3, Figure 4: each seed's mean over the run's ladders of the best, validated, mean and worst member.
+    """Figure 4: each seed's mean over the run's ladders of the best, validated, mean and worst member.
 
     And the best member's shares. A seed that lacks a ladder is left out: unlike ladders are not averaged. Compared is
     ladder by ladder, but oracle terminations, which have no members to choose among.

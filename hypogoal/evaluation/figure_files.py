@@ -1,4 +1,4 @@
-"""Spec F: the paper's figures as files of their own."""
+"""The paper's figures as files of their own."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Trained agents play on, and nothing is learned: the first n episodes of every environment (Spec H2, H6, F5).
+"""Trained agents play on, and nothing is learned: the first n episodes of every environment.
 
 Episodes differ in length, and the failed ones are the longest. Of all episodes that end within a number of steps too
 many are short, so every environment plays the same number of episodes, however long they take.

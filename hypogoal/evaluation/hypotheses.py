@@ -1,4 +1,4 @@
-"""How good hypotheses are on layouts that no data came from, and how much members differ (Spec F1, F2, H1).
+"""How good hypotheses are on layouts that no data came from, and how much members differ.
 
 Also whatever their thresholds, and without the luck of picking the best; and which planted features they have found.
 """
@@ -36,7 +36,7 @@ KNOWN = ("ranking", *CROSS_FITTED, "at_best_threshold", "calibration_gap")
 
 
 def look(work, judgement):
-    """Spec F1, F2: what members know and how much they disagree, and which one labelled rooms pick."""
+    """What members know and how much they disagree, and which one labelled rooms pick."""
     place, judged = work.place_of(judgement), judgement.judged
     for rows in rows_of(judged):
         yield rows.assign(**place)
@@ -48,7 +48,7 @@ def look(work, judgement):
 
 
 def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
-    """Spec F1, F2: K members on N held-out states, in each scope: all, or by whether training saw the room.
+    """K members on N held-out states, in each scope: all, or by whether training saw the room.
 
     Planted features are scopes, too, in which they are the truth.
     """
@@ -109,7 +109,7 @@ def knowledge(judged: Judged, inside: Bools, contexts: Ints | None) -> tuple[dic
 
 
 def choose(predictions: Bools, labels: Bools, seen: Ints) -> dict[str, float | None]:
-    """Spec F1: the member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
+    """The member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
 
     The first of equally good ones, since their order is random; None where those rooms lack a class.
     """
@@ -120,7 +120,7 @@ def choose(predictions: Bools, labels: Bools, seen: Ints) -> dict[str, float | N
 
 
 def coverage(probabilities: Floats, planted: Mapping[str, Ints]) -> float:
-    """Spec H1: the share of planted features (N,) that some member (N, K) has found: it ranks by it, and by no other.
+    """The share of planted features (N,) that some member (N, K) has found: it ranks by it, and by no other.
 
     Every combination of features is equally frequent, so an area under the ROC curve of .5 is blindness to a feature.
     NaN where some combination is missing: who ranks by one feature then ranks by another, too.

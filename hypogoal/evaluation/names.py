@@ -1,4 +1,4 @@
-"""What ensembles and agents are called: made once, when a run is evaluated, as people read it (Spec F5).
+"""What ensembles and agents are called: made once, when a run is evaluated, as people read it.
 
 Runs that were not made alike are never averaged: they have different names.
 """
@@ -50,7 +50,7 @@ def ensemble_title(config: Values) -> str:
 
 
 def agent_title(kind: str, config: Values) -> str:
-    """Spec E6, E7: an agent by how it chooses and what ends its options."""
+    """An agent by how it chooses and what ends its options."""
     if kind == "baseline":
         return f"{config['agent'].upper()} {config['setting']}"
     if kind == "options":

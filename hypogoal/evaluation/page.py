@@ -1,4 +1,4 @@
-"""What a page and a terminal's tables are made from: results, how numbers are written, templates, pictures (Spec F7).
+"""What a page and a terminal's tables are made from: results, how numbers are written, templates, pictures.
 
 Every sentence is in ``templates/``; a question gives its template what it computed.
 """

@@ -1,4 +1,4 @@
-"""States as pictures (Spec F2, F7): single ones, attributions over them, many over each other."""
+"""States as pictures: single ones, attributions over them, many over each other."""
 
 import io
 from typing import Any

@@ -1,4 +1,4 @@
-"""What everything was made from and with (Spec A8)."""
+"""What everything was made from and with."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ KEPT = {"kind", "seed", "config", "inputs", "command", "versions"}  # of a manif
 
 
 def provenance(contents: Contents) -> dict[str, Any]:
-    """Spec A8: what everything was made from and with."""
+    """What everything was made from and with."""
     artefacts = []
     for artefact in (*contents.everything(), *contents.continued):
         kept = artefact.manifest.model_dump(include=KEPT)

@@ -169,7 +169,7 @@ def sentences(results: Results) -> list[str]:
 
 
 def render(results: Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
-    """Spec F7: the page of a run, self-contained, with the figures of :func:`answers`."""
+    """The page of a run, self-contained, with the figures of :func:`answers`."""
     return page.render(
         "run.html",
         title=f"hypogoal: {results.facts['run']}",

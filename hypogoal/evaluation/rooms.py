@@ -1,4 +1,4 @@
-"""Figure 3: members on rooms that training did and did not see, for each number of labelled ladder groups (Spec F1).
+"""Figure 3: members on rooms that training did and did not see, for each number of labelled ladder groups.
 
 The paper scores the best member on files that hold training rooms too, and picks it on the same files. Here every
 score stands on unseen rooms and on all rooms, and beside the best member are the mean, the worst and the one that the
@@ -37,7 +37,7 @@ PANELS = {  # of Figure 3, and what it takes no seeing to score
 
 
 def context(results):
-    """Spec F1, F2: members' scores and disagreement, and what a member that is never positive has; Figure 3."""
+    """Members' scores and disagreement, and what a member that is never positive has; Figure 3."""
     by_room = results.of(scope="unseen")["artefact"]
     if by_room.empty:
         return {}

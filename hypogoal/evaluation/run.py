@@ -1,6 +1,6 @@
-"""What a run holds: which artefacts are evaluated, their tables, and the evaluation as read back (Spec A5, A8).
+"""What a run holds: which artefacts are evaluated, their tables, and the evaluation as read back.
 
-A damaged file is refused in one line (Spec G2).
+A damaged file is refused in one line.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""What members look at in held-out states: Figures 2 and 9, and a gallery (Spec F2, F6)."""
+"""What members look at in held-out states: Figures 2 and 9, and a gallery."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Figures 7 and 8: which members the meta-policy prefers, and where their options stop (Spec F6)."""
+"""Figures 7 and 8: which members the meta-policy prefers, and where their options stop."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
@@ -33,7 +33,7 @@ NUMBERS = (*COUNTS, "duration", "preference", "match")  # of an option
 
 
 def rows(work):
-    """Spec F6: the choices of every run of each agent whose options are members, and how well these match the truth."""
+    """The choices of every run of each agent whose options are members, and how well these match the truth."""
     judged = cache(on_layout)
     for artefact in work.contents.agents:
         work.progress.advance()
@@ -50,7 +50,7 @@ def rows(work):
 
 
 def numbers_of_choices(choices: ChoiceCounts, options: int) -> dict[str, Doubles]:
-    """Spec F6: how often each option was offered, chosen, reached; its mean duration in steps; ``preference``, (O,).
+    """How often each option was offered, chosen, reached; its mean duration in steps; ``preference``, (O,).
 
     A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered
     always. Preference is chosen / expected, 1 for a chooser that does not care, NaN for an option never offered;
@@ -68,7 +68,7 @@ def on_layout(
 ) -> tuple[Doubles, dict[int, Bytes]]:
     """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met.
 
-    Returns of each option (G*K,) its balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal but
+    Returns of each option (G*K,) its balanced accuracy, NaN where the domain does not have the sub-goal but
     the user's own labels do: its truth is unknown there; and of options that are positive anywhere, where states are
     pictures, an :func:`overlay` of these.
     """

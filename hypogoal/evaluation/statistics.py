@@ -1,4 +1,4 @@
-"""Spec F5: means over runs, intervals that hold as often as they say, pairs of runs, and equality up to rounding."""
+"""Means over runs, intervals that hold as often as they say, pairs of runs, and equality up to rounding."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ def tables_of(
 
 
 def over(runs: DataFrame, by: Sequence[str]) -> DataFrame:
-    """Spec F5: a row of statistics for each combination of ``by`` and each quantity of :func:`table.per_run`.
+    """A row of statistics for each combination of ``by`` and each quantity of :func:`table.per_run`.
 
     The values are layouts, each by the mean of its runs or, with one layout, the runs. Columns: ``by``, ``quantity``,
     mean, standard_error and standard_deviation (n - 1); estimate, the mean of shares and the median of all else, and
@@ -69,7 +69,7 @@ def statistics(runs: DataFrame) -> dict[str, Any]:
 
 
 def interval(values: Doubles, *, are_shares: bool) -> tuple[float, float]:
-    """Spec F5: a 95 % interval of (n,) independent values; NaN where there are too few.
+    """A 95 % interval of (n,) independent values; NaN where there are too few.
 
     Of shares, from ``SHARES_FROM`` on, that of :func:`bounded`; of all else, from ``MEDIANS_FROM`` on, that of
     :func:`median_bounds`.
@@ -111,7 +111,7 @@ def median_bounds(values: Doubles) -> tuple[float, float]:
 
 
 def pairs(runs: DataFrame) -> DataFrame:
-    """Spec F5: the first method against each other by each quantity, at each N, over runs that share ``SHARED``.
+    """The first method against each other by each quantity, at each N, over runs that share ``SHARED``.
 
     Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Columns: N,
     quantity, first, second, and those of :func:`compare`.
@@ -140,7 +140,7 @@ def paired(
 
 
 def compare(both: DataFrame, unit: str = "layout") -> dict[str, Any]:
-    """Spec F5: the first of two methods against the second over n pairs of runs, see :func:`paired`.
+    """The first of two methods against the second over n pairs of runs, see :func:`paired`.
 
     Pairs of one unit (a column: the layout, or the seed where there is one layout) are not independent: everything but
     the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.

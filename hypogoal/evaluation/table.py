@@ -1,4 +1,4 @@
-"""The one table of results: its columns, how numbers become its rows, and each run's final values (Spec F5, H7)."""
+"""The one table of results: its columns, how numbers become its rows, and each run's final values."""
 
 import tomllib
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""The first thing on a page: what the task is, and whether hypotheses mattered there, by one rule (Spec F7, I1).
+"""The first thing on a page: what the task is, and whether hypotheses mattered there, by one rule.
 
 Two comparisons say so: the agent with uniform-random choice among its own options (did choosing matter?), and an agent
 with several members with one that has a single classifier (did hypotheses matter?). On ladders the second is of the

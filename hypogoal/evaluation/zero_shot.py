@@ -1,4 +1,4 @@
-"""Trained agents, and each of their options alone, on layouts that they are given: nothing is learned there (Spec H6).
+"""Trained agents, and each of their options alone, on layouts that they are given: nothing is learned there.
 
 What limits an agent, its options tell: they stop at a false positive of their member, or get nowhere in time.
 """

@@ -20,7 +20,7 @@ BASELINES = {
     "dqn-tuned": "--agent dqn --set setting=tuned",
 }
 COMPARED = "agents on primitive actions"
-PRETRAIN = "train-options before train-meta; false is the paper's D5"
+PRETRAIN = "train-options before train-meta; false is the paper's"
 LADDERS = {
     "dbat": "--set diversity=dbat",
     "none": "--set diversity=none",

@@ -1,4 +1,4 @@
-"""Experiments, by name: one that comes with hypogoal, a TOML file, a function of one's own (Spec A6, G4).
+"""Experiments, by name: one that comes with hypogoal, a TOML file, a function of one's own.
 
 They are generators of (name, command) whose keyword arguments are settings.
 

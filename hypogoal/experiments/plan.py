@@ -1,4 +1,4 @@
-"""From the name of an experiment to its cells (Spec A6, G4)."""
+"""From the name of an experiment to its cells."""
 
 import re
 import shlex

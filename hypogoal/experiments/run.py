@@ -1,4 +1,4 @@
-"""A run of cells: begun, made anew in part, gone on with, on this machine or by Slurm (Spec A6, G1, G4, I7)."""
+"""A run of cells: begun, made anew in part, gone on with, on this machine or by Slurm."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""Cells as Slurm job arrays (Spec G4): Slurm decides where and when, what is on the disk says what is done.
+"""Cells as Slurm job arrays: Slurm decides where and when, what is on the disk says what is done.
 
 There is an array for the cells of a stage. It begins when the arrays that it reads have ended, successfully or not
 (``afterany``). Slurm's accounting is not needed. A cell saves before its time limit and is

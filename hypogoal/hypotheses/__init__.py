@@ -1,1 +1,1 @@
-"""Hypotheses: what a sub-goal may depend on. Member networks, ensembles, and their training (Spec C)."""
+"""Hypotheses: what a sub-goal may depend on. Member networks, ensembles, and their training."""

@@ -15,7 +15,7 @@ LABELS: Final = "labels"  # the share of positives that the labelled states have
 
 
 class MembersConfig(Config):
-    """The members and their training but for the weight of diversity. Spec C6: the defaults are DoorKey's (Table 3)."""
+    """The members and their training but for the weight of diversity. The defaults are DoorKey's (Table 3)."""
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(

@@ -1,4 +1,4 @@
-"""What a member looks at in a state: DeepLift attributions, and a check that they are complete (Spec F2, Figures 2, 9).
+"""What a member looks at in a state: DeepLift attributions, and a check that they are complete (Figures 2, 9).
 
 Members with layers for which DeepLift has no valid rules are explained by integrated gradients (Sundararajan et al.
 2017): means over ``STEPS`` states between the baseline and the state, complete up to the error of so few steps.
@@ -50,7 +50,7 @@ class Attributions:
     method: str
 
     def completeness_error(self) -> Doubles:
-        """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
+        """|sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
         sums = self.values.reshape(*self.log_odds.shape, -1).sum(-1)
         return np.abs(sums - (self.log_odds - self.baseline_log_odds))
 
@@ -102,7 +102,7 @@ def attributed(
     observations: Observations,
     baseline: Observations,
 ) -> Attributions:
-    """Spec F2: every member's attributions, by the method valid for it.
+    """Every member's attributions, by the method valid for it.
 
     DeepLift has the rescale rule (Shrikumar et al. 2017), and computes in double, where rounding does not matter.
     ``observations`` are the members' view of a few states (n, ...), compared with ``baseline`` (...).

@@ -167,7 +167,7 @@ class Ensemble(nn.Module):
         observations: Observations,
         against: Observations,
     ) -> Floats:
-        """Spec F2, Figure 2: what each member looks at in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
+        """Figure 2: what each member looks at in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
 
         The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
         (N, K, *the shape of the view; (H, W, C) for pictures) in log-odds: a state's sum is its log-odds minus the

@@ -1,4 +1,4 @@
-"""Which unlabelled states to label next: those where members disagree, common ones, unlike each other (Spec I6)."""
+"""Which unlabelled states to label next: those where members disagree, common ones, unlike each other."""
 
 import numpy as np
 from scipy.spatial import KDTree

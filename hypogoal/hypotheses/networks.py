@@ -1,4 +1,4 @@
-"""Spec C5: member networks, chosen by name.
+"""Member networks, chosen by name.
 
 Each is an ``nn.Sequential`` from :func:`inputs_of`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2), with
 "positive" in column 1. Built-in networks consist of plain modules used once, each ReLU before its MaxPool: DeepLift is
@@ -55,7 +55,7 @@ def _convolution(
 
 
 def doorkey(channels: int) -> Parts:
-    """Spec C5: DoorKey, two convolutions (+ BatchNorm + ReLU) and three dense layers; from 41x41 pixels.
+    """DoorKey, two convolutions (+ BatchNorm + ReLU) and three dense layers; from 41x41 pixels.
 
     Source: the paper's appendix; sizes from the authors' code (minigrid_cnn.py).
     """
@@ -69,7 +69,7 @@ def doorkey(channels: int) -> Parts:
 
 
 def montezuma(channels: int) -> Parts:
-    """Spec C5: Montezuma, three convolutions (+ BatchNorm + ReLU) and two dense layers; from 36x36 pixels.
+    """Montezuma, three convolutions (+ BatchNorm + ReLU) and two dense layers; from 36x36 pixels.
 
     Source: the paper's appendix; sizes from the authors' code (monte_cnn.py).
     """

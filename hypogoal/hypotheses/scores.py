@@ -1,4 +1,4 @@
-"""How well members predict the true sub-goal (Spec F1), also whatever their thresholds, and how they differ (F2)."""
+"""How well members predict the true sub-goal, also whatever their thresholds, and how they differ."""
 
 import math
 
@@ -10,7 +10,7 @@ SAME = 0.99  # of unlabelled states: a member that predicts so many as another o
 
 
 def member_scores(predictions: Bools, labels: Bools) -> dict[str, Doubles]:
-    """Spec F1: every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
+    """Every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
 
     Undefined scores are NaN: recall without positives, balanced accuracy without positives or negatives, precision
     without positive predictions, any score without states.
@@ -104,7 +104,7 @@ def ratio(numerator: Array, denominator: Array) -> Doubles:
 
 
 def best_mean_worst(scores: Doubles) -> dict[str, float]:
-    """Spec F1: best, mean and worst of members' scores (K,) without undefined ones; NaN if none is defined."""
+    """Best, mean and worst of members' scores (K,) without undefined ones; NaN if none is defined."""
     defined = scores[~np.isnan(scores)]
     if not len(defined):
         defined = np.array([math.nan])
@@ -119,7 +119,7 @@ def most_and_least(values: Doubles) -> tuple[int | None, int | None]:
 
 
 def mean_disagreement(predictions: Bools) -> float:
-    """Spec F2: from predictions (N, K), the share of states on which two members differ, mean over pairs of members.
+    """From predictions (N, K), the share of states on which two members differ, mean over pairs of members.
 
     NaN for a single member or without states.
     """

@@ -1,4 +1,4 @@
-"""The ensemble of one sub-goal: checked, trained with a log, written, and judged for a first time (Spec A2)."""
+"""The ensemble of one sub-goal: checked, trained with a log, written, and judged for a first time."""
 
 import contextlib
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The training of one sub-goal's ensemble: from states to trained members with thresholds, resumable (Spec C3, C4).
+"""The training of one sub-goal's ensemble: from states to trained members with thresholds, resumable.
 
 :mod:`hypogoal.hypotheses.fit` has the loop and its words.
 """
@@ -110,7 +110,7 @@ class EnsembleTraining(Resumable):
     def steps(self) -> Iterator[tuple[int, Losses]]:
         """Take the steps that are left, then set thresholds; yields each step's number and losses.
 
-        ``NumericalError``, Spec G3: a loss is NaN or Inf; the message names the member and the step.
+        ``NumericalError``: a loss is NaN or Inf; the message names the member and the step.
         """
         device = self.states.device
         devices = [device] if device.type == "cuda" else []

@@ -1,1 +1,1 @@
-"""Import of what users have: arrays, pictures, recorded episodes, tables of labels (Spec B6, I6)."""
+"""Import of what users have: arrays, pictures, recorded episodes, tables of labels."""

@@ -1,4 +1,4 @@
-"""What labels states: the rules of ``--label`` for episodes, and tables that people fill in (Spec I6)."""
+"""What labels states: the rules of ``--label`` for episodes, and tables that people fill in."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

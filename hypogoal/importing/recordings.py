@@ -1,4 +1,4 @@
-"""Readers of recorded episodes: Minari, robomimic's HDF5, folders of films, and LeRobotDataset (Spec I6).
+"""Readers of recorded episodes: Minari, robomimic's HDF5, folders of films, and LeRobotDataset.
 
 A LeRobotDataset, formats v2.1 and v3.0, has tables in parquet, frames in films or in the tables, facts in ``meta/``. In
 v2.1 each episode has files of its own, in v3.0 many episodes share files, and ``meta/episodes/`` says where in a film

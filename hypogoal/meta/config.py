@@ -1,4 +1,4 @@
-"""Settings of agents: where options are played, how the meta-policy learns (Spec D, E).
+"""Settings of agents: where options are played, how the meta-policy learns.
 
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """

@@ -1,4 +1,4 @@
-"""Episodes of a trained agent: frame by frame for films, and as data for other software (Spec D1, E1)."""
+"""Episodes of a trained agent: frame by frame for films, and as data for other software."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""How near executions of options come to their true sub-goals, where the domain knows them (Spec F3, H5)."""
+"""How near executions of options come to their true sub-goals, where the domain knows them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
+"""Actor and critic over options, and the two ways an option is drawn from the actor's output."""
 
 from abc import ABC, abstractmethod
 

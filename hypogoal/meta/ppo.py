@@ -1,4 +1,4 @@
-"""The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
+"""The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

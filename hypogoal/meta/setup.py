@@ -82,7 +82,7 @@ def assemble(
 
 
 def make_engine(setup: Setup, layouts: Layouts | None = None) -> Engine:
-    """Spec D4, H6: environments that begin episodes where the settings say, or in these ``layouts``."""
+    """Environments that begin episodes where the settings say, or in these ``layouts``."""
     domain, config = setup.domain, setup.config
     if layouts is None and config.layouts.strip():
         seeds = layout_seeds(config.layouts, config.layout_seed)

@@ -1,4 +1,4 @@
-"""Returns and advantages of decisions that last several steps (Spec E1)."""
+"""Returns and advantages of decisions that last several steps."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def smdp_advantages(
     ended: Bools,
     trace: float,
 ) -> Doubles:
-    """Spec E1: generalised advantages of consecutive decisions of one environment.
+    """Generalised advantages of consecutive decisions of one environment.
 
     delta_t = R_t + gamma^tau_t (1 - terminated_t) V(s'_t) - V(s_t);
     A_t = delta_t + gamma^tau_t lambda (1 - ended_t) A_{t+1}.

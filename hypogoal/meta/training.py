@@ -25,7 +25,7 @@ def train(
     checkpoints: Checkpoints,
     until: float = 0.0,
 ) -> bool:
-    """Step ``loop`` for ``steps`` more environment steps, from the last checkpoint on if there is one (Spec G1).
+    """Step ``loop`` for ``steps`` more environment steps, from the last checkpoint on if there is one.
 
     It ends earlier once a share ``until`` of the last episodes has succeeded (0: never); returns whether it has.
     """

@@ -1,4 +1,4 @@
-"""Who chooses options, and how ``train-options`` and the lower control do it, without learning which (Spec D4, E6)."""
+"""Who chooses options, and how ``train-options`` and the lower control do it, without learning which."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Chooser(Part, ABC):
 
 
 class RandomChooser(Chooser):
-    """Spec E6: uniform choice among the options offered, the lower control and the way of ``train-options``."""
+    """Uniform choice among the options offered, the lower control and the way of ``train-options``."""
 
     CHANGING = ("rng",)
 
@@ -104,7 +104,7 @@ class RandomChooser(Chooser):
 
 
 class EvenChooser(Chooser):
-    """Spec D4: the offered option that has had the fewest steps so far, ties broken by ``rng``.
+    """The offered option that has had the fewest steps so far, ties broken by ``rng``.
 
     Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
     """

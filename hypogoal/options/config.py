@@ -1,4 +1,4 @@
-"""Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
+"""Settings of option learning, with the light recipe as defaults and the paper's values in its preset."""
 
 from hypogoal.core.config import OWN, Config, part, setting
 

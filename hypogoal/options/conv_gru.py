@@ -1,4 +1,4 @@
-"""Option learning as in the paper: a conv-GRU network and a replay of its own for each member (Spec D2, D3).
+"""Option learning as in the paper: a conv-GRU network and a replay of its own for each member.
 
 A state's *window* is the last ``recurrence`` states of its option's execution, itself the last. The GRU reads a window
 from its first state on, with nothing remembered; so it does in acting, in learning, and in what is loaded. A window of
@@ -127,7 +127,7 @@ class Member(double_dqn.DoubleDQN):
 
 
 class PaperPolicies:
-    """Greedy policies of saved options that have a network each (Spec D2, D8)."""
+    """Greedy policies of saved options that have a network each."""
 
     def __init__(self, options: saved.SavedOptions):
         self.recurrence = options.config["recurrence"]

@@ -31,7 +31,7 @@ def double_q_targets(
     *,
     bounded: bool = False,
 ) -> Tensor:
-    """Spec D2: r + gamma (1 - terminal) Q_target(s', argmax_a Q_online(s', a)).
+    """Return r + gamma (1 - terminal) Q_target(s', argmax_a Q_online(s', a)).
 
     Args:
         rewards: float (...,).
@@ -98,7 +98,7 @@ class DoubleDQN(Resumable):
         options: Sequence[int],
         step: int,
     ) -> Updated:
-        """Spec D2: a step down the Huber loss of a batch; then the target network follows.
+        """A step down the Huber loss of a batch; then the target network follows.
 
         ``values`` are the online network's in the states, with gradients; ``next_online`` and ``next_target`` both
         networks' in the next states; all float (n, O, A). ``options`` (O,) and ``step`` are for errors.
@@ -108,7 +108,7 @@ class DoubleDQN(Resumable):
         )
         gamma, bounded = self.config.option_gamma, self.config.bounded_values
         ahead = steps[:, None].float()
-        rewards = reached.float() * gamma ** (ahead - 1)  # Spec D1: 1 where the option's own classifier is positive
+        rewards = reached.float() * gamma ** (ahead - 1)  # 1 where the option's own classifier is positive
         terminal = reached | terminated[:, None]
         targets = double_q_targets(rewards, terminal, next_online, next_target, gamma**ahead, bounded=bounded)
         taken = values.gather(2, actions[:, None, None].expand(-1, len(options), 1)).squeeze(2)
@@ -150,7 +150,7 @@ def descend(
     where: str,
     largest: float = math.inf,
 ) -> None:
-    """Spec G3: a step of ``optimiser`` down a loss, with its weights' gradients cut to the norm ``largest``.
+    """A step of ``optimiser`` down a loss, with its weights' gradients cut to the norm ``largest``.
 
     A loss or gradient with NaN or Inf is a ``NumericalError`` that names ``owner`` and ``where``; the weights stay.
     """

@@ -78,7 +78,7 @@ class Options:
         return ensemble.log_odds(observation[None])[:, option % self.members]
 
     def offered(self, observation: Observations) -> Bools:
-        """Spec D6: which options may start in an observation (*obs): bool (G*K,)."""
+        """Which options may start in an observation (*obs): bool (G*K,)."""
         if not self.mask_reached:
             return np.ones(self.count, bool)
         log_odds = [ensemble.log_odds(observation[None]) for ensemble in self.ensembles]
@@ -86,7 +86,7 @@ class Options:
 
 
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """A Gymnasium environment whose actions are options (Spec E1): ``Discrete(G*K)``.
+    """A Gymnasium environment whose actions are options: ``Discrete(G*K)``.
 
     One step runs an option until its rule says so (by default: its classifier is positive), its time is up or the
     episode ends. The reward is the sum of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so
@@ -141,7 +141,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, info
 
     def action_masks(self) -> Bools:
-        """Spec D6: which options may start here, bool (G*K,)."""
+        """Which options may start here, bool (G*K,)."""
         if self._masks is None:
             self._masks = self.options.offered(self._current())
         return self._masks.copy()

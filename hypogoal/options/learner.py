@@ -1,4 +1,4 @@
-"""What all learners of intra-option policies do: act, explore, count, and keep it in artefacts (Spec D2, D8)."""
+"""What all learners of intra-option policies do: act, explore, count, and keep it in artefacts."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -78,7 +78,7 @@ class Learner(Part, ABC):
         self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), int)
         self.build(config, seed)
         reach = self.reach(config, self.options)
-        if engine.memory is not None and reach > engine.memory:  # Spec D3
+        if engine.memory is not None and reach > engine.memory:
             replay = config.part(LearnerConfig).replay
             raise UserError(
                 f"the replay reaches back {reach} states, the engine remembers {engine.memory}",

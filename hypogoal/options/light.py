@@ -1,4 +1,4 @@
-"""Light option learning: one trunk, a head per member, every step a lesson for every member (Spec D1, D2, D8).
+"""Light option learning: one trunk, a head per member, every step a lesson for every member.
 
 Double DQN with prioritised replay over state ids. With ``experience=shared`` every member learns from each transition,
 with its own reward, unless the transition starts inside its sub-goal. With ``experience=own`` (the paper) only the

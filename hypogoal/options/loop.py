@@ -1,4 +1,4 @@
-"""Options at work: many environments, each running one option at a time (Spec A3, A4, D1, D6, E1, E5).
+"""Options at work: many environments, each running one option at a time.
 
 The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. It works in these steps:
 
@@ -19,7 +19,7 @@ An execution ends at the first of three things. They are not exclusive, and each
   ``truncated``: the episode is cut, at its ``max_episode_steps`` or at its cap. That is no terminal state, so the
   value of the state counts for both policies, but the trace of the policy over options ends.
 
-With ``restart_options`` (Spec D4) the end of an execution is that of its episode, too: the episode counts as cut.
+With ``restart_options`` the end of an execution is that of its episode, too: the episode counts as cut.
 With ``experience=shared`` every member of a sub-goal learns from a step, each by its own prediction of the state.
 """
 
@@ -43,7 +43,7 @@ NONE = -1
 
 
 def offered_options(predictions: Bools) -> Bools:
-    """Spec D6: options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
+    """Options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
     offered = ~predictions
     offered[~offered.any(1)] = True
     return offered

@@ -1,4 +1,4 @@
-"""Q-networks of the intra-option policies (Spec D2): a small one on cells, or on pictures."""
+"""Q-networks of the intra-option policies: a small one on cells, or on pictures."""
 
 from typing import Any
 
@@ -202,7 +202,7 @@ class LightNetwork(nn.Module):
 
 
 class LightQNetwork(LightNetwork):
-    """One trunk and a head per member (Spec D8): values float32 (N, members, actions) of every member's policy."""
+    """One trunk and a head per member: values float32 (N, members, actions) of every member's policy."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Options that are planned and not learned: the shortest way to where each member is positive, exactly (Spec H3).
+"""Options that are planned and not learned: the shortest way to where each member is positive, exactly.
 
 Where an engine knows what follows on each action, what an option does is a matter of its sub-goal alone. So an agent
 whose options are planned shows what its hypotheses are worth, whatever option learning makes of them.

@@ -1,4 +1,4 @@
-"""What happened while options were played: episodes, choices, where options stopped (Spec E5, F3, F4, F5, F6)."""
+"""What happened while options were played: episodes, choices, where options stopped."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -184,7 +184,7 @@ class Recorder(Resumable):
         near: Callable[[Ints, Ints], Bools],
         log_odds: Callable[[Ints, Ints], Floats],
     ) -> None:
-        """Spec H5: ``exploits.csv`` into ``folder``, of the same executions: how sure its own classifier was at most.
+        """``exploits.csv`` into ``folder``, of the same executions: how sure its own classifier was at most.
 
         Of states (n,) and the options (n,) that came to them ``near`` says whether these options' true sub-goals hold
         there, or nearly, ``log_odds`` how sure their classifiers are. A cell is empty where there was no such state.

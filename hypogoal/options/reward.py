@@ -1,4 +1,4 @@
-"""Sub-goal classifiers as rewards and ends of episodes for any agent, without an engine (Spec D1, I6)."""
+"""Sub-goal classifiers as rewards and ends of episodes for any agent, without an engine."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def ensemble_at(path: Path, sub_goal: str) -> Ensemble:
 
 
 class SubgoalReward:
-    """A sub-goal's classifier as a reward (Spec D1): a function of observations, which environments can be wrapped in.
+    """A sub-goal's classifier as a reward: a function of observations, which environments can be wrapped in.
 
     Args:
         source: an ensemble artefact's folder, or an ensemble from :func:`hypogoal.load_ensemble`.

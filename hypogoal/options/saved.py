@@ -1,4 +1,4 @@
-"""Greedy policies of options in an artefact, without an engine (Spec D2, D8)."""
+"""Greedy policies of options in an artefact, without an engine."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The tables of trained agents and options, each one class that writes and reads its CSV file (Spec E5, F3, F5, H5)."""
+"""The tables of trained agents and options, each one class that writes and reads its CSV file."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Episodes(Table):
     length: Ints  # steps
     reward: Doubles  # undiscounted
     terminated: Bools  # it reached a terminal state; else it was cut at the cap
-    # Spec F5: as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
+    # as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
     succeeded: Bools
 
     def last(self) -> Episodes:

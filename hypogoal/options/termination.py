@@ -1,4 +1,4 @@
-"""What decides that an option ends: a rule, which every loop that plays options asks (Spec D1, D2, H4).
+"""What decides that an option ends: a rule, which every loop that plays options asks.
 
 An execution ends at the first of three things (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance`` and
 ``OptionEnv.step``): its sub-goal is reached, as :meth:`TerminationRule.reached` says; it has taken ``option_timeout``
@@ -171,7 +171,7 @@ def saved_rule(termination: str, weights: Mapping[str, torch.Tensor], options: i
 
 
 def oracle_terminations(engine: Engine, columns: Sequence[int]) -> Terminations:
-    """Spec E6: one option for each of these sub-goals, by number, that ends where it is true; an upper bound."""
+    """One option for each of these sub-goals, by number, that ends where it is true; an upper bound."""
     return Terminations.of_predictions(lambda ids: engine.labels(ids)[:, columns], len(columns), engine.count)
 
 
@@ -182,7 +182,7 @@ def learned_terminations(
     running_only: bool = False,
     rule: str = "learned",
 ) -> Terminations:
-    """Spec D1: option g*K + k ends at a positive prediction of member k of sub-goal g's ensemble, of G with K members.
+    """Option g*K + k ends at a positive prediction of member k of sub-goal g's ensemble, of G with K members.
 
     ``running_only``: states are classified for the running options only, which costs a K-th.
     ``rule``: see :func:`load_rule`.

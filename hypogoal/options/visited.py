@@ -1,4 +1,4 @@
-"""Spec B7: states that a policy visited while it learned, kept to train ensembles with."""
+"""States that a policy visited while it learned, kept to train ensembles with."""
 
 from hashlib import blake2b
 from pathlib import Path
@@ -75,7 +75,7 @@ class Visited(Resumable):
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:
-    """Spec B7: the file of unlabelled states: ``path``, or the file of an artefact with visited states.
+    """The file of unlabelled states: ``path``, or the file of an artefact with visited states.
 
     No such file, or one of another domain or shape than ``dataset``, is a ``UserError``.
     """

@@ -1,4 +1,4 @@
-"""Spec A1, B3: collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
+"""Collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
 
 from typing import Annotated, Any
 

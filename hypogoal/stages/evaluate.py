@@ -1,4 +1,4 @@
-"""Spec A5, F: every number of the report, from whatever artefacts a run has; what is missing is named."""
+"""Every number of the report, from whatever artefacts a run has; what is missing is named."""
 
 from pathlib import Path
 from typing import Annotated

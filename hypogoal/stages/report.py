@@ -1,4 +1,4 @@
-"""Spec A5, F7: draw an evaluated run as one self-contained HTML page, and its figures as files."""
+"""Draw an evaluated run as one self-contained HTML page, and its figures as files."""
 
 from itertools import chain
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Spec A7, E7: train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
+"""Train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
+"""Train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -36,7 +36,7 @@ def train_ensemble(
 ) -> Done:
     """Train diverse classifiers (members) of each sub-goal.
 
-    Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
+    ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
     of those of ``data``. Each sub-goal has a progress line and a folder of TensorBoard's of its own.
     """
     from hypogoal.core.processes import allowed, in_processes

@@ -1,6 +1,6 @@
-"""Spec A4, D5, E: learn the meta-policy over all options while their policies go on learning.
+"""Learn the meta-policy over all options while their policies go on learning.
 
-Without ``--options`` the policies start fresh (the paper's D5); with it they continue, and the steps already spent
+Without ``--options`` the policies start fresh, as in the paper; with it they continue, and the steps already spent
 count in every curve.
 """
 

@@ -1,4 +1,4 @@
-"""Spec A3: learn every member's option policy while options are chosen at random, for a time or until that succeeds."""
+"""Learn every member's option policy while options are chosen at random, for a time or until that succeeds."""
 
 from pathlib import Path
 from typing import Annotated, Any

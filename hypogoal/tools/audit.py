@@ -1,4 +1,4 @@
-"""Spec H5: how often policies fool a success classifier, where, and what a mend changes."""
+"""How often policies fool a success classifier, where, and what a mend changes."""
 
 import json
 from functools import partial

@@ -1,4 +1,4 @@
-"""Spec I6: an audit of recorded data, without a simulator."""
+"""An audit of recorded data, without a simulator."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def audited(
     sub_goal: str | None,
     member: int | None,
 ) -> tuple[list[str], dict[str, float | None]]:
-    """Spec I6: an audit without a simulator, of a function or of all members of an ensemble; else as in play.
+    """An audit without a simulator, of a function or of all members of an ensemble; else as in play.
 
     ``out`` gets ``audit.json``, the page ``index.html`` and, for each sub-goal (or the named one), ``next/SUB_GOAL/``.
     """

@@ -1,4 +1,4 @@
-"""Several evaluated runs side by side: whether they can be compared, what differs, and who wins (Spec F5, F7)."""
+"""Several evaluated runs side by side: whether they can be compared, what differs, and who wins."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -75,7 +75,7 @@ def differences(runs: Runs) -> DataFrame:
 
 
 def compare_runs(questions: Shared) -> DataFrame:
-    """Spec F5: the first run against each other, ``agent`` by agent and method by method, over what they share."""
+    """The first run against each other, ``agent`` by agent and method by method, over what they share."""
     parts = []
     for contexts in questions.values():
         for method, alike in of_runs(contexts, "compared").groupby("method", sort=False):

@@ -1,4 +1,4 @@
-"""Spec F5, F7: several evaluated runs side by side, as one page and its numbers."""
+"""Several evaluated runs side by side, as one page and its numbers."""
 
 from pathlib import Path
 from typing import Annotated

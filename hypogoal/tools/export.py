@@ -1,4 +1,4 @@
-"""Spec B6, I6: an agent's episodes or an ensemble, written for other software."""
+"""An agent's episodes or an ensemble, written for other software."""
 
 import inspect
 import json

@@ -1,4 +1,4 @@
-"""Spec B6: from what users have to a data file."""
+"""From what users have to a data file."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Labelled states as sheets of pictures, to check labels by eye (Spec A1, B5)."""
+"""Labelled states as sheets of pictures, to check labels by eye."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""Three-key DoorKey (Spec B1-B3)."""
+"""Three-key DoorKey."""

@@ -1,4 +1,4 @@
-"""Three-key DoorKey (Spec B1-B3): the domain, and how its states are collected.
+"""Three-key DoorKey: the domain, and how its states are collected.
 
 See also ``env`` (the Gymnasium environment and the sub-goals) and ``engine`` (many environments, fast).
 """
@@ -76,7 +76,7 @@ def _sweep(config: DoorKeyConfig, layout_seeds: Iterable[int], progress: Any) ->
 
 
 class DoorKeyDomain(Domain[DoorKeyConfig]):
-    """Spec B6: three-key DoorKey."""
+    """Three-key DoorKey."""
 
     name = "doorkey"
     sub_goals = env.SUB_GOALS
@@ -91,7 +91,7 @@ class DoorKeyDomain(Domain[DoorKeyConfig]):
     )
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
-        """Spec B3: labelled, unlabelled and held-out states, each with its origin.
+        """Labelled, unlabelled and held-out states, each with its origin.
 
         The scripted expert is an exhaustive breadth-first sweep: every position and direction at every stage of the
         task (keys held; door locked, open, closed again) that is reachable without dropping a key, each image once.

@@ -247,7 +247,7 @@ class DoorKeyEngine(Engine):
         return self._on_goal.take(ids)
 
     def labels(self, ids: Ints) -> Bools:
-        """Spec B2: true sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
+        """True sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
         places = self._places[self._site.take(ids) // POSES]
         door_open = places[:, 0] == OPEN
         held = places[:, 1:] >= HELD
@@ -342,7 +342,7 @@ class DoorKeyEngine(Engine):
         return int(to_goal.min()) if len(to_goal) else None
 
     def random_success(self, episodes: int, rng: Generator) -> float:
-        """Spec F5: the share of ``episodes`` of uniform-random actions that reach the goal within ``max_steps``."""
+        """The share of ``episodes`` of uniform-random actions that reach the goal within ``max_steps``."""
         seeds = self.layouts.seeds * episodes
         if self.layouts.many:
             seeds = rng.choice(self.layouts.seeds, episodes).tolist()

@@ -1,4 +1,4 @@
-"""Spec B1, B2: three-key DoorKey on minigrid's own classes, its layouts and its five sub-goals.
+"""Three-key DoorKey on minigrid's own classes, its layouts and its five sub-goals.
 
 This is the reference: the fast engine (``engine.py``) is tested to be pixel- and step-exact with it.
 """
@@ -37,7 +37,7 @@ def sub_goals_reached(
     on_goal: Bools,
     door_label: str,
 ) -> Bools:
-    """Spec B2: the five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
+    """The five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
 
     ``held`` (..., 3) covers the blue, the green and the red key; the others are (...,). ``open-red-door`` holds when
     the door is ``open``, wherever the agent stands, or only when the agent is also ``in-front``, facing it.
@@ -176,7 +176,7 @@ class DoorKeyGrid(MiniGridEnv):
         return 1.0
 
     def labels(self) -> Bools:
-        """Spec B2: the true predicates of the current state, bool (5,), in the order of ``SUB_GOALS``."""
+        """The true predicates of the current state, bool (5,), in the order of ``SUB_GOALS``."""
         held = np.array([colour in self.held for colour in KEY_COLOURS])
         facing = self.grid.get(*self.front_pos) is self.door
         on_goal = isinstance(self.grid.get(*self.agent_pos), Goal)
@@ -194,7 +194,7 @@ class DoorKeyGrid(MiniGridEnv):
 
 
 class DoorKeyEnv(DoorKeyGrid):
-    """Spec B1: three-key DoorKey, observed as the full RGB image, uint8 (64, 64, 3), without a view cone.
+    """Three-key DoorKey, observed as the full RGB image, uint8 (64, 64, 3), without a view cone.
 
     Gymnasium id ``hypogoal/DoorKey-8x8-v0``; seven actions: left, right, forward, pickup, drop, toggle, done.
     Arguments as ``DoorKeyGrid``.

@@ -1,1 +1,1 @@
-"""Domains made of a Gymnasium environment (Spec B6, B7)."""
+"""Domains made of a Gymnasium environment."""

@@ -1,4 +1,4 @@
-"""A domain made of any Gymnasium environment and a label function for each sub-goal (Spec B6, B7)."""
+"""A domain made of any Gymnasium environment and a label function for each sub-goal."""
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -44,7 +44,7 @@ class GymnasiumConfig(Config):
 
 
 class GymnasiumDomain(Domain[GymnasiumConfig]):
-    """Spec B6: all that hypogoal needs to know about a problem, from a Gymnasium environment.
+    """All that hypogoal needs to know about a problem, from a Gymnasium environment.
 
     Args:
         make: makes an environment; or functions that do, by split: ``training``, and any of ``labelled``,

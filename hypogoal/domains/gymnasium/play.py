@@ -1,4 +1,4 @@
-"""States of a Gymnasium environment: play of each layout, and a sample of what it reached (Spec B7)."""
+"""States of a Gymnasium environment: play of each layout, and a sample of what it reached."""
 
 from __future__ import annotations
 

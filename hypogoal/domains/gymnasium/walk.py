@@ -1,4 +1,4 @@
-"""What follows on each action in each state of a layout, found by walking through the environment itself (Spec B6)."""
+"""What follows on each action in each state of a layout, found by walking through the environment itself."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Sub-goals in Montezuma's Revenge (Spec B4, B5)."""
+"""Sub-goals in Montezuma's Revenge."""

@@ -1,4 +1,4 @@
-"""Sub-goals in Montezuma's Revenge (Spec B4, B5): the domain, and how its states are collected.
+"""Sub-goals in Montezuma's Revenge: the domain, and how its states are collected.
 
 See also ``emulator`` (the game, with the agent placed anywhere), ``ladders`` (their positions), ``sub_goals``,
 ``expert`` (scripted play), ``states`` (the states of a room), ``env`` and ``engine`` (one game and many, from the top
@@ -96,7 +96,7 @@ def rooms_of(config: MontezumaConfig) -> tuple[list[int], list[int]]:
 
 
 def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
-    """Spec B5: labelled, unlabelled and held-out states, each with its origin.
+    """Labelled, unlabelled and held-out states, each with its origin.
 
     All 24 rooms have held-out states, the same for every N. States at the base of a ladder that continues through the
     floor are in the unlabelled set only. No held-out stack is in another set, and no stack occurs twice in a room of a
@@ -139,7 +139,7 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
 
 
 class MontezumaDomain(Domain[MontezumaConfig]):
-    """Spec B6: Montezuma's Revenge; the defaults are Table 1, and for options what lets them learn on a laptop."""
+    """Montezuma's Revenge; the defaults are Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"
     sub_goals = tuple(SUB_GOALS)

@@ -1,4 +1,4 @@
-"""Montezuma's Revenge on the Arcade Learning Environment: RAM, pictures, the agent placed anywhere (Spec B4, B5).
+"""Montezuma's Revenge on the Arcade Learning Environment: RAM, pictures, the agent placed anywhere.
 
 The raw emulator instead of Gymnasium's wrappers: these cannot save, restore and write states, or skip drawing frames
 that are not needed. The observations are the same, pixel for pixel (a test compares them with ``AtariPreprocessing``
@@ -129,7 +129,7 @@ class Emulator:
         return stacked(self.seen)
 
     def step(self, action: int) -> float:
-        """Spec B4: play four frames of ``action`` (0..17); returns the sum of their rewards."""
+        """Play four frames of ``action`` (0..17); returns the sum of their rewards."""
         act, number = self.ale.act, self.actions[action]
         reward = 0.0
         for _ in range(FRAME_SKIP - len(self._screens)):
@@ -178,7 +178,7 @@ class Emulator:
         self.seen = snapshot.seen
 
     def place(self, room: int, x: int, y: int, *, phase: int = 2, settle: int = STACK) -> Snapshot | None:
-        """Spec B5: place the agent at (x, y) of a room, with the torch, ``phase`` frames after entering.
+        """Place the agent at (x, y) of a room, with the torch, ``phase`` frames after entering.
 
         The agent enters through the room's side, from its neighbour: writing the room's number alone draws half a room.
         Then it waits for ``settle`` agent steps. None if it died meanwhile or left the room.

@@ -1,4 +1,4 @@
-"""Spec B4, D4: Montezuma's Revenge from the top of a ladder or elsewhere, a Gymnasium environment; its start states.
+"""Montezuma's Revenge from the top of a ladder or elsewhere, a Gymnasium environment; its start states.
 
 This is the reference: tests compare the training engine (``engine.py``) with it.
 """
@@ -45,7 +45,7 @@ for _name, _numbers in MEASURED["starts"].items():
 
 
 def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> list[game.Snapshot]:
-    """Spec D4: states at a beginning, such as the top of a ladder, from which its script survives.
+    """States at a beginning, such as the top of a ladder, from which its script survives.
 
     They differ in the phase of what moves, drawn from ``seed``, and look different if ``TRIES`` phases per state offer
     enough different looks. The top of 14-22 has one look only; its states differ out of sight. The emulator's state is

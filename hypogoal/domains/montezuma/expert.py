@@ -1,4 +1,4 @@
-"""Spec B5: scripted play in a room of Montezuma's Revenge, from around the places of its sub-goals and elsewhere."""
+"""Scripted play in a room of Montezuma's Revenge, from around the places of its sub-goals and elsewhere."""
 
 from collections.abc import Iterator, Sequence
 from itertools import cycle

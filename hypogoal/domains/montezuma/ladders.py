@@ -1,4 +1,4 @@
-"""The ladders of Montezuma's Revenge: their positions, and distances through the rooms (Spec B4, B5, F3).
+"""The ladders of Montezuma's Revenge: their positions, and distances through the rooms.
 
 Positions are in RAM units (see ``emulator``). What was measured is in ``measured.toml``.
 """
@@ -101,7 +101,7 @@ def _landmarks(places: Sequence[Position]) -> tuple[Ints, Ints]:
 
 
 def distance_to(positions: Ints, places: Sequence[Position]) -> Ints:
-    """Spec F3: the Manhattan distance from positions (n, 3) to the nearest place, through the rooms; int (n,).
+    """The Manhattan distance from positions (n, 3) to the nearest place, through the rooms; int (n,).
 
     Paths go sideways from room to room within a region, freely up and down, and from row to row only through the
     ladders that join rooms. Platforms and walls inside a room are ignored, so it is a lower bound.

@@ -1,4 +1,4 @@
-"""States of a room of Montezuma's Revenge from scripted play, with labels and origins (Spec B4, B5)."""
+"""States of a room of Montezuma's Revenge from scripted play, with labels and origins."""
 
 from collections import Counter
 from collections.abc import Sequence

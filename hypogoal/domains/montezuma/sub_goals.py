@@ -1,4 +1,4 @@
-"""The sub-goals on Montezuma's Revenge (Spec I4): where each holds, by the console's memory, and rooms that label it.
+"""The sub-goals on Montezuma's Revenge: where each holds, by the console's memory, and rooms that label it.
 
 The paper has the first, ``CLIMB_DOWN``: the agent lives and is within ``REACH`` of a ladder's base, in x and in y. The
 others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``ALL``, and its
@@ -83,14 +83,14 @@ class SubGoal:
 
 
 def labels_of(facts: NDArray[np.integer], sub_goals: Iterable[SubGoal]) -> Bools:
-    """Spec B4: whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``)."""
+    """Whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``)."""
     reached = [sub_goal.at(facts) >= 0 for sub_goal in sub_goals]
     lives = facts[:, [DYING]] == 0
     return np.stack(reached, axis=1) & lives
 
 
 def _climb(name: str, ends: Places, others: Places) -> SubGoal:
-    """Be at one end of a ladder; ends that are another ladder's other end are labelled nowhere (Spec B5)."""
+    """Be at one end of a ladder; ends that are another ladder's other end are labelled nowhere."""
     unclear = {index for index, end in enumerate(ends) if end in others}
     return SubGoal(
         name,

@@ -1,1 +1,1 @@
-"""Rooms (Spec H1): hypothesis learning with a known answer, since the features of its scenes are planted."""
+"""Rooms: hypothesis learning with a known answer, since the features of its scenes are planted."""

@@ -1,4 +1,4 @@
-"""Rooms, one of which has the feature that is rewarded (Spec H1).
+"""Rooms, one of which has the feature that is rewarded.
 
 An agent stands before some rooms and enters one. In the labelled states several features agree, so only the reward can
 tell which of them counts: ``truth`` of the world that an agent is trained in.
@@ -28,7 +28,7 @@ DEFAULTS = {
 
 
 class RoomsDomain(Domain[RoomsConfig]):
-    """Spec H1: a domain in which one labelled context cannot say what the sub-goal is."""
+    """A domain in which one labelled context cannot say what the sub-goal is."""
 
     name = "rooms"
     sub_goals = SUB_GOALS

@@ -1,4 +1,4 @@
-"""The rooms that an agent chooses among, and the settings that say which feature is rewarded (Spec H1)."""
+"""The rooms that an agent chooses among, and the settings that say which feature is rewarded."""
 
 from typing import Self
 

@@ -1,4 +1,4 @@
-"""Spec H1: scenes with planted factors, drawn with MiniGrid's tiles, and the truth of each factor."""
+"""Scenes with planted factors, drawn with MiniGrid's tiles, and the truth of each factor."""
 
 from collections.abc import Sequence
 from functools import cache

@@ -1,1 +1,1 @@
-"""What audits say: of policies that exploit a classifier, and of recorded states (Spec H5, I6)."""
+"""What audits say: of policies that exploit a classifier, and of recorded states."""

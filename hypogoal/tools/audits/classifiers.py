@@ -1,4 +1,4 @@
-"""What audits are of: the members of an ensemble, or code of the user's own (Spec H5, I6)."""
+"""What audits are of: the members of an ensemble, or code of the user's own."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""How often policies fool a success classifier, and where (Spec H5).
+"""How often policies fool a success classifier, and where.
 
 A classifier can be right in nearly all states that are met, and wrong where a policy stops that was trained to reach
 its positive predictions. So options are learned that end at these, and the truth of each of their executions is looked

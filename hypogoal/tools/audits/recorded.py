@@ -1,4 +1,4 @@
-"""What recorded states say of a classifier, without a simulator (Spec I6).
+"""What recorded states say of a classifier, without a simulator.
 
 Where members disagree, which failures they take for a success, and which states to label next.
 """
