@@ -137,11 +137,11 @@ def test_the_picture_of_the_stages_is_drawn_from_their_code() -> None:
     assert picture["declared"](stage) == ("train-meta", ["ensemble", "options"], "meta")
 
 
-def test_requirements_lead_to_code_and_tests() -> None:
-    """Each requirement is cited by the code and by a test; these cite nothing else."""
+def test_requirements_lead_to_tests() -> None:
+    """Each requirement is cited by a test; tests cite nothing else. The package does without such numbers."""
     listed = (DOCS / "deviations.md").read_text(encoding="utf-8").partition("\n## What it must do\n")[2]
     numbers = re.findall(r"[:;]\s+([A-I]\d)\s", listed)
-    assert set(numbers) == cited("hypogoal") == cited("tests") and len(numbers) > 50
+    assert set(numbers) == cited("tests") and len(numbers) > 50 and not cited("hypogoal")
 
 
 def cited(folder: str) -> set[str]:
