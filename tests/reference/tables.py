@@ -13,6 +13,11 @@ FOLDER = Path(__file__).parent
 RECORD = "record.json"  # of each part: which code made it, on which machine
 FLAGS = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_tile")  # of the processor, that decide how it adds up
 
+# Columns of the tables of an evaluation that have other statistics since 1.1: test_statistics.py holds them.
+STATISTICS = {"iqm", "estimate", "low", "high", "difference", "outcome"}
+STATISTICS |= {f"probability_{end}" for end in ("low", "high")}
+STATISTICS |= {f"difference_{end}" for end in ("low", "high", "least", "most")}
+
 Table = list[tuple[str, ...]]
 
 
@@ -66,11 +71,16 @@ def parting(old: Table, new: Table, tolerance: float) -> str | None:
 
 
 def by_key(table: Table) -> dict[tuple[str, ...], str]:
-    """A table's values by what they are of, in its order."""
+    """A table's values by what they are of, in its order, without ``STATISTICS``."""
     values = {row[:-1]: row[-1] for row in table[1:]}
     if len(values) != len(table) - 1:
         raise ValueError("two lines of a table are of the same")
-    return values
+    return {key: value for key, value in values.items() if not is_statistic(key)}
+
+
+def is_statistic(key: tuple[str, ...]) -> bool:
+    """Whether it is of a table of the evaluation, in one of these columns."""
+    return key[0].startswith("tables/") and key[-1].rpartition(" ")[2] in STATISTICS
 
 
 def alike(first: str, second: str, tolerance: float) -> bool:
