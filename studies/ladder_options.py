@@ -29,7 +29,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import integers
 from hypogoal.core.processes import in_processes
 from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig
-from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ROOMS
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, LABELLED_ROOMS
 from hypogoal.evaluation.distance import option_numbers
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_ensemble import train_ensemble
@@ -127,7 +127,7 @@ def tables(path: Path) -> Iterator[str]:
 
 def _leads(groups: int, measures: dict[str, Distances]) -> Iterator[str]:
     """How much nearer D-BAT stops than the others on ladders without labels, ensemble by ensemble."""
-    rooms = {str(room) for group in ROOMS[CLIMB_DOWN.name]["groups"][:groups] for room in group}
+    rooms = {str(room) for group in LABELLED_ROOMS[CLIMB_DOWN.name]["groups"][:groups] for room in group}
     new = [ladder for ladder in LADDERS if not rooms & {*ladder.rstrip("LMR").split("-")}]
     rows = []
     for (rule, distances), other in product(measures.items(), ("none", "cnn")):

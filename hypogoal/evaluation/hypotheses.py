@@ -32,7 +32,7 @@ BY = ["method", "sub_goal"]
 WHICH = ("best", "mean", "worst")
 PAIRED = ("best", "mean")
 CROSS_FITTED = ("cross_fitted_ranking", "cross_fitted_accuracy")
-KNOWN = ("ranking", *CROSS_FITTED, "at_best_threshold", "calibration_gap")
+KNOWLEDGE = ("ranking", *CROSS_FITTED, "at_best_threshold", "calibration_gap")
 
 
 def look(work, judgement):
@@ -140,7 +140,7 @@ def context(results):
     by_room = results.of(scope="unseen")["artefact"]
     numbers = results.numbers[~results.numbers["artefact"].isin(by_room)]
     values = [per_run(numbers, "balanced_accuracy", scope=HELDOUT, member=which, name=which) for which in WHICH]
-    values.append(per_run(numbers, *KNOWN, "coverage", scope=HELDOUT))
+    values.append(per_run(numbers, *KNOWLEDGE, "coverage", scope=HELDOUT))
     for states in ("unlabelled", HELDOUT):
         values.append(per_run(numbers, "disagreement", scope=states, name=f"{{}}_{states}"))
     tables = tables_of(pd.concat(values), BY, PAIRED)

@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hypogoal.evaluation import plots
-from hypogoal.evaluation.hypotheses import KNOWN, VALIDATED
+from hypogoal.evaluation.hypotheses import KNOWLEDGE, VALIDATED
 from hypogoal.evaluation.page import Drawn
 from hypogoal.evaluation.statistics import tables_of
 from hypogoal.evaluation.table import per_run
@@ -45,7 +45,7 @@ def context(results):
     states = per_run(numbers, "states", scope="all")
     never = per_run(numbers, "positives", scope="all", name=NEVER)
     never = never.assign(of="accuracy", value=1 - never["value"] / states["value"])
-    values = [never, per_run(numbers, *KNOWN, scope="unseen")]
+    values = [never, per_run(numbers, *KNOWLEDGE, scope="unseen")]
     for scope in ("unlabelled", "heldout"):
         values.append(per_run(numbers, "disagreement", scope=scope, name=f"{{}}, {scope}"))
     for scope, (which, member) in product(("unseen", "all"), WHICH.items()):

@@ -115,7 +115,7 @@ class Executions(Table):
     duration: Ints  # steps
     reached: Bools  # its own termination classifier ended it
     inside_at_start: Bools  # that classifier's prediction was positive where it began
-    terminated: Bools  # the episode ended in a terminal state: the agent died
+    terminated: Bools  # the episode ended in a terminal state: solved, or lost
     room: Ints  # where it stopped; x and y too
     x: Ints
     y: Ints

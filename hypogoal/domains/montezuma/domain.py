@@ -25,7 +25,7 @@ from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MAX_STEPS
 from hypogoal.domains.montezuma.ladders import distance_to
 from hypogoal.domains.montezuma.states import gather
-from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ROOMS, SUB_GOALS
+from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, LABELLED_ROOMS, SUB_GOALS
 
 TABLE_1 = {
     "network": "montezuma",
@@ -87,9 +87,9 @@ def rooms_of(config: MontezumaConfig) -> tuple[list[int], list[int]]:
     """
     labelled: list[int] = []
     for name in config.sub_goals:
-        groups = ROOMS[name]["groups"]
+        groups = LABELLED_ROOMS[name]["groups"]
         labelled += chain.from_iterable(groups[: config.groups])
-    of_first = ROOMS[config.sub_goals[0]]
+    of_first = LABELLED_ROOMS[config.sub_goals[0]]
     holding = [room for room in of_first["unlabelled"] if room not in labelled]
     unlabelled = holding[:1] + of_first["others"]
     return [*dict.fromkeys(labelled)], unlabelled[:2]

@@ -13,7 +13,15 @@ from hypogoal.data import States
 from hypogoal.domains.montezuma.emulator import DYING, JUMP, ON_LADDER, POSE, Emulator
 from hypogoal.domains.montezuma.expert import Expert, Shown
 from hypogoal.domains.montezuma.ladders import BASES
-from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, CLIMB_UP, ROOMS, SubGoal, around, inside, labels_of
+from hypogoal.domains.montezuma.sub_goals import (
+    CLIMB_DOWN,
+    CLIMB_UP,
+    LABELLED_ROOMS,
+    SubGoal,
+    around,
+    inside,
+    labels_of,
+)
 from hypogoal.observations import digest
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
@@ -64,7 +72,7 @@ def states_of(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
     facts = np.stack(every).astype(int)
     room, x, y, *_ = facts.T
     group = np.zeros_like(room)
-    for number, rooms in enumerate(ROOMS[CLIMB_DOWN.name]["groups"], 1):
+    for number, rooms in enumerate(LABELLED_ROOMS[CLIMB_DOWN.name]["groups"], 1):
         group[np.isin(room, rooms)] = number
     origins = {
         "room": room,

@@ -20,7 +20,7 @@ from hypogoal.domains.montezuma.ladders import BASES, FAR, MEASURED, TOPS
 REACH = 2  # at a place: at most this far from it, in x and in y
 BETWEEN_SPOTS = 8  # RAM units
 LASER_Y = 235
-ROOMS = MEASURED["rooms"]  # by sub-goal
+LABELLED_ROOMS = MEASURED["rooms"]  # by sub-goal
 ENEMIES = [*MEASURED["enemies"].values()]
 # By room, where an agent stands left of each laser gate, and right of it.
 GATES = {int(room): gates for room, gates in MEASURED["gates"].items()}
@@ -147,5 +147,5 @@ CLIMB_DOWN = _climb("climb-down-ladder", BASES, TOPS)
 CLIMB_UP = _climb("climb-up-ladder", TOPS, BASES)
 ALL = (CLIMB_DOWN, CLIMB_UP, _pass("left"), _pass("right"), _pass_lasers())
 SUB_GOALS = {sub_goal.name: sub_goal for sub_goal in ALL}
-for _without in SUB_GOALS.keys() - ROOMS.keys():
+for _without in SUB_GOALS.keys() - LABELLED_ROOMS.keys():
     raise UserError("a sub-goal lacks its rooms", _without, f"Add [rooms.{_without}] to measured.toml.")
