@@ -123,6 +123,18 @@ def test_equations_lead_to_code() -> None:
                 assert hasattr(module, name), (row, name)
 
 
+def test_links_lead_to_files_of_a_checkout() -> None:
+    """Each of every page; that they work on the site, too, is MkDocs' own test."""
+    pages = [*DOCS.rglob("*.md"), *(path for path in ROOT.glob("*.md") if path.name != "CHANGELOG.md")]
+    dead = []
+    for page in pages:
+        text = re.sub("```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+        for link in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
+            if not link.startswith("http") and not (page.parent / link).exists():
+                dead.append((page.name, link))
+    assert not dead and len(pages) > 20
+
+
 def test_readme_and_the_sites_first_page_are_one_text() -> None:
     """``python docs/home.py`` would change nothing; pictures are drawn as they were."""
     page = runpy.run_path(str(DOCS / "home.py"))
