@@ -288,7 +288,7 @@ def create(
             wanted.took = {"seconds": round(time.monotonic() - started, 1)}
             _finish(draft, wanted)
         except BaseException as error:
-            if draft.is_resumable:
+            if draft.is_resumable and getattr(error, "do", "") != ANEW:
                 error.add_note("the last checkpoint is kept: give the same command with --resume to continue")
             raise
 
