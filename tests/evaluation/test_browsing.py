@@ -2,6 +2,8 @@
 
 import io
 import json
+import re
+from html import unescape
 from types import SimpleNamespace
 
 import h5py
@@ -13,6 +15,7 @@ from PIL import Image
 from torch import nn
 
 from hypogoal.data import Collected, States, write_dataset
+from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judged, Judgement, Work
 from hypogoal.evaluation.pictures import attribution_image, coloured, encoded, last_frame, overlay
 from hypogoal.evaluation.run import Contents
@@ -153,3 +156,12 @@ def test_overlay_keeps_what_is_shared():
     states[1, 0, 1] = (100, 0, 0)
     assert overlay(states)[0, :, 0].tolist() == [200, 50, 100, 50, 50, 50]
     assert overlay(states[:1])[0, :, 0].tolist() == [200, 0, 100, 0, 0, 0]
+
+
+def test_the_policy_of_a_page_lets_its_own_script_and_style_in_alone() -> None:
+    """Spec F7: by their digests; nothing else is loaded, and pictures are in the page."""
+    text = page.render("lines.html", title="x", about="", lines=[], sections=[])
+    (policy,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]+)">', text)
+    (script,), (style,) = (re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL) for tag in ("script", "style"))
+    own = f"default-src 'none'; script-src {page.digest(script)}; style-src {page.digest(style)}; img-src data:;"
+    assert unescape(policy) == f"{own} base-uri 'none'; form-action 'none'"

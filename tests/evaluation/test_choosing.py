@@ -1,14 +1,19 @@
 """What choosing is worth, on planted members whose worth is known (Spec H2, H3)."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from corridor import LENGTH, Corridor
 from numpy.typing import NDArray
+from option_loops import loop_of
 from planted import harsh, planted
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Plan
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.evaluation.choosing import judge, qualities, with_choosers
 from hypogoal.evaluation.frozen import Choices, play
@@ -191,3 +196,19 @@ def test_uniform_random_choice_stands_beside_the_agent_whose_options_it_has() ->
     told = with_choosers(runs)
     assert told["method"].tolist() == ["D-BAT", "D-BAT", "one classifier"]
     assert told["chooser"].tolist() == ["the agent's", UNIFORM, "the agent's"]
+
+
+class Mapped(Corridor):
+    """It knows what follows."""
+
+    def plan(self, starts: Any = None) -> Plan:
+        cells = np.arange(LENGTH)
+        following = np.stack([np.maximum(cells - 1, 0), np.minimum(cells + 1, LENGTH - 1)], axis=1)
+        return Plan(cells, np.arange(2), following, cells == LENGTH - 1, cells == LENGTH - 1)
+
+
+def test_a_state_counts_as_often_as_it_is_decided_in() -> None:
+    """Three times it begins in cell 1 and goes to the left end, once in cell 4, where it ends the episode instead."""
+    learner = SimpleNamespace(act=lambda ids, *_, **__: (ids > 2).astype(int))
+    quality = qualities(loop_of(Mapped(1), learner), np.array([0]), np.array([1, 4, 1, 1]))
+    assert quality.tolist() == [0.75]

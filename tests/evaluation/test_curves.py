@@ -1,12 +1,15 @@
 """Spec F5: curves over environment steps, numbers over runs, against values worked by hand."""
 
 import math
+import re
 
 import numpy as np
-from made_up import LEARNED, asked, figures, results_of, row, shown
+import pytest
+from made_up import LEARNED, asked, figures, numbers_of, results_of, row, shown
 
 from hypogoal.evaluation import curves as question
-from hypogoal.evaluation.curves import by_episode, curves, run_numbers
+from hypogoal.evaluation import page
+from hypogoal.evaluation.curves import by_episode, curves, learning_curves, run_numbers
 from hypogoal.options.tables import Episodes
 
 
@@ -131,3 +134,25 @@ def test_curves_over_episodes():
     assert found.index[0] == 10 and found.index[-1] <= 40 and found.index.is_unique
     np.testing.assert_allclose([found[10], found[20], found[30]], [0, 0.5, 1])
     assert by_episode(np.ones(9, np.bool_)).empty
+
+
+def test_the_band_of_a_curve_is_the_standard_error() -> None:
+    """Figure 6: of 1 and 3 on two layouts the mean is 2 and its error sqrt(2) / sqrt(2); their deviation is not 1."""
+    rows = [row("reward", value, step=step, layout=value, method="a") for value in (1, 3) for step in (10, 20)]
+    (axes,) = learning_curves(numbers_of(*rows), "reward").axes
+    (band,) = axes.collections
+    heights = band.get_paths()[0].vertices[:, 1]
+    assert (heights.min(), heights.max()) == pytest.approx((1, 3))
+
+
+def test_intervals_on_the_page_are_in_the_units_of_its_titles() -> None:
+    """Three layouts: success in percent, median steps, and near as a share, each with its interval if it has one."""
+    rows = []
+    for layout in range(3):
+        place = {"method": "option agent", "layout": layout, "seed": 0, "artefact": f"a-{layout}"}
+        rows += [row("success", 1, **place), row("solved_length", 12, **place), row("near", 0.5, **place)]
+    context = asked(question, results_of(*rows, agents={"option agent": LEARNED}))
+    text = page.render("curves.html", **context).partition("Intervals and pairs")[2]
+    cells = dict(re.findall(r'data-name="([^"]+)">([^<]*)', text.partition("</table>")[0]))
+    assert cells["success, %"].startswith("100.0 [29.") and cells["success, %"].endswith(", 100.0]")
+    assert cells["steps"] == "12" and cells["within 1.5 shortest paths"].startswith("0.50 [")

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from corridor import Corridor
 from numpy.typing import NDArray
+from option_loops import Scripted, loop_of
 from planted import harsh, planted
 from scipy.stats import binom
 
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.evaluation.frozen import play
+from hypogoal.evaluation.frozen import play, play_both
 from hypogoal.meta.config import GAMMA, TrainMetaConfig
 from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
@@ -136,3 +138,13 @@ def test_play_teaches_nothing() -> None:
     play(loop, chooser, 3)
     np.testing.assert_array_equal(rule.thresholds, before)
     assert not learner.option_steps.any() and not learner.positives.any()
+
+
+def test_uniform_choice_is_drawn_by_the_seed_of_the_run() -> None:
+    """The same again for the same seed, another for another."""
+
+    def drawn(seed: int) -> Any:
+        _, uniform = play_both(loop_of(Corridor(4), Scripted(0)), seed, 1)
+        return uniform.choices.options.tolist()
+
+    assert drawn(0) == drawn(0) != drawn(1)

@@ -1,14 +1,20 @@
 """What members know of held-out states, wherever their thresholds lie, and which features they have found (F1, H1)."""
 
 from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+import toy_data
 from made_up import asked, results_of, row
 
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.hypotheses import coverage, knowledge
-from hypogoal.evaluation.judging import Judged
+from hypogoal.evaluation.judging import Judged, judge
+from hypogoal.hypotheses import ensemble
 from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
 
 RNG = np.random.default_rng(0)
@@ -92,3 +98,14 @@ def test_best_mean_and_worst_member_over_seeds() -> None:
     best = context["pairs"].set_index("quantity").loc["best"]
     assert (best["n"], best["difference"]) == (1, pytest.approx(0.2))
     assert asked(hypotheses, results_of()) is None
+
+
+def test_every_state_is_judged_by_the_members_own_threshold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Held-out and unlabelled ones alike: .7 is above .6, and not above .8; .4 is above .3."""
+    says, thresholds = np.array([0.7, 0.7, 0.4], np.float32), torch.tensor([0.6, 0.8, 0.3])
+    members = SimpleNamespace(thresholds=thresholds, predict=lambda states: np.tile(says, (len(states), 1)))
+    monkeypatch.setattr(ensemble, "read_ensemble", lambda *_: members)
+    monkeypatch.setattr(ensemble, "together", lambda _: None)
+    artefact: Any = SimpleNamespace(path=tmp_path, config={"sub_goals": ["one"]})
+    judged = judge(artefact, toy_data.write(tmp_path / "data.h5", states=2))["one"]
+    assert judged.predictions.tolist() == judged.unlabelled.tolist() == [[True, False, True]] * 2

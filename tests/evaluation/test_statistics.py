@@ -1,6 +1,8 @@
 """Spec F5: means, intervals and pairs of the one table, against values worked by hand."""
 
 import math
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -8,6 +10,7 @@ import pytest
 from made_up import numbers_of, row
 
 from hypogoal.core.errors import UserError
+from hypogoal.evaluation import table
 from hypogoal.evaluation.statistics import (
     MEDIANS_FROM,
     SHARES_FROM,
@@ -199,3 +202,13 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
         assert (at_least(upper / 100 - lower / 100, bound / 100) == (upper - lower >= bound)).all()
         assert (above(upper / 100 - lower / 100, bound / 100) == (upper - lower > bound)).all()
     assert not at_least(0.2 - 1e-6, 0.2) and not at_least(math.nan, 0.0) and not above(math.nan, 0.0)
+
+
+def test_what_is_a_share_by_its_meaning_is_one() -> None:
+    """Its interval is of the mean and ends at 1 at most: here of 1, 1 and .9."""
+    meanings = tomllib.loads((Path(table.__file__).with_name("quantities.toml")).read_text(encoding="utf-8"))
+    named = {name for name, (_, meaning) in meanings.items() if meaning.startswith("share ")}
+    assert {"success", "near", "within_2"} <= named <= table.shares()
+    for quantity in sorted(named):
+        (found,) = over(runs_of(1, 1, 0.9, quantity=quantity), ["method"]).to_dict("records")
+        assert found["estimate"] == pytest.approx(2.9 / 3) and 0 < found["low"] < found["high"] <= 1, quantity

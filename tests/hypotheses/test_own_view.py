@@ -124,3 +124,16 @@ def test_what_does_not_fit_is_one_line(changes: dict[str, object], line: str) ->
     observations, labels, unlabelled = toy()
     with pytest.raises(UserError, match=line):
         train(observations, labels, unlabelled, OWN.model_copy(update=changes), seed=0)
+
+
+def test_every_pool_has_an_order_of_its_own() -> None:
+    """Else the same places of two pools, which may belong together, would always meet in a batch."""
+    labels, kind = np.arange(64) < 32, np.arange(64) % 2
+    images = np.zeros((64, 48, 48, 3), dtype=np.uint8)
+    view = Moved((48, 48, 3), Settings())
+    states = TrainingStates(images, labels, images, members_of(view), {"kind": kind})
+    ((drawn, _),) = states.batches(EnsembleConfig(batch_size=64, steps=1), 0)
+    positives = drawn[:24]
+    even, odd = positives[kind[positives] == 0], positives[kind[positives] == 1]
+    assert len(even) == len(odd) == 12
+    assert even.tolist() != (odd - 1).tolist()

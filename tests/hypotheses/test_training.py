@@ -329,3 +329,12 @@ def test_data_that_cannot_be_learned_from_are_one_clear_line() -> None:
         train(observations, labels & False, unlabelled, TOY, seed=0)
     with pytest.raises(UserError, match="unlabelled states are needed"):
         train(observations, labels, unlabelled[:0], TOY, seed=0)
+
+
+def test_nan_names_the_member_of_a_later_round() -> None:
+    """Spec G3, C4: of members one after the other the second, whose weights are broken, in its first step."""
+    config = TOY.model_copy(update={"steps": 2, "schedule": "sequential", "diversity": "none"})
+    training = EnsembleTraining(*toy(), config, 0)
+    next(training.ensemble.networks[1].parameters()).data.fill_(torch.nan)
+    with pytest.raises(NumericalError, match=r"^the labelled loss of member 1 is nan at step 3$"):
+        list(training.steps())

@@ -16,6 +16,7 @@ from command_line import refuses, run
 from hypogoal.data import Dataset, open_dataset
 from hypogoal.importing import pictures
 from hypogoal.importing.assemble import with_roles
+from hypogoal.importing.recordings import read_robomimic
 from hypogoal.importing.states import ROLES
 from hypogoal.observations import digest
 from tests.importing import robot_data
@@ -230,13 +231,13 @@ def test_what_a_demonstration_lacks_is_named(
 
 
 def test_padded_names_are_held_out_and_unknown_success_is_unlabelled(tmp_path: Path) -> None:
-    """``last:2`` of an episode of which nothing says whether it succeeds are not negative."""
+    """``last:2`` of an episode of which nothing says whether it succeeds are not negative; any frame may say so."""
 
     def change(file: h5py.File) -> None:
         file["mask/valid"] = np.array([b"demo_0  ", b"demo_5\0"])
         file["data/demo_1/success"] = np.ones(9)
         for demo in (0, 2, 3, 4, 5):
-            file[f"data/demo_{demo}/success"] = np.array([demo % 2])
+            file[f"data/demo_{demo}/success"] = np.array([0, demo % 2, 0])
 
     source = small_robomimic(tmp_path / "x.hdf5", change)
     data = imported(source, tmp_path / "data.h5", "--label", "on=last:2")
@@ -402,3 +403,9 @@ def test_the_missing_extra_is_named(datasets: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setitem(sys.modules, "av", None)
     words = ["import", datasets / "v3.0-video", "--out", tmp_path / "data.h5", *LABEL]
     refuses("pip install 'hypogoal[lerobot,minari]'", *words)
+
+
+def test_demonstrations_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    """The eleventh last, not second as HDF5 lists names."""
+    source = small_robomimic(tmp_path / "x.hdf5", put("data/demo_10/obs/state", np.zeros((5, 2))))
+    assert [episode.name for episode in read_robomimic(source, [])] == [f"demo_{n}" for n in (0, 1, 2, 3, 4, 5, 10)]

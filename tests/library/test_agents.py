@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from command_line import FIXED, run, settings, trusting
 from corridor_env import CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
@@ -404,3 +405,29 @@ def test_maskable_ppo_learns_which_option_pays(options: Options) -> None:
     agent.learn(256)
     assert _first_choice(agent, env) >= MEMBERS
     assert env.step(_first_choice(agent, env))[2], "the task is over"
+
+
+def members_of(count: int) -> Ensemble:
+    """Members that learned nothing."""
+    return Ensemble("doorkey", (48, 48, 3), count, torch.Generator())
+
+
+@pytest.mark.parametrize(("count", "least"), [(1, 1), (2, 2), (3, 2), (4, 3), (5, 3)])
+def test_a_vote_takes_more_than_half_of_the_members(count: int, least: int) -> None:
+    """Half of an even number is none; one and all of them by their rules."""
+    says = np.tri(count + 1, count, -1) > 0  # none, one, ..., all
+    for by, enough in (("any", 1), ("vote", least), ("all", count)):
+        held = hypogoal.SubgoalReward(members_of(count), by=by).decide(says)
+        assert held.tolist() == [number >= enough for number in range(count + 1)]
+
+
+def test_steps_away_are_those_of_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in the first and one in the second are no two in a row: what begins inside is not yet paid."""
+    monkeypatch.setattr(Ensemble, "log_odds", lambda _, seen: seen[:, 0, :1, 0] - 127.0)  # positive at the left end
+    env = hypogoal.SubgoalReward(members_of(1)).wrap(FromLeftEnd(corridor()), away=2)
+    with pytest.warns(UserWarning, match="an episode begins where"):
+        env.reset(seed=0)
+    env.step(1)
+    env.reset(seed=0)
+    told = [env.step(action) for action in (1, 0)]
+    assert [info["subgoal"] for *_, info in told] == [{"predicted": at, "paid": 0.0} for at in (False, True)]

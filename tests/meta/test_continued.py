@@ -1,21 +1,25 @@
 """Spec D2, D8, E1, E2: settings on the real DoorKey engine, and what training from an options artefact begins with."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_line import run, settings
+from loops import loop_of
 
 from hypogoal.baselines.agents import make_agent
 from hypogoal.baselines.engine_env import EngineEnv
 from hypogoal.baselines.settings import PPOSettings
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.networks import LightMetaNetwork
 from hypogoal.meta.setup import frames_kept
+from hypogoal.meta.training import continue_with
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.light import LightLearner
@@ -142,3 +146,14 @@ def test_an_engine_remembers_what_the_meta_policy_looks_back_at() -> None:
     assert frames_kept(config, GOALS) >= 64 * 200
     config = TrainMetaConfig.of(chooser="ppo", replay=100_000, environments=4, decisions=64)
     assert frames_kept(config, GOALS) == LightLearner.reach(config, GOALS)
+
+
+def test_options_go_on_ending_where_they_ended(tmp_path: Path) -> None:
+    """Spec D1, E1: with weights also the thresholds of an artefact, whatever those of its ensemble are."""
+    trained, loop = loop_of("light, shared, ppo"), loop_of("light, shared, ppo")
+    thresholds = torch.tensor([1.5, -2.0])
+    save_tensors(tmp_path / "options.safetensors", {**trained.learner.state(), "thresholds": thresholds})
+    assert loop.terminations.rule.thresholds.tolist() != thresholds.tolist()
+    artefact: Any = SimpleNamespace(path=tmp_path)
+    continue_with(loop, artefact)
+    assert loop.terminations.rule.thresholds.tolist() == thresholds.tolist()

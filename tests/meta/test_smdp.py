@@ -188,3 +188,16 @@ def test_credit_ends_with_an_episode_and_with_an_environment(monkeypatch: pytest
     *_, terminated, ended, _ = asked[0]
     assert terminated.tolist() == outcomes.terminated.tolist()
     assert ended.tolist() == [True, False, True, False, True, True]
+
+
+@pytest.mark.parametrize("head", ["categorical", "gaussian"])
+def test_where_nothing_is_to_be_gained_choices_become_less_certain(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec E1: of zero advantages the entropy bonus alone is left; the first option begins with a score of 1."""
+    monkeypatch.setattr(smdp, "smdp_advantages", lambda returns, *_: np.zeros(len(returns)))
+    policy = MetaPolicy(Corridor(2), 2, MetaConfig(head=head, decisions=6, meta_batch=6), 0)
+    with torch.no_grad():
+        policy.network.get_submodule("outputs").bias[0] = 1.0
+    outcomes = replace(Outcome.zeros(6), environments=np.repeat([0, 1], 3))
+    draws = replace(draws_in(np.arange(6) % 5), drawn=np.zeros((6, policy.head.remembered), np.float32))
+    entropies = [-policy.update(draws, outcomes)["entropy_loss"] for _ in range(3)]
+    assert entropies == sorted(entropies) and entropies[-1] > entropies[0] + 1e-3

@@ -9,7 +9,7 @@ import numpy as np
 import own_domain
 import pytest
 from corridor import Corridor
-from option_loops import loop_of
+from option_loops import Scripted, loop_of
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
@@ -147,3 +147,9 @@ def test_the_setting_says_how_many_or_which() -> None:
     layouts = make_engine(Setup(corridor_env.DOMAIN, about, Path(), config, 0)).layouts
     assert layouts is not None and layouts.seeds == (100, 101)
     assert Corridor(1).layouts is None
+
+
+def test_an_option_alone_is_not_played_into_the_next_episode() -> None:
+    """It goes right, which ends the episode, and only in the next one to the left end."""
+    told = alone(loop_of(Corridor(1), Scripted(1, 1, 1, 0)), 0, 0, np.array([2.0]))
+    assert (told["success"].tolist(), told["false_positives"].tolist()) == ([0.0], [0.0])

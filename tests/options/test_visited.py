@@ -3,14 +3,16 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from command_line import FIXED, refuses, run, settings
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.data import joined, open_dataset
+from hypogoal.core.errors import UserError
+from hypogoal.data import Collected, States, joined, open_dataset, write_dataset
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.options.visited import Visited
+from hypogoal.options.visited import Visited, unlabelled_file
 
 
 def walk(visited: Visited, engine: Corridor, steps: int, seed: int = 0) -> None:
@@ -113,3 +115,15 @@ def test_states_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         command = ["train-ensemble", str(data), "--unlabelled", str(wrong), "--out", str(tmp_path / "out"), "-q"]
         refuses(words, *command, "--set", chosen)
     assert not (tmp_path / "out").exists()
+
+
+def test_states_of_another_type_are_refused(tmp_path: Path) -> None:
+    """Spec G2: numbers of the shape of pictures, in the same domain."""
+    for kind in (np.uint8, np.float32):
+        states = States(np.ones((2, 4, 5, 3), kind), np.array([[True], [False]]))
+        collected = Collected((4, 5, 3), ("one",), states, states, states)
+        write_dataset(tmp_path / kind.__name__, collected, domain="toy", config={}, seed=0)
+    pictures = open_dataset(tmp_path / "uint8")
+    assert unlabelled_file(pictures.path, pictures) == pictures.path
+    with pytest.raises(UserError, match="the observation dtype is float32, that of the data uint8"):
+        unlabelled_file(tmp_path / "float32", pictures)

@@ -10,8 +10,9 @@ from command_line import refuses, run
 from toy_data import fill, reseal, write_table
 
 from hypogoal.core.artefacts import Artefact, create, open_artefact, sha256_of
+from hypogoal.evaluation.statistics import pairs
 from hypogoal.stages.evaluate import evaluate
-from hypogoal.tools.beside import labels_of
+from hypogoal.tools.beside import labels_of, winners
 from hypogoal.tools.compare import compare
 
 STEPS = 3_000
@@ -148,3 +149,16 @@ def test_what_cannot_be_compared_is_refused(runs, tmp_path):
     refuses("was not evaluated", "compare", slow, tmp_path / "empty", "--out", out)
     refuses("would replace an input", "compare", slow, fast, "--out", fast)
     assert labels_of(["/a/run", "/b/run"]) == ["a/run", "b/run"]  # as short as tells them apart
+
+
+@pytest.mark.parametrize(("of", "winner"), [("success", "slow beats fast"), ("length", "fast beats slow")])
+def test_the_winner_is_the_better_one(of, winner):
+    """Spec F5: the first has the higher values in each of six layouts, and of lengths the lower is better."""
+    runs = [
+        {"method": name, "N": pd.NA, "ladder": "", "sub_goal": "", "layout": layout, "seed": 0, "value": value}
+        for name, value in (("slow", 1.0), ("fast", 0.5))
+        for layout in range(6)
+    ]
+    both = pairs(pd.DataFrame(runs).assign(of=of, quantity=of)).assign(of="PPO tuned")
+    (line,) = winners(both)
+    assert line.startswith(f"PPO tuned: {of}: {winner} (slow +0.5, 95 % [0.5, 0.5], n = 6;")

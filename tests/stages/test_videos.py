@@ -6,6 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from corridor import Corridor
+from option_loops import Chosen, Scripted, loop_of
 from PIL import Image
 
 from hypogoal.core.artefacts import open_artefact
@@ -95,3 +97,19 @@ def test_what_is_drawn_of_a_frame():
     assert (bar[:168] == bar[0]).all() and (bar[170:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
     video = Image.open(io.BytesIO(episode_gif([frame, replace(frame, left=0, ended="x")], ["red", "door"], 2, 10)))
     assert video.n_frames == 2
+
+
+@pytest.mark.parametrize(
+    ("option", "action", "timeout", "cap", "why"),
+    [
+        (1, 1, 9, 9, "solved"),
+        (0, 0, 9, 9, "its classifier is positive"),
+        (1, 0, 4, 9, "its time is up"),
+        (1, 0, 9, 4, "the episode is cut"),
+    ],
+)
+def test_frames_say_why_an_option_ended(option, action, timeout, cap, why):
+    """An option to the left end (0) or the right one (1), played by going left (0) or right (1) all the time."""
+    loop = loop_of(Corridor(1, cap), Scripted(action), Chosen(option), option_timeout=timeout)
+    first, *_ = [frame for frame in play_episode(loop, 1) if frame.ended]
+    assert (first.option, first.ended) == (option, why)
