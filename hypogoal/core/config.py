@@ -60,9 +60,9 @@ class Config(BaseModel):
     def part(self, kind: type[C]) -> C:
         """The part of this kind; a ``TypeError`` where the settings have chosen none."""
         for name in parts_of(type(self)):
-            found = getattr(self, name)
-            if isinstance(found, kind):
-                return found
+            chosen = getattr(self, name)
+            if isinstance(chosen, kind):
+                return chosen
         raise TypeError(f"these settings have no {kind.__name__}")
 
     def flat(self) -> dict[str, Any]:
@@ -219,15 +219,15 @@ def resolve(model: type[C], *layers: Values, stage: str) -> C:
     for layer in layers:
         values |= {name: value for name, value in layer.items() if value is not None}
     for field, choice in parts_of(model).items():
-        given = {name: values.pop(name) for name in choice.whole.model_fields if name in values}
+        part_values = {name: values.pop(name) for name in choice.whole.model_fields if name in values}
         chosen = choice.model(str(values.get(choice.by, model.model_fields[choice.by].default)))
         names = chosen.model_fields if chosen else {}
-        for name in given:
+        for name in part_values:
             if name not in names and layers[-1].get(name) is not None:
                 fault = f"{stage} has this setting only beside another choice"
                 raise UserError(fault, name, f"See 'hypogoal config {stage}'.")
         if chosen:
-            of_part = {name: value for name, value in given.items() if name in names}
+            of_part = {name: value for name, value in part_values.items() if name in names}
             values[field] = _validated(chosen, of_part, model, stage)
     return _validated(model, values, model, stage)
 
@@ -260,15 +260,15 @@ def known(model: type[Config], values: Values) -> dict[str, Any]:
 
 def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str, Any]]:
     """Every setting of the model, then of its parts; a layer has values that replace defaults, and their source."""
-    given: dict[str, Any] = {}
+    replacing: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for values, source in layers:
-        given |= {name: value for name, value in values.items() if value is not None}
+        replacing |= {name: value for name, value in values.items() if value is not None}
         sources |= dict.fromkeys(values, source)
     rows = {}
     for home in homes_of(model):
-        own = {name: value for name, value in given.items() if name in home.model_fields}
-        defaults = _validated(home, own, model, "").model_dump(mode="json")
+        of_home = {name: value for name, value in replacing.items() if name in home.model_fields}
+        defaults = _validated(home, of_home, model, "").model_dump(mode="json")
         for origin in home.__mro__:
             for name in inspect.get_annotations(origin):
                 field = home.model_fields.get(name)

@@ -85,9 +85,9 @@ def bounded(values: Doubles, least: float = 0.0) -> tuple[float, float]:
     ``least`` as the unseen one, the upper end 1. Of zeros and ones it is Clopper and Pearson's interval.
     """
     weights = gaps(len(values))
-    known = weights[:, 1:] @ np.sort(values)
-    low = np.quantile(known + weights[:, 0] * least, TAILS[0])
-    high = np.quantile(known + weights[:, 0], TAILS[1])
+    weighed = weights[:, 1:] @ np.sort(values)
+    low = np.quantile(weighed + weights[:, 0] * least, TAILS[0])
+    high = np.quantile(weighed + weights[:, 0], TAILS[1])
     return float(low), min(float(high), 1.0)  # up to rounding
 
 
