@@ -15,6 +15,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import train
 from hypogoal.hypotheses.views import StateOrigins
+from hypogoal.options.termination import Terminations
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import one_room
@@ -79,9 +80,10 @@ def test_bases_are_recognised_in_rooms_without_labels(tmp_path: Path) -> None:
 def test_options_are_learned_that_were_out_of_reach() -> None:
     """No state is sure enough; with patience the threshold falls, and what the replay holds is judged by it."""
     log_odds = np.array([[3, -1], [2, 0], [1, 1], [0, 2], [-1, 3], [-2, 4]], dtype=np.float32)
-    rule = one_room.Patience(lambda ids: log_odds[ids], 2, None, np.array([3.5, 5.0], dtype=np.float32), 4)
+    rule = one_room.Patience(np.array([3.5, 5.0], dtype=np.float32), 4)
     rule.steps = 150
-    loop = played(loop_of(Corridor(4), ends=rule, **QUICK, experience="own", mask_reached=False), 400)
+    ends = Terminations(lambda ids: log_odds[ids], rule)
+    loop = played(loop_of(Corridor(4), ends=ends, **QUICK, experience="own", mask_reached=False), 400)
     assert rule.thresholds.tolist() == [2.25, 3.0]  # three quarters of the surest state
     for rows, end in zip(loop.recorder.executions, (0, 5), strict=True):
         last = list(rows)[-20:]
