@@ -85,7 +85,8 @@ def findings(results: Results) -> list[dict[str, Any]]:
         of_choosing = finding(CHOOSING, frozen, _of(UNIFORM, played), ["artefact", "layout"])
         of_choosing = [each | among_members(name, results) for each in of_choosing]
         # random choice while learning has other options
-        result += of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
+        of_choosing = of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
+        result += [each | how_soon(name, results) for each in of_choosing]
         for other, single in learned.items():
             if single["members"] != 1 or task_of.get(name) != task_of.get(other):
                 continue
@@ -102,6 +103,13 @@ def among_members(agent: str, results: Results) -> dict[str, float]:
     agents, random = _of(agent, taken), _of(UNIFORM, taken)
     random = random[random["artefact"].isin(agents["artefact"])]
     return {"better": agents["value"].mean(), "better_at_random": random["value"].mean()}
+
+
+def how_soon(agent: str, results: Results) -> dict[str, float]:
+    """After how many episodes 95 % of the last ones were solved: the median of the runs that got there, their share."""
+    own = results.of(method=agent)
+    soon, every = per_run(own, "episodes_to_95"), per_run(own, "success")
+    return {"episodes": soon["value"].median(), "got_there": len(soon) / max(1, len(every))}
 
 
 def _of(method, numbers):

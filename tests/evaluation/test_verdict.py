@@ -84,6 +84,19 @@ def test_seeds_are_the_units_of_a_single_layout() -> None:
     assert one[1] == "One run is not evidence: train more layouts or seeds."
 
 
+def test_the_verdict_says_after_how_many_episodes() -> None:
+    """The median of the runs that got there, and how many did if not all."""
+    rows = []
+    for number, episodes in enumerate((30, 40, 80, None)):
+        place = {"layout": number, "seed": 0, "artefact": f"own-{number}"}
+        rows.append(row("success", 1.0, method=SEVERAL, **place))
+        rows += [row("success", 1.0, method=SEVERAL, scope=FROZEN, **place)]
+        rows += [row("success", 0.2, method=UNIFORM, scope=FROZEN, **place)]
+        rows += [] if episodes is None else [row("episodes_to_95", episodes, method=SEVERAL, **place)]
+    first, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
+    assert first.endswith("After 40 episodes in the median it solved 95 % of the last twenty, in 75 % of its runs.")
+
+
 @pytest.mark.parametrize(
     ("better", "said"), [(0.55, "it chose sub-goals, not hypotheses."), (0.9, "it chose among hypotheses, too.")]
 )
