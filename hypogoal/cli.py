@@ -23,7 +23,6 @@ from typer import Argument, Option
 from typer.core import TyperGroup
 
 from hypogoal.command import call, registry, stage
-from hypogoal.command.registry import LOOK, OWN
 from hypogoal.core import own_code, processes
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
@@ -218,7 +217,7 @@ def run(
     say(*look.outcome(evaluation), out / "report" / "index.html")
 
 
-@command(LOOK, "show runs/mine")
+@command(registry.LOOK, "show runs/mine")
 def show(
     path: Made,
     as_json: Json = False,
@@ -235,7 +234,7 @@ def show(
         say(*write_sheets(path, pictures), err=as_json)
 
 
-@command(LOOK, "verify runs/mine")
+@command(registry.LOOK, "verify runs/mine")
 def verify(path: Made, as_json: Json = False) -> None:
     """Check for missing or changed files; exit code 2 if there are any.
 
@@ -254,7 +253,7 @@ def verify(path: Made, as_json: Json = False) -> None:
         raise typer.Exit(2)
 
 
-@command(LOOK, "status runs/mine")
+@command(registry.LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
     """Say what is stale or unfinished, why, and which commands renew it."""
     from hypogoal import look
@@ -264,7 +263,7 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
     echo(rows, as_json, [*notes, *look.stale_lines(rows)])
 
 
-@command(LOOK, "config train-ensemble --domain montezuma")
+@command(registry.LOOK, "config train-ensemble --domain montezuma")
 def config(
     stage: Annotated[str, Argument(help="For example train-meta, or run.")],
     domain: Annotated[str, Option(help=f"Settings for: {call.DOMAINS}")] = "doorkey",
@@ -301,7 +300,7 @@ for _stage, _help in registry.LISTED.items():  # their commands come from them
     app.command(_stage, help=_help, rich_help_panel=registry.TOOLS.get(_stage, MAKE))(lambda: None)
 
 
-@command(OWN, "check mine:DOMAIN")
+@command(registry.OWN, "check mine:DOMAIN")
 def check(
     domain: Annotated[str | None, Argument(help=f"{call.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from gymnasium.utils.env_checker import check_env
 
+from hypogoal import data
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.config import Config, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import place_of
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GET_MORE, Collected, Unmet, require_classes, write_dataset
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.domains.gymnasium.play import PASS_SEEDS
 from hypogoal.hypotheses.networks import AUTO
@@ -45,7 +45,7 @@ def check_domain(domain: Domain, config: Config | None = None, *, seed: int = 0)
     return verdicts(laws[first:], _Played(domain, config, seed))
 
 
-def collected(domain: Domain, config: Config | None, seed: int) -> Collected:
+def collected(domain: Domain, config: Config | None, seed: int) -> data.Collected:
     """States of a domain, collected with a config of its; None: with the defaults."""
     settings = config or resolve(domain.config_class, stage="collect")
     progress = Progress("check", total=1, quiet=True)
@@ -127,10 +127,10 @@ class _Played:
             for _ in range(2):
                 try:
                     states = collected(domain, self.config, self.seed)
-                except Unmet as error:
+                except data.Unmet as error:
                     warnings.warn(str(error), stacklevel=1)
                     return "not looked at: play did not reach the states"
-                write_dataset(place, states, domain=domain.name, config={}, seed=self.seed)
+                data.write_dataset(place, states, domain=domain.name, config={}, seed=self.seed)
                 files.append(place.read_bytes())
         fault = f"states differ when collected again with seed {self.seed}"
         promise(files[0] == files[1], fault, SEEDED)
@@ -143,7 +143,7 @@ class _Played:
             count = max(len(observations), 1)
             self.require_observations(name, observations, count)
         labels = states.labelled.labels
-        require_classes(labels, goals, "collect", GET_MORE)
+        data.require_classes(labels, goals, "collect", data.GET_MORE)
         return f"{len(labels)} labelled states, positives of each sub-goal: {labels.sum(0)}"
 
     def require_observations(self, name: str, observations: Any, count: int) -> None:

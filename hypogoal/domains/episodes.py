@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 LAST = 100  # an agent is judged by its last so many episodes, an option by its last so many executions
 
 
-class Episode(NamedTuple):
+class PlayedEpisode(NamedTuple):
     """A finished episode: a row of :class:`hypogoal.options.tables.Episodes`."""
 
     step: int  # environment steps when it ended, summed over the environments
@@ -39,7 +39,7 @@ class EpisodeRecorder(Resumable):
         self.steps = 0
         self.lengths = np.zeros(environments, int)  # so far, of the episodes that run
         self.rewards = np.zeros(environments)
-        self.rows: list[Episode] = []
+        self.rows: list[PlayedEpisode] = []
 
     def see(self, step: Step) -> None:
         """One step of every environment."""
@@ -58,7 +58,7 @@ class EpisodeRecorder(Resumable):
         ]
         ended = [column[over].tolist() for column in columns]
         for facts in zip(*ended, strict=True):
-            self.rows.append(Episode(self.steps, *facts))
+            self.rows.append(PlayedEpisode(self.steps, *facts))
         self.lengths[over] = 0
         self.rewards[over] = 0.0
 
@@ -82,4 +82,4 @@ class EpisodeRecorder(Resumable):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        self.rows = [Episode(*row) for row in snapshot["rows"]]
+        self.rows = [PlayedEpisode(*row) for row in snapshot["rows"]]

@@ -37,7 +37,7 @@ def train_meta(
     Options start fresh, or continue as those of an ``options`` artefact; so does choosing, as an ``agent`` chose.
     """
     from hypogoal.core.tensors import load_tensors
-    from hypogoal.domains.episodes import Episode
+    from hypogoal.domains.episodes import PlayedEpisode
     from hypogoal.meta import training
     from hypogoal.meta.setup import assemble
     from hypogoal.options.choosers import FILE
@@ -64,7 +64,7 @@ def train_meta(
             loop.recorder.start_at(begun_at)
             if all(practice.config[key] == settings[key] for key in WORLD):
                 practised = Episodes.read(practice.path / Episodes.FILE)
-                loop.recorder.episodes.rows += map(Episode._make, practised.rows())
+                loop.recorder.episodes.rows += map(PlayedEpisode._make, practised.rows())
         if agent:
             loop.chooser.carry(load_tensors(agent / FILE))
         agents.learn(work, setup, loop, steps)

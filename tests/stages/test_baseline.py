@@ -23,7 +23,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.doorkey.domain import DOMAIN
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.domains.episodes import Episode, EpisodeRecorder
+from hypogoal.domains.episodes import EpisodeRecorder, PlayedEpisode
 from hypogoal.domains.world import WorldConfig, make_engine
 from hypogoal.stages.train_baseline import train_baseline
 
@@ -107,9 +107,9 @@ def test_epsilon_waits_for_the_first_goal():
         episodes.steps = steps
         assert epsilon(paper, episodes) == pytest.approx(wanted)
     episodes.steps = 200_000
-    episodes.rows.append(Episode(9_000, 50, 0.0, 0, 0))
+    episodes.rows.append(PlayedEpisode(9_000, 50, 0.0, 0, 0))
     assert epsilon(tuned, episodes) == 1.0
-    episodes.rows += [Episode(184_000, 40, 1.0, 1, 1), Episode(190_000, 40, 1.0, 1, 1)]
+    episodes.rows += [PlayedEpisode(184_000, 40, 1.0, 1, 1), PlayedEpisode(190_000, 40, 1.0, 1, 1)]
     assert epsilon(tuned, episodes) == pytest.approx(0.525)
 
 
