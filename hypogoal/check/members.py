@@ -18,7 +18,7 @@ from hypogoal.core.tensors import stored
 from hypogoal.data import Collected
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.hypotheses import views
-from hypogoal.hypotheses.config import FULL, EnsembleConfig
+from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import inputs_of
@@ -127,7 +127,7 @@ class _Network:
     states: Any  # observations (N, *obs)
 
     def ensemble(self, seed: int = 0) -> Ensemble:
-        view = views.view_of(FULL, (), self.states.shape[1:], self.states.dtype)
+        view = views.view_of(views.FULL, (), self.states.shape[1:], self.states.dtype)
         view.fit(self.states, self.states, views.StateOrigins(), 0)
         return Ensemble(self.name, view.shape, 2, torch_generator(seed, "check"), view)
 

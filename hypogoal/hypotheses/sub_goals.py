@@ -16,7 +16,7 @@ from hypogoal.data import Dataset, joined, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses import networks, scores, teacher, thresholds, views
 from hypogoal.hypotheses.auto import training_of
-from hypogoal.hypotheses.config import FULL, TrainEnsembleConfig
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.observations import spread_rows
 
@@ -43,7 +43,7 @@ def check_names(config: TrainEnsembleConfig) -> None:
     thresholds.threshold_rule(config.threshold)
     if config.teacher:
         teacher.load_teacher(config.teacher)
-    if config.view != FULL:
+    if config.view != views.FULL:
         views.load_view(config.view)
     for name in networks.names_in(config.network):
         if name != networks.AUTO:

@@ -13,7 +13,7 @@ from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.config import Config, assigned, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_class
-from hypogoal.hypotheses.config import FULL
+from hypogoal.hypotheses.config import FULL as FULL
 from hypogoal.observations import (
     NUMBERS,
     PICTURE,
