@@ -18,9 +18,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below
 from hypogoal.domains.base import Engine
-from hypogoal.options import networks, saved
+from hypogoal.options import double_dqn, networks, saved
 from hypogoal.options.config import STACK, LightConfig, OptionConfig
-from hypogoal.options.double_dqn import DoubleDQN, ReplayBatch, Updated
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay, Steps, StepsAhead
 
@@ -58,7 +57,7 @@ class LightLearner(Learner):
     def build(self, config: OptionConfig, seed: int) -> None:
         self.settings = settings = config.part(LightConfig)
         self.running_only = config.experience == "own"
-        self.networks = DoubleDQN(self.network(settings, seed), settings, GRADIENT_NORM)
+        self.networks = double_dqn.DoubleDQN(self.network(settings, seed), settings, GRADIENT_NORM)
         self.ahead = StepsAhead(self.engine.count, settings.n_step)
         self.replay = PrioritisedReplay(Lessons.zeros(settings.replay))
         self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
@@ -135,11 +134,11 @@ class LightLearner(Learner):
             last = self._update()
         return self.health(last, self.replay.size) if last else {}
 
-    def _update(self) -> Updated:
+    def _update(self) -> double_dqn.Updated:
         """One update of all policies."""
         lessons, indices, weights = self._batch()
         learns, reached = self._judged(lessons)
-        batch = ReplayBatch(
+        batch = double_dqn.ReplayBatch(
             lessons.action,
             lessons.steps,
             reached,
