@@ -288,7 +288,8 @@ def create(
             wanted.took = {"seconds": round(time.monotonic() - started, 1)}
             _finish(draft, wanted)
         except BaseException as error:
-            if draft.is_resumable and getattr(error, "do", "") != ANEW:
+            is_useless = isinstance(error, UserError) and error.do == ANEW  # what the draft has cannot be continued
+            if draft.is_resumable and not is_useless:
                 error.add_note("the last checkpoint is kept: give the same command with --resume to continue")
             raise
 
