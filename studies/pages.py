@@ -29,6 +29,7 @@ from studies import (
     misgeneralise_agents,
     one_room,
     symbols,
+    two_factors,
     weight,
     weight_elsewhere,
 )
@@ -53,6 +54,7 @@ TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "preference-doorkey": choosing.tables,
     "rooms": choosing.rooms,
     "symbols": symbols.tables,
+    "two-factors": two_factors.tables,
     "weight": weight.tables,
     "weight-elsewhere": weight_elsewhere.tables,
 }

@@ -104,7 +104,7 @@ def cells() -> Iterator[Row]:
             values = drawn(shape, np.random.default_rng(seeds), seeds)
             for name, method in METHODS.items():
                 low, high = method(values)
-                coverage = np.mean((low <= 0) & (0 <= high))
+                coverage = np.mean((low <= 0) & (high >= 0))
                 width = np.mean(high - low)
                 numbers = (shape, name, seeds, f"{coverage:.4f}", f"{width:.1f}")
                 yield dict(zip(COLUMNS, numbers, strict=True))

@@ -17,7 +17,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.rooms.domain import DOMAIN
 from hypogoal.evaluation import statistics
 from hypogoal.evaluation.statistics import bounded, median_bounds
-from studies import cells, coverage, hypotheses, pages, recompute
+from studies import cells, coverage, hypotheses, pages, recompute, two_factors
 from studies.cells import (
     amount,
     bootstrap_t,
@@ -173,6 +173,20 @@ def test_a_percentile_bootstrap_would_not_hold() -> None:
         return low[0], high[0]
 
     assert held_by(percentile, "solved", "one in ten fails", 10) < 0.8
+
+
+def test_intervals_over_seeds_and_ladders_are_bounds_of_both_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where values are plain they hold, where a fifth of the ladders is far off they do not: so no page shows one."""
+    monkeypatch.setattr(two_factors, "EXPERIMENTS", 300)
+    monkeypatch.setattr(two_factors, "RESAMPLES", 300)
+    for shape, holds in (("both differ", True), ("a fifth of ladders far off", False)):
+        values = two_factors.drawn(shape, np.random.default_rng(7), 10)
+        for method in two_factors.METHODS.values():
+            low, high = method(values)
+            coverage_of_it = np.mean((low <= 0) & (high >= 0))
+            assert (coverage_of_it > 0.88) == holds
+    rows = cells.read_rows(RESULTS / "two-factors.csv")
+    assert [two_factors.admitted_from(rows, method) for method in two_factors.METHODS] == [None, None]
 
 
 def test_tables_show_the_intervals_that_were_chosen() -> None:
