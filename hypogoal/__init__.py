@@ -6,26 +6,11 @@ Its environments are registered with Gymnasium if that was imported before, else
 
 import importlib
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 __version__ = "1.1.0"
 
-if TYPE_CHECKING:
-    from hypogoal.api import compare, load_ensemble, load_options
-    from hypogoal.core.errors import UserError
-    from hypogoal.domains.gymnasium.domain import GymnasiumDomain
-    from hypogoal.look import Made
-    from hypogoal.options.env import OptionEnv
-    from hypogoal.options.reward import SubgoalReward
-    from hypogoal.stages.collect import collect
-    from hypogoal.stages.evaluate import evaluate
-    from hypogoal.stages.report import report
-    from hypogoal.stages.train_baseline import train_baseline
-    from hypogoal.stages.train_ensemble import train_ensemble
-    from hypogoal.stages.train_meta import train_meta
-    from hypogoal.stages.train_options import train_options
-
-_HOMES = {  # where each name is imported from on first use
+_HOMES = {  # where each name is imported from on first use; __init__.pyi has their signatures, for editors
     "GymnasiumDomain": "domains.gymnasium.domain",
     "Made": "look",
     "OptionEnv": "options.env",

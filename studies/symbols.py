@@ -227,15 +227,15 @@ def options_at(folder: Path, name: str, layout: int) -> Path:
 def train_ensemble(folder: Path, name: str, seed: int) -> None:
     """Train the ensemble of a world's seed."""
     world = ALL[name]
-    made = {"diversity": "dbat", "members": world.members, "seed": seed}
     place = ensemble_at(folder, world, seed)
-    hypogoal.train_ensemble(data_at(folder, world, seed), place, quiet=True, resume=True, **made)
+    data = data_at(folder, world, seed)
+    hypogoal.train_ensemble(data, place, diversity="dbat", members=world.members, seed=seed, quiet=True, resume=True)
 
 
 def practise(folder: Path, name: str, layout: int, seed: int) -> None:
     """Have the options of an agent practise."""
     world = ALL[name]
-    of_agent = {"layout_seed": layout, "seed": seed, "quiet": True, "resume": True}
+    of_agent: dict[str, Any] = {"layout_seed": layout, "seed": seed, "quiet": True, "resume": True}
     source = ensemble_at(folder, world, seed)
     hypogoal.train_options(source, options_at(folder, name, layout), **of_agent, **(world.practice or {}))
 

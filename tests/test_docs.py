@@ -1,5 +1,6 @@
 """The documentation's site: it builds without a warning, its commands run, its table of equations is true."""
 
+import ast
 import importlib
 import re
 import runpy
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import hypogoal
 from hypogoal.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -147,6 +149,16 @@ def test_the_picture_of_the_stages_is_drawn_from_their_code() -> None:
     assert picture["drawn"]() == (DOCS / "stages.svg").read_text(encoding="utf-8")
     stage = ROOT / "hypogoal" / "stages" / "train_meta.py"
     assert picture["declared"](stage) == ("train-meta", ["ensemble", "options"], "meta")
+
+
+def test_editors_are_shown_the_signatures_of_the_code() -> None:
+    """``python docs/signatures.py`` would change nothing; a name that Python gives is in the file, too."""
+    signatures = runpy.run_path(str(DOCS / "signatures.py"))
+    text = signatures["STUB"].read_text(encoding="utf-8")
+    assert signatures["stub"]() == text
+    shown = {node.name for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)}
+    shown |= set(re.findall(r" as (\w+)$", text, flags=re.MULTILINE))
+    assert shown | {"__version__"} == set(hypogoal.__all__)
 
 
 def test_requirements_lead_to_tests() -> None:
