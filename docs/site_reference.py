@@ -95,25 +95,39 @@ def command_line() -> str:
 
 
 def settings() -> str:
-    """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
-    from hypogoal.core.config import TABLES, described
-    from hypogoal.domains.base import BUILT_IN, layers_of
-    from hypogoal.experiments.experiment import config_class_of
+    """What ``hypogoal config`` says of every stage: a table a stage, a column for each domain's default."""
+    from hypogoal.core.config import TABLES
+    from hypogoal.domains.base import BUILT_IN
 
     lines = [
         "# Settings",
         "",
-        "Every setting of every stage: `--set name=value` changes one, a preset changes several, and the manifest of "
-        "what was made has them all. `hypogoal config STAGE --domain DOMAIN` prints the same.",
+        "Every setting of every stage. `--set name=value` changes one, a preset changes several, and the manifest of "
+        "what was made has them all. A domain's column has the default there, and a dash where the domain has no such "
+        "setting. `hypogoal config STAGE --domain DOMAIN` prints the same.",
         "",
     ]
-    for domain in BUILT_IN:
-        for stage in TABLES:
-            rows = described(config_class_of(stage, domain), *layers_of(stage, domain, None))
-            lines += [f"## {stage}, {domain}", "", "| setting | default | meaning | source |", "|---|---|---|---|"]
-            lines += [_row(row) for row in rows]
-            lines.append("")
+    for stage in TABLES:
+        domains = " | ".join(BUILT_IN)
+        rule = "---|" * (len(BUILT_IN) + 3)
+        lines += [f"## {stage}", "", f"| setting | {domains} | meaning | source |", f"|{rule}"]
+        lines += [_row(by_domain) for by_domain in settings_of(stage)]
+        lines.append("")
     return "\n".join(lines)
+
+
+def settings_of(stage: str) -> list[dict[str, Any]]:
+    """The settings of a stage, each by the domains that have it. What means something else elsewhere is another one."""
+    from hypogoal.core.config import described
+    from hypogoal.domains.base import BUILT_IN, layers_of
+    from hypogoal.experiments.experiment import config_class_of
+
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for domain in BUILT_IN:
+        for row in described(config_class_of(stage, domain), *layers_of(stage, domain, None)):
+            key = row["name"], row["meaning"] + row["allowed"]
+            found.setdefault(key, {})[domain] = row
+    return [*found.values()]
 
 
 def python() -> str:
@@ -133,13 +147,24 @@ def _documented(entry: str | tuple[str, str]) -> list[str]:
     return [f"::: {name}", "    options:", f"      members: [{members}]", ""]
 
 
-def _row(row: dict[str, Any]) -> str:
-    default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple | list) else str(row["default"])
+def _row(by_domain: dict[str, Any]) -> str:
+    """A row of a table: a setting, its default on each domain, what it means and where the defaults come from."""
+    from hypogoal.domains.base import BUILT_IN
+
+    row = next(iter(by_domain.values()))
     allowed = f" ({row['allowed']})" if row["allowed"] else ""
-    cells = (
-        f"`{row['name']}`",
-        f"{default or '(none)'} {row['unit']}".strip(),
-        row["meaning"] + allowed,
-        row["source"],
-    )
+    unit = f", in {row['unit']}" if row["unit"] else ""
+    defaults = [_default(by_domain[domain]) if domain in by_domain else "-" for domain in BUILT_IN]
+    sources = {domain: each["source"] for domain, each in by_domain.items()}
+    source = row["source"]
+    if len({*sources.values()}) > 1:
+        source = "; ".join(f"{domain}: {text}" for domain, text in sources.items() if text)
+    cells = [f"`{row['name']}`", *defaults, f"{row['meaning']}{unit}{allowed}", source]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _default(row: dict[str, Any]) -> str:
+    """A default as one types it."""
+    value = row["default"]
+    text = ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+    return text or "(none)"
