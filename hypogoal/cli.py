@@ -78,7 +78,7 @@ def _root(
     ] = False,
     debug: Annotated[bool, Option("--debug", metavar="", help="Show the traceback of an error.")] = False,
     trust: Annotated[
-        bool, Option("--trust", metavar="", help="Load code of your own that files name (module:object).")
+        bool, Option("--trust", metavar="", help="Allow code of your own that a file names (module:object).")
     ] = False,
 ) -> None:
     """Options before a command; ``main`` takes them anywhere."""
@@ -168,14 +168,14 @@ def run(
     out: Annotated[Path | None, Option(help="What to write. Default: runs/EXPERIMENT.")] = None,
     preset: call.Preset = None,
     set_: stage.Set = None,
-    seed: Annotated[str | None, Option(help="The run seeds, instead of the experiment's: 3, or 0-9.")] = None,
+    seed: Annotated[str | None, Option(help="Seeds to run, instead of the experiment's: 3, or 0-9.")] = None,
     device: call.Device = "auto",
     force: call.Force = False,
     resume: call.Resume = False,
     from_: Annotated[
-        str | None, Option("--from", metavar="STAGE", help="Make this stage again and all that needs it.")
+        str | None, Option("--from", metavar="STAGE", help="Run this stage again, and every stage that reads it.")
     ] = None,
-    only: Annotated[str | None, Option(metavar="STAGE", help="Make this stage again and run no other.")] = None,
+    only: Annotated[str | None, Option(metavar="STAGE", help="Run this stage again and no other stage.")] = None,
     engine: Annotated[
         Literal["local", "slurm"], Option(help="The cores of this machine, or job arrays of a cluster.")
     ] = "local",
@@ -183,7 +183,7 @@ def run(
     quiet: call.Quiet = False,
     dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands; run none.")] = False,
 ) -> None:
-    """Run all cells of an experiment: from nothing to a report.
+    """Run every command of an experiment, from nothing to a report.
 
     --set takes settings of the experiment, and STAGE.KEY=VALUE.
     """
@@ -255,7 +255,7 @@ def verify(path: Made, as_json: Json = False) -> None:
 
 @command(registry.LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
-    """Say what is stale or unfinished, why, and which commands renew it."""
+    """Say which outputs are out of date or unfinished, why, and how to renew them."""
     from hypogoal import look
 
     notes = look.in_the_making(path)
@@ -268,7 +268,7 @@ def config(
     stage: Annotated[str, Argument(help="For example train-meta, or run.")],
     domain: Annotated[str, Option(help=f"Settings for: {call.DOMAINS}")] = "doorkey",
     preset: call.Preset = None,
-    toml: Annotated[bool, Option("--toml", metavar="", help="As a preset to edit: a .toml file for --preset.")] = False,
+    toml: Annotated[bool, Option("--toml", metavar="", help="Print a .toml file to edit, for --preset.")] = False,
     as_json: Json = False,
 ) -> None:
     """List every setting of a stage: default, unit, meaning, source."""
@@ -313,14 +313,16 @@ def check(
     set_: stage.Set = None,
     seed: call.Seed = 0,
 ) -> None:
-    """Check that your domain, or part of an agent, keeps its contract; or that data suffice.
+    """Check that your domain or part of an agent keeps its contract, or that data suffice.
 
-    Of a data file, in a minute: are there enough labels, do they leave more
-    than one hypothesis, how long will training take? --set is train-ensemble's.
+    Of a data file it says in a minute whether there are enough labels, whether
+    they leave more than one hypothesis, and how long training will take. There
+    --set changes settings of 'train-ensemble'.
 
-    Exit code 2 if not. It collects a few states of the domain twice; --set
-    changes how, as for 'collect'. Parts see, or play in, that domain; without
-    one views and teachers see rooms, agents' parts play in doorkey.
+    Of a domain it collects a few states twice, where --set changes settings of
+    'collect'. A part plays in the domain that you name. If you name none, views
+    and teachers see rooms, and other parts play in doorkey. The exit code is 2
+    if something is wrong.
     """
     from hypogoal import check as contracts
     from hypogoal.core import config as settings

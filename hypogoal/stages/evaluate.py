@@ -11,7 +11,7 @@ from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.progress import Progress
 
-PLAYED = "Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."
+PLAYED = "Layouts that agents, and each option alone, also play without learning: 2000-2099 or 7,9."
 
 
 @stage(

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 REPORT = "audit.json"
 WHERE = "Where to play; without it, look at recorded data."
 WHICH = "The labelled data to look at. Default: what the members were trained with."
-TRUTH = "The sub-goal that is the truth."
-LIMIT = "Exit with code 3 if a larger share of executions, or of what play meets, is a false positive."
+TRUTH = "The sub-goal that the classifier is meant to recognise."
+LIMIT = "Exit with code 3 if false positives are more than this share of executions, or of states met or recorded."
 FAILED = 3
 
 
