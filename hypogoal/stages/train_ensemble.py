@@ -20,7 +20,7 @@ TITLES = {
     "worst": "worst",
 }
 IDLE = "Give unlabelled states in which features part, or fewer members."
-ELSEWHERE = "Where unlabelled states come from instead: a data file, or an agent or options with save_visited. Repeatable."
+ELSEWHERE = "Where unlabelled states come from instead: data, or an agent or options with save_visited. Repeatable."
 
 
 @stage(
